@@ -43,12 +43,13 @@ class Compensator:
 
     Args:
         terms: the rule of flight.
-        gain: K of the vehicle's own regulator, with which it flies along a spline; shape (axes, 2).
+        regulator: K and λ by which the vehicle flies along a spline, see
+            `shared.scenario.gain.regulator`; shape (axes, 3).
             Horizons of inputs bring theirs along.
     """
 
-    def __init__(self, terms: Terms, gain: Array | None = None) -> None:
-        self._gain = np.zeros((terms.axes, 2)) if gain is None else gain
+    def __init__(self, terms: Terms, regulator: Array | None = None) -> None:
+        self._regulator = np.zeros((terms.axes, 3)) if regulator is None else regulator
         self._H = terms.horizon
         self._age_max = terms.age_max
         self._indexed = terms.indexed
@@ -230,9 +231,10 @@ class Compensator:
                 bound=bound,
                 gain_p=gain_p,
                 gain_v=gain_v,
+                lag=lag,
             )
-            for model, each, u, bound, (gain_p, gain_v) in zip(
-                self._model, knots, last, self._bounds, self._gain.tolist(), strict=True
+            for model, each, u, bound, (gain_p, gain_v, lag) in zip(
+                self._model, knots, last, self._bounds, self._regulator.tolist(), strict=True
             )
         ]
         self._length, self.feeds_back = length, True
@@ -255,6 +257,7 @@ class Compensator:
         step: int,
         state: Sequence[tuple[float, float]],
         disturbance: Sequence[float] = NO_WIND,
+        before: Sequence[float] = NO_WIND,
     ) -> list[float]:
         """Input u* for `step` on each axis [m/s].
 
@@ -263,12 +266,13 @@ class Compensator:
             state: position [m] and velocity [m/s] of each axis at the step.
             disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
                 spline [m/s].
+            before: input flown until now, of each axis; counts only along a spline [m/s].
 
         Source: eq. (11).
         """
         stage = self._go_on(step)
         if self.guides:
-            return self._follow(stage, state, disturbance)
+            return self._follow(stage, state, disturbance, before)
         if self.feeds_back:
             self._lead_to(stage)
         axes = zip(self.held, self.lead, state, strict=True)
@@ -299,15 +303,20 @@ class Compensator:
         self.told = told
 
     def _follow(
-        self, stage: int, state: Sequence[tuple[float, float]], disturbance: Sequence[float]
+        self,
+        stage: int,
+        state: Sequence[tuple[float, float]],
+        disturbance: Sequence[float],
+        before: Sequence[float],
     ) -> list[float]:
         """Input along the spline at a stage, see `choose`."""
         flown = []
         # Not strict: NO_WIND has as many axes as there can be.
-        for axis, (guide, w) in enumerate(zip(self.guides, disturbance, strict=False)):
+        axes = zip(self.guides, disturbance, before, strict=False)
+        for axis, (guide, w, last) in enumerate(axes):
             lead = spline.guided_to(guide, self.lead_stage, stage, *self.lead[axis])
             self.lead[axis] = lead
-            flown.append(spline.follow(guide, stage, *lead, *state[axis], w))
+            flown.append(spline.follow(guide, stage, *lead, *state[axis], w, last))
         self.lead_stage = stage
         self.told = [told for _, told in flown]
         return [u for u, _ in flown]
@@ -323,8 +332,9 @@ class Compensator:
         """
         stage = self._chosen - self.begins
         if self.guides:  # what the wind does is flown off
+            # What λ keeps of the input before is left out: it lasts for a few steps only.
             led = zip(self.guides, self.lead, states, strict=True)
-            told = [spline.follow(guide, stage, *lead, *x, 0.0)[0] for guide, lead, x in led]
+            told = [spline.regulated(guide, stage, *lead, *x, 0.0)[0] for guide, lead, x in led]
             return [advance(m, *x, u) for m, x, u in zip(self._model, states, told, strict=True)]
         if flown is None:
             axes = zip(self.held, self.lead, states, strict=True)

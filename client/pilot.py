@@ -22,7 +22,7 @@ from skytether.client.session import Echo
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -75,8 +75,8 @@ class Pilot:
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
-        gain = feedback_gain(scenario) if self._terms.splines else None
-        self.compensator = Compensator(self._terms, gain)
+        along = regulator(scenario) if self._terms.splines else None
+        self.compensator = Compensator(self._terms, along)
         """Compensator, which chooses the input."""
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
@@ -225,7 +225,8 @@ class Pilot:
         # Asked first: `choose` goes on to this step.
         had_plan = compensator.covered
         self._rest()
-        wanted = compensator.choose(self.step, known.predicted, known.disturbance)
+        before = self._input.tolist()
+        wanted = compensator.choose(self.step, known.predicted, known.disturbance, before)
         if failsafe.mode is Mode.LAND:
             wanted = wanted if compensator.rests else [0.0] * self._terms.axes
             if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
@@ -234,7 +235,7 @@ class Pilot:
         speed_max = self._speed_max(had_plan, compensator.covered)
         flown = clamped(
             wanted,
-            self._input.tolist(),
+            before,
             self._terms.u_max,
             self._change_max,
             told=told,

@@ -28,7 +28,7 @@ from skytether.shared.base.kernel import B1, I1, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import feedback_gain, regulator
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import KnownArrays, Situation, Verdict, make_trigger
@@ -117,7 +117,6 @@ class Controller:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self.desired = Desired(scenario, terms, room, block, references)
         """Desired trajectories as far as they are known."""
-        gain = feedback_gain(scenario)
         self._scheme: Scheme
         self.planner: Planner | Guidance | Together
         """Plans of every vehicle, or what is sent in place of a plan."""
@@ -129,9 +128,10 @@ class Controller:
             )
         elif terms.splines:
             self._scheme = self.planner = Guidance(
-                terms, control, gain, self.desired, clock, room, block
+                terms, control, regulator(scenario), self.desired, clock, room, block
             )
         else:
+            gain = feedback_gain(scenario)
             self._scheme = (
                 Replay(terms, control, gain, room, clock)
                 if terms.commits

@@ -77,6 +77,7 @@ TINY = 1e-9
 
 along, guided_to = shared(spline.along), shared(spline.guided_to)
 shared(spline.guided)
+regulated = shared(spline.regulated)
 follow = shared(spline.follow)
 """The rule of flight along a spline, compiled for kernels."""
 
@@ -163,7 +164,7 @@ class Guidance:
     Args:
         terms: the rule of flight.
         control: weights and `delay_bound`.
-        gain: K of the regulator aboard; shape (axes, 2).
+        regulator: K and λ of the regulator aboard; shape (axes, 3).
         desired: what the server knows of the desired trajectories.
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
         block: number of vehicles that are decided on at a time.
@@ -176,7 +177,7 @@ class Guidance:
         self,
         terms: Terms,
         control: ControlConfig,
-        gain: Array,
+        regulator: Array,
         desired: Desired,
         clock: ClockMap,
         capacity: int,
@@ -184,7 +185,7 @@ class Guidance:
     ) -> None:
         axes, given = terms.axes, control.delay_bound
         # TINY: weights that ask for no gain on position would divide by 0.
-        lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
+        lead_s = (1.0 + regulator[:, 1]) / np.maximum(regulator[:, 0], TINY)
         # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
         # the spline goes straight on: measured, such plans led up to 12 m away (docs/envelope.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()

@@ -10,10 +10,11 @@ state that goes on by itself, p̄ = p₀ + t v₀. Stages count steps from the f
 
 The vehicle flies, at each stage i,
 
-    u*(i) = ū(i) + K (x̄(i) - x(i)) - ŵ             v̄(i+1) = a v̄(i) + b ū(i)
+    u*(i) = λ u(i-1) + (1 - λ) [ū(i) + K (x̄(i) - x(i)) - ŵ]        v̄(i+1) = a v̄(i) + b ū(i)
 
-ū is the input under which the velocity of eq. (4) follows the spline, K the vehicle's regulator, ŵ
-the disturbance that its own filter has found. x is the state in which the input meets the vehicle
+ū is the input under which the velocity of eq. (4) follows the spline, K and λ the vehicle's
+regulator (`shared.scenario.gain`), u(i-1) the input flown until now, and ŵ the disturbance that the
+vehicle's own filter has found. x is the state in which the input meets the vehicle
 (`shared.law.dead_time`), so the spline is of the desired trajectory that much later. No input is
 flown for longer than `link.age_max_s` after the observation behind it: from there on ū is held, or
 braked to nothing as in `shared.law.rule`, and x̄ follows eq. (4) under that until it rests.
@@ -59,6 +60,8 @@ class Guide(NamedTuple):
     """K on position [1/s]."""
     gain_v: float
     """K on velocity."""
+    lag: float
+    """λ: share of the input before that is kept, 0 to below 1."""
 
 
 def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[float, float]:
@@ -128,10 +131,10 @@ def guided_to(
     return lead_p, lead_v
 
 
-def follow(
+def regulated(
     guide: Guide, stage: int, lead_p: float, lead_v: float, p: float, v: float, w: float
 ) -> tuple[float, float]:
-    """Fly one axis for a step along a spline.
+    """Input that the regulator asks for on one axis, towards which `follow` moves.
 
     Args:
         guide: the spline.
@@ -141,8 +144,31 @@ def follow(
         w: disturbance ŵ [m/s].
 
     Returns:
-        the input that is flown, u* [m/s]; and ū, what of it belongs to the spline [m/s].
+        ū + K (x̄ - x) - ŵ within the bound [m/s]; and ū [m/s].
     """
     told = guided(guide, stage)
     back = led_back(guide.gain_p, guide.gain_v, lead_p - p, lead_v - v)
     return bounded(told + back - w, guide.bound), told
+
+
+def follow(
+    guide: Guide,
+    stage: int,
+    lead_p: float,
+    lead_v: float,
+    p: float,
+    v: float,
+    w: float,
+    before: float,
+) -> tuple[float, float]:
+    """Fly one axis for a step along a spline.
+
+    Args:
+        guide, stage, lead_p, lead_v, p, v, w: see `regulated`.
+        before: input flown until now, u(i-1), within the bound [m/s].
+
+    Returns:
+        the input that is flown, u* [m/s]; and ū, what of it belongs to the spline [m/s].
+    """
+    wanted, told = regulated(guide, stage, lead_p, lead_v, p, v, w)
+    return guide.lag * before + (1.0 - guide.lag) * wanted, told

@@ -144,7 +144,8 @@ class ControlConfig(Section, frozen=True):
     input_weight: OfServer[Annotated[float, Meta(ge=1e-9, le=1e9)]] = 1.0
     """Weight R of eq. (5) on the input [s²/m²]."""
     change_weight: OfServer[Amount] = 0.0
-    """Weight S of eq. (9) on the change from the previous horizon [s²/m²]."""
+    """Weight S of eq. (9) on the change from the previous horizon, and with the scheme "trajectory"
+    on the change of the input from step to step [s²/m²]."""
     input_reference: OfServer[bool] = True
     """Whether R weighs u - v_ref instead of u, so that R does not ask for standing still."""
 

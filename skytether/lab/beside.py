@@ -7,7 +7,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.lab import floor
-from skytether.lab.contenders import BESIDE, Plan
+from skytether.lab.contenders import BESIDE, REGULATED, Plan
 from skytether.lab.journal import digests
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -49,14 +49,14 @@ class Work:
     """
 
     def __init__(self, plan: Plan) -> None:
-        scenario = plan.tuned(BESIDE)
+        scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
         self.regular = [
             replace(scenario, control=replace(scenario.control, trigger="periodic", period=period))
             for period in PERIODS
         ]
         """Scenarios for the points of the floor."""
         first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
-        self.aboard = [replace(scenario, seed=seed) for seed in range(first, first + runs)]
+        self.aboard = [replace(aboard, seed=seed) for seed in range(first, first + runs)]
         """Scenarios with the reference aboard."""
 
     def settings(self) -> dict[str, Any]:
@@ -66,6 +66,7 @@ class Work:
             "periods": list(PERIODS),
             "runs": [RUNS, len(self.aboard)],
             "scenario": reading.to_table(self.regular[0]),
+            "aboard": [reading.to_table(each) for each in self.aboard[:1]],
         }
 
 

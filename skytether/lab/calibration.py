@@ -118,11 +118,8 @@ WEIGHTS = (
     Free("control.change_weight", 1e-4, 1e4),
 )
 """Weights that are searched for; only their ratios matter, so the position's is fixed."""
-REGULATOR = (WEIGHTS[0], WEIGHTS[3])
-"""Weights that determine the feedback gain, where nothing is planned."""
-NOMINAL = (*REGULATOR, WEIGHTS[4])
-"""Weights that determine the motion of a trajectory that is planned as well; what of the target's
-movement it leaves out depends on the weight of changes most."""
+REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
+"""Weights that determine the regulator along a trajectory, and a nominal motion that is planned."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
 """Key of a trajectory that the server knows ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
@@ -183,7 +180,7 @@ class Rmse:
         weights: Sequence[Free] = WEIGHTS
         if control.scheme == "trajectory":
             ahead = self.scenario.reference.preview != "none"
-            weights = (*NOMINAL, *SPLINE_KEYS) if ahead else REGULATOR
+            weights = (*REGULATOR, *SPLINE_KEYS) if ahead else REGULATOR
         keys = [*weights, *trigger_keys(control.trigger), *observer]
         return [key for key in keys if key.of(table) > 0.0]
 

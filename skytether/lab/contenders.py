@@ -116,8 +116,8 @@ TRAJECTORY = {
     "horizon": 80,
     "state_weight": [7.1, 0.1],
     "terminal_weight": [50.0, 20.0],
-    "input_weight": 1.0,
-    "change_weight": 0.0,
+    "input_weight": 0.1,
+    "change_weight": 0.5,
 }
 """Scheme that sends no inputs, but a trajectory, along which the vehicle regulates itself."""
 
@@ -155,7 +155,9 @@ def _contenders() -> tuple[Contender, ...]:
 
 CONTENDERS = _contenders()
 BESIDE = "feedback-gap"
-"""Contender whose weights are used for the reference aboard, and for the floor."""
+"""Contender whose weights are used for the floor."""
+REGULATED = "trajectory-expected"
+"""Contender whose weights are used for the reference aboard."""
 ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 """Baseline for cases in which the reference is known before the flight."""
 
@@ -344,10 +346,6 @@ def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Sce
     """Scenario from which the search for a contender's weights in a case begins."""
     table = reading.to_table(reading.load(case.plant))
     control = {key: case.start.get(key, value) for key, value in contender.control.items()}
-    if control["scheme"] == "trajectory" and case.keys.get("reference.preview", "none") != "none":
-        # Here a motion is planned, and effort is bounded: without a weight of changes it follows
-        # every movement of the target that costs no input (measured: 0.0189 m instead of 0.0173).
-        control["change_weight"] = TIGHT["change_weight"]
     lay({f"control.{key}": value for key, value in control.items()}, table)
     lay(case.keys, table)
     lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)

@@ -53,7 +53,7 @@ class PlannedCourse:
         """Whether the horizon contains feedback gains."""
         if not self.feeds_back:
             feedback = np.zeros((terms.axes, FEEDBACK))
-        self._feedback = feedback
+        self._feedback, self.lag = feedback, np.zeros(terms.axes)
         self._gain, self._disturbance = feedback[:, [GAIN_P, GAIN_V]], feedback[:, DISTURBANCE]
         self._led, self._stage = feedback[:, LED], 0
 
@@ -80,7 +80,13 @@ class PlannedCourse:
         back: Array = (self._gain * (self._led - state)).sum(axis=1)
         return back
 
-    def by_rule(self, stage: int, state: Array, found: Sequence[float]) -> list[float]:  # noqa: ARG002
+    def by_rule(
+        self,
+        stage: int,
+        state: Array,
+        found: Sequence[float],  # noqa: ARG002
+        before: Sequence[float],  # noqa: ARG002
+    ) -> list[float]:
         """Input at a stage by the compiled rule, of each axis [m/s]; see `back`."""
         speed = math.sqrt(sum(u * u for u in self._inputs[:, -1].tolist()))
         return [
@@ -115,14 +121,16 @@ class FollowedCourse:
         trajectory: the trajectory.
         length: number of usable stages.
         terms: the rule of flight.
-        gain: K of the vehicle's regulator; shape (axes, 2).
+        regulator: K and λ of the vehicle's regulator; shape (axes, 3).
     """
 
     feeds_back = True
 
-    def __init__(self, trajectory: Trajectory, length: int, terms: Terms, gain: Array) -> None:
+    def __init__(self, trajectory: Trajectory, length: int, terms: Terms, regulator: Array) -> None:
         self._knots, self._spacing = trajectory.knots.astype(float), trajectory.spacing
-        self._length, self._terms, self._gain = length, terms, gain
+        self._length, self._terms = length, terms
+        self._gain, self.lag = regulator[:, :2], regulator[:, 2]
+        """K; and λ, the share of the input before that is kept; shape (axes,)."""
         self._model, self._bound = terms.model, np.array(terms.u_max)
         self._last = self._along(length - 1)
         self._led, self._stage = self._state(length), length
@@ -171,8 +179,14 @@ class FollowedCourse:
         back: Array = (self._gain * (led - state)).sum(axis=1) - np.array(found)
         return back
 
-    def by_rule(self, stage: int, state: Array, found: Sequence[float]) -> list[float]:
-        """Input at a stage by the compiled rule, of each axis [m/s]; see `back`."""
+    def by_rule(
+        self, stage: int, state: Array, found: Sequence[float], before: Sequence[float]
+    ) -> list[float]:
+        """Input at a stage by the compiled rule, of each axis [m/s]; see `back`.
+
+        Args:
+            before: input flown until now, of each axis [m/s].
+        """
         terms = self._terms
         axes = list(
             zip(
@@ -180,14 +194,16 @@ class FollowedCourse:
                 self._knots.reshape(terms.axes, -1),
                 terms.u_max,
                 self._gain.tolist(),
+                self.lag.tolist(),
                 state.tolist(),
                 found,
+                before,
                 strict=True,
             )
         )
         last = [
             _last_along(model, knots, self._spacing, terms.dt_s, self._length, bound)
-            for model, knots, bound, _, _, _ in axes
+            for model, knots, bound, *_ in axes
         ]
         speed = math.hypot(*last)
         return [
@@ -197,18 +213,20 @@ class FollowedCourse:
                 self._spacing,
                 terms.dt_s,
                 self._length,
-                u,
+                end,
                 speed,
                 terms.brake,
                 bound,
                 gain_p,
                 gain_v,
+                lag,
                 stage,
                 p,
                 v,
                 w,
+                u,
             )
-            for u, (model, knots, bound, (gain_p, gain_v), (p, v), w) in zip(
+            for end, (model, knots, bound, (gain_p, gain_v), lag, (p, v), w, u) in zip(
                 last, axes, strict=True
             )
         ]
@@ -262,13 +280,17 @@ def _by_spline(
     bound: float,
     gain_p: float,
     gain_v: float,
+    lag: float,
     stage: int,
     p: float,
     v: float,
     w: float,
+    before: float,
 ) -> float:
     """Input on one axis at a stage of a trajectory [m/s]; see `shared.law.spline.follow`."""
-    guide = Guide(model, knots, spacing, dt_s, length, last, speed, brake, bound, gain_p, gain_v)
+    guide = Guide(
+        model, knots, spacing, dt_s, length, last, speed, brake, bound, gain_p, gain_v, lag
+    )
     led_p, led_v = guided_to(guide, 0, stage, knots[0], knots[1])
-    u, _ = follow(guide, stage, led_p, led_v, p, v, w)
+    u, _ = follow(guide, stage, led_p, led_v, p, v, w, before)
     return u

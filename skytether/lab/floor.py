@@ -22,7 +22,7 @@ from skytether.client.clamp import clamped
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.law.model import Array, white_acceleration
-from skytether.shared.scenario.gain import stationary_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -83,11 +83,11 @@ def _root(total: float, count: int) -> float:
 def fly_aboard(scenario: Scenario) -> Rows:
     """Fly with the reference aboard, and without a network; the client's part of the record.
 
-        u(k) = u_ff(k) + K (x_ref(k) - x(k))
+        u(k) = λ u(k-1) + (1 - λ) [u_ff(k) + K (x_ref(k) - x(k)) - ŵ]
 
-    u_ff moves the model along the reference. K is the gain that the server sends for feedback
-    aboard, and inputs pass the same clamp. Winds and noise equal those of a networked flight with
-    this seed.
+    u_ff moves the model along the reference. K and λ are the regulator of `shared.law.spline`, ŵ
+    is the disturbance that the filter aboard has found, and inputs pass the same clamp. Winds and
+    noise equal those of a networked flight with this seed.
 
     Raises:
         ValueError: only the server knows the reference.
@@ -99,7 +99,8 @@ def fly_aboard(scenario: Scenario) -> Rows:
     flies, known = simulated(scenario, 1), Navigation(scenario)
     desired = _due(scenario)
     forward = (desired[1:, :, 1] - model.a11 * desired[:-1, :, 1]) / model.b1
-    gain = stationary_gain(model, scenario.control)
+    along = regulator(scenario)
+    gain, lag, bound = along[:, :2], along[:, 2], np.array(u_max)
     change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
     rows = np.zeros(scenario.steps, client_columns(terms.axes))
     rows["step"] = np.arange(scenario.steps)
@@ -110,9 +111,10 @@ def fly_aboard(scenario: Scenario) -> Rows:
         now_ns = k * terms.dt_ns
         known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
         back = (gain * (desired[k] - known.predicted)).sum(axis=1)
-        told = forward[k].tolist()
-        wanted = (forward[k] + back).tolist()
-        flown = clamped(wanted, u.tolist(), u_max, change_max, told=told)
+        told, w = forward[k].tolist(), np.array(known.disturbance[: terms.axes])
+        wanted = np.clip(forward[k] + back - w, -bound, bound)
+        wanted = lag * u + (1.0 - lag) * wanted
+        flown = clamped(wanted.tolist(), u.tolist(), u_max, change_max, told=told)
         assert flown is not None
         u = np.array(flown)
         row["state"], row["measured"] = flies.truth(), known.measured

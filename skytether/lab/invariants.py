@@ -25,7 +25,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
 from skytether.shared.wire.protocol import (
@@ -188,7 +188,7 @@ class WatchedLife(Recorder):
         """Time-out [steps]."""
         self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
         """Largest change of the input from step to step [m/s]."""
-        self._gain = feedback_gain(scenario)
+        self._regulator = regulator(scenario)
         """K of the vehicle's own regulator."""
         self._extent = _extent(scenario)
         self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
@@ -391,7 +391,7 @@ class WatchedLife(Recorder):
         if self._course is None:
             last, terms = self._observed + self._terms.age_max - in_force + 1, self._terms
             if isinstance(horizon, Trajectory):
-                self._course = FollowedCourse(horizon, last, terms, self._gain)
+                self._course = FollowedCourse(horizon, last, terms, self._regulator)
             else:
                 self._course = PlannedCourse(horizon, min(horizon.inputs.shape[1], last), terms)
 
@@ -425,17 +425,20 @@ class WatchedLife(Recorder):
         if not covered:
             most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
         # Behind the last input the told part may not speed up; feedback comes on top of it.
-        told = told * min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING))
+        left_out = told * (1.0 - min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING)))
         bound = np.array(self._terms.u_max)
         want = np.clip(told + course.back(stage, state, found), -bound, bound)
+        want = course.lag * before + (1.0 - course.lag) * want - left_out
+        told = told - left_out
         near = np.clip(want, before - self._change_max, before + self._change_max)
+        near = np.clip(near, -bound, bound)
         for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
             # Within rounding by an independent computation in float64; `_check_rule` then compares
             # bit by bit.
             if abs(u - should) > 2.0 * ROUNDING:
                 raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
         if covered:
-            self._check_rule(course.by_rule(stage, state, found), flown)
+            self._check_rule(course.by_rule(stage, state, found, self.input), flown)
             self.followed += isinstance(course, FollowedCourse)
             self.planned += isinstance(course, PlannedCourse)
         feeds_back = course.feeds_back

@@ -82,7 +82,8 @@ class Loop(NamedTuple):
     feeds_back: bool
     """Whether there is feedback aboard."""
     back: F1
-    """Gains of the feedback aboard, on position [1/s] and velocity; shape (2,)."""
+    """Gains of the feedback aboard, on position [1/s] and velocity, shape (2,); along a trajectory
+    also λ, shape (3,)."""
     decay: float
     """Share of its error that the disturbance observer keeps per step; 1 without an observer."""
     holds: bool
@@ -216,13 +217,13 @@ def _go_on(loop: Loop, last: F1, stage: int, holds: bool, u: F1) -> None:
 
 
 @making_part
-def _follow(loop: Loop, past: Past, x: F2, u: F1) -> None:
+def _follow(loop: Loop, past: Past, x: F2, before: F1, u: F1) -> None:
     """Compute the input along a trajectory that rests at the origin."""
     rests = (0.0, 0.0)
-    gain_p, gain_v = loop.back[0], loop.back[1]
-    guide = Guide(loop.model, rests, 1, 1.0, 1, 0.0, 0.0, 0.0, np.inf, gain_p, gain_v)
+    gain_p, gain_v, lag = loop.back[0], loop.back[1], loop.back[2]
+    guide = Guide(loop.model, rests, 1, 1.0, 1, 0.0, 0.0, 0.0, np.inf, gain_p, gain_v, lag)
     for c in range(len(u)):
-        u[c], _ = follow(guide, 0, 0.0, 0.0, x[0, c], x[1, c], past.filtered[2, c])
+        u[c], _ = follow(guide, 0, 0.0, 0.0, x[0, c], x[1, c], past.filtered[2, c], before[c])
 
 
 @making_part
@@ -403,7 +404,7 @@ def _choose(loop: Loop, timing: Timing, past: Past, s: int) -> None:
     reach = len(past.flown)
     u, x = past.flown[s % reach], past.reported[s % reach]
     if loop.scheme == TRAJECTORY:
-        _follow(loop, past, x, u)
+        _follow(loop, past, x, past.flown[(s - 1) % reach], u)
         return
     made = timing.in_force[s]
     number = _number(past, made)

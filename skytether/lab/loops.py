@@ -19,7 +19,7 @@ from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.dead_time import dead_time
 from skytether.shared.law.model import Array, Indices, Model, discretise, white_acceleration
 from skytether.shared.scenario import policies
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import feedback_gain, regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import committed_max
@@ -36,7 +36,8 @@ def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
     plans, before = np.zeros((terms.axes, 1, 3)), np.zeros((terms.axes, 0, 0))
     if not terms.splines:
         plans, before = _plans(terms.model, make_mpc(terms, control))
-    back = feedback_gain(scenario).astype("f4").astype("f8")
+    told = regulator(scenario) if terms.splines else feedback_gain(scenario)
+    back = told.astype("f4").astype("f8")
     delay, corrections = _corrections(scenario, steps)
     pushes = white_acceleration(tau, dt)
     return [

@@ -162,6 +162,7 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
             "gain": (known * rng.uniform(0.8, 1.2, axes)).tolist(),
             "steady_wind_mps": rng.uniform(-0.2, 0.2, axes).tolist(),
         }
+    table["control"]["change_weight"] = float(rng.choice((0.0, 0.05, 0.6)))
 
 
 def short_trial(seed: int) -> Trial:

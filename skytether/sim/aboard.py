@@ -16,7 +16,7 @@ from skytether.client import clamp
 from skytether.client import filter as kalman
 from skytether.client.filter import Spread
 from skytether.server.control.law import advance, lead_to, step
-from skytether.server.control.trajectory import follow, guided_to
+from skytether.server.control.trajectory import follow, guided_to, regulated
 from skytether.shared.base.kernel import F1, F2, R1, kernel, part, record, records, shared
 from skytether.shared.law import leap
 from skytether.shared.law.model import Axis
@@ -143,6 +143,8 @@ class AxisPlan:
     """Feedback gain K on position [1/s]."""
     gain_v: float
     """Feedback gain K on velocity."""
+    lag: float
+    """Share λ of the input before that is kept along a spline."""
     disturbance: float
     """Disturbance ŵ that a horizon's inputs already compensate [m/s]."""
 
@@ -204,6 +206,7 @@ def guide_of(axis: AxisAboard, plan: AxisPlan, knots: R1) -> Guide:
         axis.bound,
         plan.gain_p,
         plan.gain_v,
+        plan.lag,
     )
 
 
@@ -262,7 +265,7 @@ def fly_step(
         if plan.is_spline:
             guide = guide_of(axis, plan, numbers[i])
             lead_p, lead_v = guided_to(guide, lead_stage, stage, lead_p, lead_v)
-            u, part_told = follow(guide, stage, lead_p, lead_v, x_p, x_v, now_is.x_w)
+            u, part_told = follow(guide, stage, lead_p, lead_v, x_p, x_v, now_is.x_w, was.u)
         else:
             held = held_of(axis, plan, numbers[i])
             if plan.feeds_back:
@@ -311,9 +314,9 @@ def believe_step(
         apart[i, 0], apart[i, 1] = p - x_p, v - x_v
         if plan.is_spline:
             guide = guide_of(axis, plan, numbers[i])
-            u, _ = follow(guide, stage, at.lead_p, at.lead_v, p, v, 0.0)
+            u, _ = regulated(guide, stage, at.lead_p, at.lead_v, p, v, 0.0)
             silent[i, 0], silent[i, 1] = advance(model, p, v, u)
-            u, _ = follow(guide, stage, at.lead_p, at.lead_v, x_p, x_v, 0.0)
+            u, _ = regulated(guide, stage, at.lead_p, at.lead_v, x_p, x_v, 0.0)
             told[i, 0], told[i, 1] = advance(model, x_p, x_v, u)
         else:
             held = held_of(axis, plan, numbers[i])

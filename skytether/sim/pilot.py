@@ -204,6 +204,7 @@ class _Flying:
                     True,
                     g.gain_p,
                     g.gain_v,
+                    g.lag,
                     0,
                 )
                 for g in guides
@@ -222,6 +223,7 @@ class _Flying:
                     h.feeds_back,
                     h.gain_p,
                     h.gain_v,
+                    0,
                     h.disturbance,
                 )
                 for h in held

@@ -17,7 +17,7 @@ from skytether.server.control.trajectory import Guidance
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Horizon, Trajectory
 from skytether.sim.flight import fly
@@ -52,8 +52,8 @@ def mismatches(scheme: str, stages: int, seed: int) -> tuple[int, float]:
     rng, differ, away, compared = np.random.default_rng(seed), 0, 0.0, 0
     while compared < stages:
         flown = terms(scheme, ("brake", "hold")[rng.integers(2)], rng)
-        gain = rng.uniform(0.0, 3.0, (AXES, 2))
-        aboard = Compensator(flown, gain)
+        along = rng.uniform(0.0, (3.0, 3.0, 0.9), (AXES, 3))
+        aboard = Compensator(flown, along)
         step, age = int(rng.integers(9, 40)), int(rng.integers(3, 9))
         course: FollowedCourse | PlannedCourse
         if scheme == "trajectory":
@@ -61,7 +61,7 @@ def mismatches(scheme: str, stages: int, seed: int) -> tuple[int, float]:
             knots = rng.normal(0.0, 3.0, (AXES, count, 2)).astype(np.float32)
             sent = Trajectory(1, 1, step, 0, age, int(rng.integers(1, 12)), knots)
             aboard.offer(sent, step - 2, step - age)
-            course = FollowedCourse(sent, AGE_MAX - age + 1, flown, gain)
+            course = FollowedCourse(sent, AGE_MAX - age + 1, flown, along)
         else:
             inputs = rng.normal(0.0, 1.5, (AXES, H)).astype(np.float32)
             feedback = rng.normal(0.0, 1.0, (AXES, FEEDBACK * int(rng.integers(2))))
@@ -72,13 +72,15 @@ def mismatches(scheme: str, stages: int, seed: int) -> tuple[int, float]:
             if rng.random() < 0.1:  # it has slept
                 continue
             state, found = rng.normal(0.0, 2.0, (AXES, 2)), rng.normal(0.0, 0.3, AXES).tolist()
-            u = aboard.choose(k, state.tolist(), found)
-            differ += u != course.by_rule(k - step, state, found)
+            before = rng.uniform(np.negative(flown.u_max), flown.u_max).tolist()
+            u = aboard.choose(k, state.tolist(), found, before)
+            differ += u != course.by_rule(k - step, state, found, before)
             assert all(map(math.isfinite, u))
             compared += 1
             if compared <= ANEW:
                 wanted = course.told(k - step) + course.back(k - step, state, found)
                 anew = np.clip(wanted, np.negative(flown.u_max), flown.u_max)
+                anew = course.lag * before + (1.0 - course.lag) * anew
                 away = max(away, float(np.abs(anew - u).max()))
     return differ, away
 
@@ -118,7 +120,7 @@ def flown_mismatches(flown: Scenario) -> tuple[int, int]:
     """
     kept: dict[int, tuple[Array, Array, int]] = {}
     winds: dict[int, list[float]] = {}
-    terms, gain = flown.terms(), feedback_gain(flown)
+    terms, along = flown.terms(), regulator(flown)
     follows = terms.splines
     scheme = Guidance if follows else Replay
     remember, choose = scheme.remember, Compensator.choose
@@ -128,9 +130,11 @@ def flown_mismatches(flown: Scenario) -> tuple[int, int]:
         for i in event.nonzero()[0].tolist():
             kept[int(step[i])] = kept_at_the_server(self, found, int(rows[i]), i)
 
-    def look(self: Compensator, step: int, state: Any, disturbance: Any) -> list[float]:
+    def look(
+        self: Compensator, step: int, state: Any, disturbance: Any, before: Any
+    ) -> list[float]:
         winds[step] = list(disturbance)
-        return choose(self, step, state, disturbance)
+        return choose(self, step, state, disturbance, before)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scheme, "remember", spy)
@@ -149,13 +153,15 @@ def flown_mismatches(flown: Scenario) -> tuple[int, int]:
             last = observed + terms.age_max - made + 1
             if follows:
                 sent = Trajectory(1, 1, made, 0, made - observed, spacing, numbers.astype("f4"))
-                courses[made] = FollowedCourse(sent, last, terms, gain)
+                courses[made] = FollowedCourse(sent, last, terms, along)
             else:
                 told = feedback.astype("f4") if terms.feedback else np.zeros((terms.axes, 0), "f4")
                 horizon = Horizon(1, 1, made, 0, 0, numbers.astype("f4"), told)
                 courses[made] = PlannedCourse(horizon, min(numbers.shape[1], last), terms)
-        wanted = courses[made].by_rule(step - made, row["estimate"], winds[step])
         last_flown = before["input"]
+        wanted = courses[made].by_rule(
+            step - made, row["estimate"], winds[step], last_flown.tolist()
+        )
         near = np.clip(wanted, last_flown - change, last_flown + change)
         differ += (np.clip(near, np.negative(terms.u_max), terms.u_max) != row["input"]).any()
         steps += 1
@@ -167,6 +173,7 @@ def demo(scheme: str, duration_s: float, seed: int) -> Scenario:
     table = reading.to_table(reading.load("demo")) | {"duration": duration_s, "seed": seed}
     trigger = "expected_gap(0.05)" if scheme == "trajectory" else "cost_gap(3)"
     table["control"] |= {"scheme": scheme, "trigger": f"{trigger} | silence(1)"}
+    table["control"]["change_weight"] = 0.05
     table["vehicle"] |= {"gain": [0.9], "steady_wind_mps": [0.2, -0.1], "wind": 0.1}
     return reading.check(table, "demo")
 

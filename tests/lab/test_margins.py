@@ -22,7 +22,7 @@ from skytether.lab.margins import (
     timings,
 )
 from skytether.shared.law.model import Array, white_acceleration
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.sim.flight import fly_batch
@@ -41,19 +41,25 @@ NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
 # -- what is computed ------------------------------------------------------------------------------
 
 
-def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation() -> None:
-    """Along a trajectory u = -K x, whatever arrives: P = F P Fᵀ + W, and ρ(F)² is the growth."""
+@pytest.mark.parametrize("change_weight", [0.0, 0.05])
+def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation(change_weight: float) -> None:
+    """Along a trajectory x and u(k-1) regulate themselves whatever arrives: P = F P Fᵀ + W, and
+    ρ(F)² is the growth.
+    """
     scenario = demo_with(
         control__scheme="trajectory",
         control__trigger="expected_gap(1)",
         control__input_weight=0.01,
+        control__change_weight=change_weight,
         sensor__filter="none",
     )
     assert not looks_at_state(scenario)
-    model, K = scenario.terms().model, feedback_gain(scenario)[0]
-    F = model.A[0] - np.outer(model.B[0], K)
-    L = scenario.vehicle.wind * white_acceleration(scenario.tau_s, scenario.control.dt)[0]
-    P: Array = np.zeros((2, 2))
+    model, (gain_p, gain_v, lag) = scenario.terms().model, regulator(scenario)[0]
+    K = np.array([(1.0 - lag) * gain_p, (1.0 - lag) * gain_v, -lag])
+    F = np.pad(model.A[0], ((0, 1), (0, 1))) - np.outer([*model.B[0], 1.0], K)
+    L = np.zeros((3, 2))
+    L[:2] = scenario.vehicle.wind * white_acceleration(scenario.tau_s, scenario.control.dt)[0]
+    P: Array = np.zeros((3, 3))
     for _ in range(2000):
         P = F @ P @ F.T + L @ L.T
     found = margin(scenario, AS_IT_IS, timings(scenario, 1))

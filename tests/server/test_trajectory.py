@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
+from statistics import mean
 from typing import Any
 
 import msgpack
@@ -26,12 +27,12 @@ from skytether.server.control.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain
 from skytether.shared.law.model import Array, Indices, advance
-from skytether.shared.law.spline import Guide, along, follow, guided_to, spline_at
+from skytether.shared.law.spline import Guide, along, follow, guided_to, regulated, spline_at
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
-from skytether.shared.telemetry.summary import position_error
+from skytether.shared.telemetry.summary import position_error, summarise
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import (
     KNOTS_MAX,
@@ -151,6 +152,7 @@ def guide(flown: Scenario, knots: Sequence[float], **other: Any) -> Guide:
         "bound": terms.u_max[0],
         "gain_p": 2.0,
         "gain_v": 0.5,
+        "lag": 0.0,
     }
     return Guide(terms.model.axes()[0], knots, **{**numbers, **other})
 
@@ -168,11 +170,43 @@ def test_along_a_spline_the_models_velocity_is_the_splines() -> None:
 def test_input_is_that_of_the_spline_and_feedback_less_the_disturbance() -> None:
     """Together they are held within the bound."""
     held = guide(scenario(), (1.0, 0.5))
-    u, told = follow(held, 4, 1.2, 0.5, 1.1, 0.4, 0.03)
+    u, told = follow(held, 4, 1.2, 0.5, 1.1, 0.4, 0.03, 0.0)
     assert told == pytest.approx(0.5)
     assert u == pytest.approx(0.5 + 2.0 * 0.1 + 0.5 * 0.1 - 0.03)
-    u, _ = follow(held, 4, 9.0, 0.5, 1.1, 0.4, 0.0)
+    u, _ = follow(held, 4, 9.0, 0.5, 1.1, 0.4, 0.0, 0.0)
     assert u == held.bound
+
+
+def test_input_moves_from_the_one_before_by_the_regulator_s_share() -> None:
+    """By the same share of the way at each step: 1 - λ."""
+    held = guide(scenario(), (1.0, 0.5), lag=0.75)
+    state = (1.2, 0.5, 1.1, 0.4, 0.03)
+    wanted, told = regulated(held, 4, *state)
+    assert wanted == pytest.approx(0.5 + 2.0 * 0.1 + 0.5 * 0.1 - 0.03)
+    u, same = follow(held, 4, *state, -0.4)
+    assert same == told
+    assert u == pytest.approx(-0.4 + 0.25 * (wanted + 0.4))
+    assert follow(held, 4, *state, wanted)[0] == pytest.approx(wanted)
+
+
+def test_weight_of_changes_buys_a_smaller_error_at_the_same_effort() -> None:
+    """After a target that only the server sees; without λ the same effort costs 0.05 m more."""
+
+    def flown(**weights: float) -> tuple[float, float]:
+        table = reading.to_table(reading.load("compare/trajectory-every-step-target"))
+        table["control"] |= weights
+        target, errors, efforts = reading.check(table, "smooth"), [], []
+        for flight in fly_batch(target, range(5000, 5004)):
+            summary = summarise(target, "smooth", flight.client)
+            assert summary.rmse_xy is not None
+            errors.append(summary.rmse_xy)
+            efforts.append(summary.effort_mps)
+        return mean(errors), mean(efforts)
+
+    rough, effort = flown(input_weight=1.58, change_weight=0.0)
+    smooth, as_much = flown(input_weight=0.1, change_weight=0.6)
+    assert as_much < 1.05 * effort
+    assert smooth < rough - 0.03
 
 
 def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
@@ -180,7 +214,7 @@ def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
     held = guide(
         scenario(), (0.0, 1.0), length=20, last=1.0, speed=1.0, brake=0.1, gain_p=0.0, gain_v=0.0
     )
-    told = [follow(held, stage, 0.0, 0.0, 0.0, 0.0, 0.0)[1] for stage in range(18, 33)]
+    told = [follow(held, stage, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)[1] for stage in range(18, 33)]
     np.testing.assert_allclose(told[:2], 1.0)
     np.testing.assert_allclose(told[2:], np.maximum(1.0 - 0.1 * np.arange(1, 14), 0.0), atol=1e-12)
     lead, before = (0.0, 0.0), 0
@@ -217,10 +251,15 @@ class Server:
     def __init__(self, flown: Scenario, capacity: int = 1) -> None:
         self.terms = flown.terms()
         self.desired = Moved(flown, self.terms, capacity, capacity)
-        gain = feedback_gain(flown)
         self.clock = ClockMap(capacity, self.terms.dt_ns)
         self.scheme = Guidance(
-            self.terms, flown.control, gain, self.desired, self.clock, capacity, capacity
+            self.terms,
+            flown.control,
+            regulator(flown),
+            self.desired,
+            self.clock,
+            capacity,
+            capacity,
         )
         self.found: Foresight = foresight(capacity, 2, 1, 1, splines=True)
 
@@ -249,7 +288,7 @@ class Server:
 
 def known(flown: Scenario, server: Server, off_m: float, off_mps: float) -> float:
     """The gap of a trajectory that is off by so much on one axis, as the documents have it."""
-    (gain_p, gain_v), *_ = feedback_gain(flown).tolist()
+    (gain_p, gain_v, _), *_ = regulator(flown).tolist()
     h, weight = (1.0 + gain_v) / gain_p, flown.control.state_weight[0]
     times = server.d * 0.1 * np.arange(1, 4)
     gap: float = weight * np.mean((off_m + times * off_mps + h * off_mps) ** 2)
@@ -568,10 +607,10 @@ def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
     """Also where they are beyond all sense."""
     flown = scenario()
     terms = flown.terms()
-    compensator = Compensator(terms, feedback_gain(flown))
+    compensator = Compensator(terms, regulator(flown))
     told = message(10, np.array([knots, knots], np.float32), age=1, spacing=spacing)
     compensator.offer(told, 10, 9)
-    inputs = compensator.choose(10 + stage, [(0.0, 0.0), (1.0, -1.0)])
+    inputs = compensator.choose(10 + stage, [(0.0, 0.0), (1.0, -1.0)], before=terms.u_max)
     assert all(math.isfinite(u) for u in inputs)
     for u, bound in zip(inputs, terms.u_max, strict=True):
         assert abs(u) <= bound
@@ -652,7 +691,7 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
         network={"uplink": POISSON, "downlink": POISSON},
     )
     flight, kept = flown_and_kept(flown)
-    terms, gain, checked = flown.terms(), feedback_gain(flown), 0
+    terms, gain, checked = flown.terms(), regulator(flown)[:, :2], 0
     for row in flight.client[flight.client["covered"]]:
         spacing, knots = kept[int(row["in_force"])]
         stage = int(row["step"] - row["in_force"])

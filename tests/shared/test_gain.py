@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from helpers import packaged
 from skytether.shared.law.model import Array, discretise, white_acceleration
-from skytether.shared.scenario.gain import feedback_gain
+from skytether.shared.scenario.gain import feedback_gain, regulator
 from skytether.shared.scenario.gain import stationary_gain as gain_for
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.sim.flight import fly
@@ -32,6 +32,33 @@ def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> Non
         X = solve_discrete_are(A, B, np.diag([7.1, q]), np.array([[r + s]]))
         expected = np.linalg.solve(r + s + B.T @ X @ B, B.T @ X @ A)[0]
         np.testing.assert_allclose(K, expected, rtol=1e-7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(1e-4, 10.0))
+def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(
+    q: float, r: float, s: float
+) -> None:
+    """The input before is a state of its own: u = λ u(k-1) - (1 - λ) K x."""
+    weights = {"state_weight": [7.1, q], "input_weight": r, "change_weight": s}
+    flown = scenario(model={"tau_s": [0.81, 0.3], "gain": 0.8}, control=weights)
+    model = flown.terms().model
+    for A, B, (gain_p, gain_v, lag) in zip(model.A, model.B, regulator(flown), strict=True):
+        F, G = np.pad(A, ((0, 1), (0, 1))), np.append(B, 1.0)[:, None]
+        N = np.array([[0.0], [0.0], [-s]])
+        X = solve_discrete_are(F, G, np.diag([7.1, q, s]), np.array([[r + s]]), s=N)
+        K = np.linalg.solve(r + s + G.T @ X @ G, G.T @ X @ F + N.T)[0]
+        found = [(1.0 - lag) * gain_p, (1.0 - lag) * gain_v, -lag]
+        np.testing.assert_allclose(found, K, rtol=1e-6, atol=1e-9)
+        assert 0.0 <= lag < 1.0
+
+
+def test_without_a_weight_of_changes_it_is_the_feedback_gain() -> None:
+    """Bit for bit, and nothing of the input before is kept."""
+    flown = scenario(control={"change_weight": 0.0, "feedback": True})
+    along = regulator(flown)
+    np.testing.assert_array_equal(along[:, :2], feedback_gain(flown))
+    assert not along[:, 2].any()
 
 
 def test_where_nothing_weighs_the_position_nothing_leads_back_to_it() -> None:
