@@ -61,7 +61,7 @@ class Guide(NamedTuple):
     gain_v: float
     """K on velocity."""
     lag: float
-    """λ: share of the input before that is kept, 0 to below 1."""
+    """Share λ of the input before that is kept, 0 to below 1."""
 
 
 def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[float, float]:

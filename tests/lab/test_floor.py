@@ -83,7 +83,8 @@ def test_a_reference_aboard_needs_no_packets() -> None:
 
 def test_feedback_aboard_comes_as_near_as_no_packets_at_all() -> None:
     """In wind, with the same gain: of a trajectory known for ever the network tells nothing."""
-    tight = {"state_weight": [7.1, 0.001], "terminal_weight": [15.0, 1.5], "input_weight": 1e-4}
+    tight = {"state_weight": [7.1, 0.001], "terminal_weight": [15.0, 1.5]}
+    tight |= {"input_weight": 0.0301, "change_weight": 0.0}
     sent = {"scheme": "committed", "feedback": True, "trigger": "cost_gap(6e-4)"}
     flown = packaged("paper", duration=30.0, control=tight | sent, vehicle={"wind": 0.1})
     planned = summarise(flown, "planned", fly(flown).client)

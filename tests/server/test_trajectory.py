@@ -17,6 +17,7 @@ import skytether
 from helpers import uncompile
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
+from skytether.lab.sweep import summaries
 from skytether.server.control import trajectory
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.desired import Desired, Window
@@ -32,7 +33,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
-from skytether.shared.telemetry.summary import position_error, summarise
+from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import (
     KNOTS_MAX,
@@ -195,13 +196,8 @@ def test_weight_of_changes_buys_a_smaller_error_at_the_same_effort() -> None:
     def flown(**weights: float) -> tuple[float, float]:
         table = reading.to_table(reading.load("compare/trajectory-every-step-target"))
         table["control"] |= weights
-        target, errors, efforts = reading.check(table, "smooth"), [], []
-        for flight in fly_batch(target, range(5000, 5004)):
-            summary = summarise(target, "smooth", flight.client)
-            assert summary.rmse_xy is not None
-            errors.append(summary.rmse_xy)
-            efforts.append(summary.effort_mps)
-        return mean(errors), mean(efforts)
+        runs = summaries("smooth", reading.check(table, "smooth"), range(5000, 5004))
+        return mean(run.rmse_xy or 0.0 for run in runs), mean(run.effort_mps for run in runs)
 
     rough, effort = flown(input_weight=1.58, change_weight=0.0)
     smooth, as_much = flown(input_weight=0.1, change_weight=0.6)
