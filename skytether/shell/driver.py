@@ -20,6 +20,7 @@ from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shell.batch import BATCH_MAX, Batch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.stream import ByteStream
@@ -31,12 +32,13 @@ from skytether.shell.udp import (
     is_loopback,
     kernel_drops,
     open_socket,
-    to_kernel,
     within_reach_of,
 )
 
-BURST_MAX = 128
+BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
+TOGETHER_MIN = 4
+"""Fewest datagrams that are sent by one `sendmmsg`: fewer take less time one by one."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""
@@ -104,6 +106,9 @@ class Shell:
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """Buffer of every datagram: making room for the longest costs more than to copy."""
+        self._batches: dict[int, Batch | None] = {}
+        """Arrays for the sockets of each family; None where the system has no such calls."""
+        self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
         """Address of socket 0."""
 
@@ -154,8 +159,7 @@ class Shell:
                 self._feed.end()
             self._timer.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
-            for datagram in self.endpoint.outbox():
-                self._send(datagram)
+            self._send_all(self.endpoint.outbox())
             self._drops = self.kernel_drops()
             for sock in self._sockets.values():
                 self._loop.remove_reader(sock)
@@ -169,9 +173,46 @@ class Shell:
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
-        self._loop.add_reader(self._sockets[number], self._read, number)
+        batch = self._batch(self._sockets[number])
+        if batch is None:
+            self._loop.add_reader(self._sockets[number], self._read, number)
+        else:
+            self._loop.add_reader(self._sockets[number], self._read_batch, number, batch)
+
+    def _batch(self, sock: socket) -> Batch | None:
+        """Arrays of the socket's family, made when they are first used."""
+        if sock.family not in self._batches:
+            try:
+                self._batches[sock.family] = Batch(sock.family)
+            except OSError:
+                self._batches[sock.family] = None
+        return self._batches[sock.family]
+
+    def _read_batch(self, number: int, batch: Batch) -> None:
+        """Hear all datagrams that have come to a socket, at most BURST_MAX."""
+        self._stopwatch.start()
+        came = batch.receive(self._sockets[number])
+        # All of them were here by now; stamped one by one, those behind would seem to come later.
+        now_ns = time.monotonic_ns()
+        if not came:
+            self._read(number)  # nothing came, or an error, which the plain call tells apart
+            return
+        heard, datagrams = self._names.heard, []
+        for payload, raw in came:
+            # OSError: an interface has gone since.
+            with contextlib.suppress(OSError):
+                datagrams.append(Datagram(payload, heard(raw), number))
+        self._stopwatch.lap("receive")
+        hear = self.endpoint.receive
+        for datagram in datagrams:
+            try:
+                hear(datagram, now_ns=now_ns)
+            except Exception as error:  # a fault of ours is told, and the next datagram is heard
+                self._loop.call_exception_handler({"message": str(error), "exception": error})
+        self._after()
 
     def _read(self, number: int) -> None:
+        """Hear all datagrams that have come to a socket, one by one."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch = self._stopwatch
@@ -203,8 +244,9 @@ class Shell:
         """Send what the endpoint wants sent, arm its timer, hand on its events and its rows."""
         endpoint = self.endpoint
         self._stopwatch.start()
-        for datagram in endpoint.outbox():
-            self._send(datagram)
+        out = endpoint.outbox()
+        if out:
+            self._send_all(out)
         self._stopwatch.lap("send")
         due_ns = endpoint.next_wake_ns()
         if due_ns != self._armed:
@@ -217,6 +259,36 @@ class Shell:
         if self._feed:
             self._feed.take()
 
+    def _send_all(self, datagrams: Sequence[Datagram]) -> None:
+        """Send datagrams in their order; those in a row that use one socket go together."""
+        first, count = 0, len(datagrams)
+        while first < count:
+            number, last = datagrams[first].socket, first + 1
+            while last < count and datagrams[last].socket == number and last - first < BURST_MAX:
+                last += 1
+            row = datagrams[first:last]
+            # What was not sent together is sent alone: a lost packet is one that failed there, too.
+            for datagram in row[self._send_together(row) :] if len(row) > 1 else row:
+                self._send(datagram)
+            first = last
+
+    def _send_together(self, row: Sequence[Datagram]) -> int:
+        """Send datagrams of one socket in few calls; returns how many went, from the first on."""
+        sock = self._sockets.get(row[0].socket)
+        if sock is None:
+            return 0
+        payloads, peers = (
+            [datagram.payload for datagram in row],
+            [datagram.peer for datagram in row],
+        )
+        try:
+            if peers.count(peers[0]) == len(peers) and self._segments.suit(payloads):
+                return self._segments.send(sock, payloads, self._names.kernel(peers[0]))
+            batch = self._batch(sock) if len(row) >= TOGETHER_MIN else None
+            return batch.send(sock, payloads, list(map(self._names.raw, peers))) if batch else 0
+        except OSError:  # an address that is none
+            return 0
+
     def _send(self, datagram: Datagram) -> None:
         payload, peer, number = datagram
         if peer == LINE:
@@ -227,7 +299,7 @@ class Shell:
             if sock is None:
                 sock = self._sockets[number] = open_socket(self._elsewhere)
                 self._listen(number)
-            sock.sendto(payload, to_kernel(self._names.number(peer)))
+            sock.sendto(payload, self._names.kernel(peer))
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
             self.send_errors += 1
 
