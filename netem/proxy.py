@@ -106,16 +106,20 @@ class Proxy(Endpoint):
             if flow.order is self._unanswered:
                 flow.order = self._answered
                 self._answered[flow.client] = self._unanswered.pop(flow.client)
-        for lane in (flow.uplink, flow.downlink):
-            if lane.fates.fault and lane.fates.fault not in self._faults:
-                self._faults.add(lane.fates.fault)
-                self._events.append(Fault(traceback=lane.fates.fault))
+        if flow.uplink.fates.fault or flow.downlink.fates.fault:
+            self._tell_faults(flow)
         flow.used_ns = now_ns
         # Both dictionaries stay ordered by use: the oldest flow is found without a search, also in
         # a flood of new clients.
         flow.order.move_to_end(flow.client)
         # What is not delayed leaves now, and not a wake later.
         self._forward(now_ns)
+
+    def _tell_faults(self, flow: Flow) -> None:
+        for lane in (flow.uplink, flow.downlink):
+            if lane.fates.fault and lane.fates.fault not in self._faults:
+                self._faults.add(lane.fates.fault)
+                self._events.append(Fault(traceback=lane.fates.fault))
 
     def wake(self, *, now_ns: int) -> None:
         """Send the packets that are due."""
