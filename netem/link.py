@@ -102,10 +102,10 @@ class Counts:
     """Times that packets took to pass a finite rate, from when they entered."""
 
 
-Held = tuple[int, int, Datagram, Lane, int, int, bool]
-"""Packet that is held: due time [ns], order of entry, packet, lane, number in the lane, delay [ns],
-and whether it is a copy. The order of entry decides between equal times, so that no datagrams are
-ever compared."""
+Held = tuple[int, int, Datagram, int, Lane, int, int, bool]
+"""Packet that is held: due time [ns], order of entry, packet, its size [B], lane, number in the
+lane, delay [ns], and whether it is a copy. The order of entry decides between equal times, so that
+no datagrams are ever compared."""
 
 
 class Queue:
@@ -268,7 +268,7 @@ class Link:
             self._bytes += size
             self._entered += 1
             delay_ns = due_ns - entered_ns
-            queue.push((due_ns, self._entered, datagram, lane, number, delay_ns, is_copy))
+            queue.push((due_ns, self._entered, datagram, size, lane, number, delay_ns, is_copy))
             if queue.size > counts.depth_max:  # noqa: PLR1730
                 counts.depth_max = queue.size
             is_copy = True
@@ -294,10 +294,10 @@ class Link:
         out: list[Datagram] = []
         delays_ns: list[int] = []
         errors_ns: list[int] = []
-        rows: list[tuple[float, ...]] = []
+        rows: list[bytes] = []
+        way, pack = self._direction, recorder.pack if recorder else None
         while queue.front and queue.front[0][0] <= now_ns:
-            due_ns, _, datagram, lane, number, delay_ns, is_copy = queue.pop()
-            size = len(datagram.payload)
+            due_ns, _, datagram, size, lane, number, delay_ns, is_copy = queue.pop()
             self._bytes -= size
             overtaken = number < lane.newest_out
             if overtaken:
@@ -306,27 +306,16 @@ class Link:
                 lane.newest_out = number
             delays_ns.append(delay_ns)
             errors_ns.append(now_ns - due_ns)
-            if recorder is not None and not is_copy:
-                entered_ns = due_ns - delay_ns
-                rows.append(
-                    (
-                        self._direction,
-                        lane.flow,
-                        number,
-                        size,
-                        entered_ns,
-                        delay_ns,
-                        False,
-                        overtaken,
-                    )
-                )
+            if pack is not None and not is_copy:
+                flow, entered_ns = lane.flow, due_ns - delay_ns
+                rows.append(pack(way, flow, number, size, entered_ns, delay_ns, False, overtaken))
             out.append(datagram)
         # Together: a call for each packet would take longer than what it does.
         counts.forwarded += len(out)
         counts.delay.add_all(delays_ns)
         counts.error.add_all(errors_ns)
         if recorder is not None and rows:
-            recorder.append_rows(rows)
+            recorder.append_packed(rows)
         return out
 
     def next_due_ns(self) -> int | None:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
 from skytether.shared.core.events import Fault, FlowOpened
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
@@ -93,7 +93,7 @@ class Proxy(Endpoint):
             if flow is None:
                 self.refused += 1
                 return
-            onward = Datagram(payload, self._server, flow.socket)
+            onward = make_datagram((payload, self._server, flow.socket))
             self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
@@ -101,7 +101,8 @@ class Proxy(Endpoint):
             if flow is None or peer != self._server:
                 self.refused += 1
                 return
-            self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
+            onward = make_datagram((payload, flow.client, 0))
+            self.uplink.take(onward, flow.uplink, now_ns=now_ns)
             # Its place is earned by the server's answer, for a sender's address can be made up.
             if flow.order is self._unanswered:
                 flow.order = self._answered

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -251,6 +251,8 @@ class Recorder:
         self.columns = columns
         self._sinks: list[Sink] = []
         self._row = _row(columns)
+        self.pack = self._row.pack
+        """Function that makes the bytes of a row, of a value for every column in order."""
         if sink is not None:
             sink.write(json.dumps(columns.descr).encode() + b"\n")
             self._sinks.append(sink)
@@ -272,10 +274,9 @@ class Recorder:
         for sink in self._sinks:
             sink.write(row)
 
-    def append_rows(self, rows: Iterable[Sequence[float]]) -> None:
-        """Append rows, each as in `append_row`, in one piece."""
-        pack = self._row.pack
-        self._write(b"".join([pack(*row) for row in rows]))
+    def append_packed(self, rows: Iterable[bytes]) -> None:
+        """Append rows, made by `pack`,, in one piece."""
+        self._write(b"".join(rows))
 
     def _write(self, rows: bytes) -> None:
         for sink in self._sinks:

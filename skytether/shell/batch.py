@@ -34,6 +34,7 @@ SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
 _STRIDE = 65_536 + 4096 + 64
 """Distance of two datagrams that are received [B]: room for the longest, and an odd number of cache
 lines, so that their first bytes do not all compete for the same lines."""
+_STARTS = range(0, _STRIDE * BATCH_MAX, _STRIDE)
 _SOL_UDP, _UDP_SEGMENT = 17, 103
 _HEADER = struct.Struct("@QI4xQQQQi4xI4x")
 """Layout of `struct mmsghdr`: address of the name and its size, address and number of the buffers,
@@ -138,24 +139,25 @@ class Batch:
         self._in = _Headers(_STRIDE, 65_536, self._name_bytes)
         self._out = _Headers(SIZE_MAX, 0, self._name_bytes)
 
-    def receive(self, sock: socket.socket) -> list[tuple[bytes, RawAddress]]:
+    def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress]]:
         """Payloads and senders of the datagrams that have arrived, at most BATCH_MAX.
 
         Args:
             sock: socket of this family.
 
         Returns:
-            datagrams in the order of their arrival; none where there is none, or an error.
+            payloads and senders in the order of arrival; none where nothing came, or an error.
         """
         rows, size = self._in, self._name_bytes
         count = self._receive(sock.fileno(), rows.first, BATCH_MAX, _MSG_DONTWAIT, None)
         if count <= 0:
-            return []
-        room, names, out, at = rows.room, bytes(rows.names[: count * size]), [], 0
-        for i, length in enumerate(rows.done[:count].tolist()):
-            out.append((room[at : at + length].tobytes(), names[i * size : (i + 1) * size]))
-            at += _STRIDE
-        return out
+            return [], []
+        room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
+        lengths = rows.done[:count].tolist()
+        payloads = [
+            room[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
+        ]
+        return payloads, [names[at : at + size] for at in range(0, ends, size)]
 
     def send(
         self, sock: socket.socket, payloads: Sequence[bytes], peers: Sequence[RawAddress]

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from socket import socket
 from typing import Any
 
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
@@ -191,17 +191,20 @@ class Shell:
     def _read_batch(self, number: int, batch: Batch) -> None:
         """Hear all datagrams that have come to a socket, at most BURST_MAX."""
         self._stopwatch.start()
-        came = batch.receive(self._sockets[number])
+        payloads, raws = batch.receive(self._sockets[number])
         # All of them were here by now; stamped one by one, those behind would seem to come later.
         now_ns = time.monotonic_ns()
-        if not came:
+        if not payloads:
             self._read(number)  # nothing came, or an error, which the plain call tells apart
             return
-        heard, datagrams = self._names.heard, []
-        for payload, raw in came:
-            # OSError: an interface has gone since.
-            with contextlib.suppress(OSError):
-                datagrams.append(Datagram(payload, heard(raw), number))
+        try:
+            peers = self._names.heard_all(raws)
+        except OSError:  # an interface has gone since
+            payloads, peers = self._still_here(payloads, raws)
+        datagrams = [
+            make_datagram((payload, peer, number))
+            for payload, peer in zip(payloads, peers, strict=True)
+        ]
         self._stopwatch.lap("receive")
         hear = self.endpoint.receive
         for datagram in datagrams:
@@ -210,6 +213,18 @@ class Shell:
             except Exception as error:  # a fault of ours is told, and the next datagram is heard
                 self._loop.call_exception_handler({"message": str(error), "exception": error})
         self._after()
+
+    def _still_here(
+        self, payloads: Sequence[bytes], raws: Sequence[bytes]
+    ) -> tuple[list[bytes], list[Address]]:
+        """Payloads and senders of the datagrams that came over an interface that is still there."""
+        kept: list[bytes] = []
+        peers: list[Address] = []
+        for payload, raw in zip(payloads, raws, strict=True):
+            with contextlib.suppress(OSError):
+                peers.append(self._names.heard(raw))
+                kept.append(payload)
+        return kept, peers
 
     def _read(self, number: int) -> None:
         """Hear all datagrams that have come to a socket, one by one."""
@@ -277,10 +292,7 @@ class Shell:
         sock = self._sockets.get(row[0].socket)
         if sock is None:
             return 0
-        payloads, peers = (
-            [datagram.payload for datagram in row],
-            [datagram.peer for datagram in row],
-        )
+        payloads, peers, _ = zip(*row, strict=True)
         try:
             if peers.count(peers[0]) == len(peers) and self._segments.suit(payloads):
                 return self._segments.send(sock, payloads, self._names.kernel(peers[0]))

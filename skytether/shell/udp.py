@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 from skytether.shared.core.endpoint import Address, Form
 from skytether.shared.core.events import address_text
@@ -247,6 +247,17 @@ class Names:
                     self._heard.clear()
                 self._heard[raw] = peer
         return peer
+
+    def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
+        """Peers, as by `heard`.
+
+        Raises:
+            OSError: there is no such interface as the scope of one.
+        """
+        known = list(map(self._heard.get, raws))
+        if None not in known:
+            return cast("list[Address]", known)
+        return list(map(self.heard, raws))
 
     def kernel(self, peer: Address) -> tuple[Any, ...]:
         """Numeric address of a peer, as a socket takes it.
