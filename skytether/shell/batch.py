@@ -189,7 +189,7 @@ class Segments:
         """Largest payload of one datagram for which it is tried [B]. The kernel refuses what is
         longer than the path's MTU, and old kernels refuse all; neither is tried again."""
 
-    def suit(self, payloads: Sequence[bytes]) -> bool:
+    def suits(self, payloads: Sequence[bytes]) -> bool:
         """Whether payloads in this order are sent in fewer calls, and may be."""
         sizes = list(map(len, payloads))
         if not 0 < min(sizes) <= max(sizes) <= self.size_max:

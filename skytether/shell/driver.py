@@ -38,7 +38,8 @@ from skytether.shell.udp import (
 BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
 TOGETHER_MIN = 4
-"""Fewest datagrams that are sent by one `sendmmsg`: fewer take less time one by one."""
+"""Fewest datagrams that are sent by one `sendmmsg`, or came to a socket last time where `recvmmsg`
+reads the next: fewer take less time one by one."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""
@@ -108,6 +109,9 @@ class Shell:
         """Buffer of every datagram: making room for the longest costs more than to copy."""
         self._batches: dict[int, Batch | None] = {}
         """Arrays for the sockets of each family; None where the system has no such calls."""
+        self._crowded: dict[int, Batch] = {}
+        """Sockets to which several datagrams came at once, by number, and the arrays that read the
+        next."""
         self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
         """Address of socket 0."""
@@ -173,11 +177,15 @@ class Shell:
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
-        batch = self._batch(self._sockets[number])
+        self._loop.add_reader(self._sockets[number], self._hear, number)
+
+    def _hear(self, number: int) -> None:
+        """Hear the datagrams that have come to a socket, at most BURST_MAX."""
+        batch = self._crowded.get(number)
         if batch is None:
-            self._loop.add_reader(self._sockets[number], self._read, number)
+            self._read(number)
         else:
-            self._loop.add_reader(self._sockets[number], self._read_batch, number, batch)
+            self._read_batch(number, batch)
 
     def _batch(self, sock: socket) -> Batch | None:
         """Arrays of the socket's family, made when they are first used."""
@@ -189,11 +197,13 @@ class Shell:
         return self._batches[sock.family]
 
     def _read_batch(self, number: int, batch: Batch) -> None:
-        """Hear all datagrams that have come to a socket, at most BURST_MAX."""
+        """Hear datagrams that one call reads."""
         self._stopwatch.start()
         payloads, raws = batch.receive(self._sockets[number])
         # All of them were here by now; stamped one by one, those behind would seem to come later.
         now_ns = time.monotonic_ns()
+        if len(payloads) < TOGETHER_MIN:
+            del self._crowded[number]
         if not payloads:
             self._read(number)  # nothing came, or an error, which the plain call tells apart
             return
@@ -227,12 +237,12 @@ class Shell:
         return kept, peers
 
     def _read(self, number: int) -> None:
-        """Hear all datagrams that have come to a socket, one by one."""
+        """Hear datagrams that are read one by one."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch = self._stopwatch
         try:
-            for _ in range(BURST_MAX):
+            for count in range(BURST_MAX):  # noqa: B007 - used below
                 stopwatch.start()
                 try:
                     size, sender = receive(room)
@@ -243,6 +253,9 @@ class Shell:
                     continue
                 stopwatch.lap("receive")
                 hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+            batch = self._batch(self._sockets[number]) if count >= TOGETHER_MIN else None
+            if batch is not None:
+                self._crowded[number] = batch
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
 
@@ -260,7 +273,9 @@ class Shell:
         endpoint = self.endpoint
         self._stopwatch.start()
         out = endpoint.outbox()
-        if out:
+        if len(out) == 1:
+            self._send(out[0])
+        elif out:
             self._send_all(out)
         self._stopwatch.lap("send")
         due_ns = endpoint.next_wake_ns()
@@ -294,7 +309,7 @@ class Shell:
             return 0
         payloads, peers, _ = zip(*row, strict=True)
         try:
-            if peers.count(peers[0]) == len(peers) and self._segments.suit(payloads):
+            if peers.count(peers[0]) == len(peers) and self._segments.suits(payloads):
                 return self._segments.send(sock, payloads, self._names.kernel(peers[0]))
             batch = self._batch(sock) if len(row) >= TOGETHER_MIN else None
             return batch.send(sock, payloads, list(map(self._names.raw, peers))) if batch else 0
