@@ -143,15 +143,23 @@ class Queue:
             self._later[number] = [held]
             heappush(self._slices, number)
 
-    def pop(self) -> Held:
-        """The packet in front, which is held no longer."""
-        self.size -= 1
-        held = heappop(self.front)
-        if not self.front and self._slices:
-            self._slice = heappop(self._slices)
-            self.front = self._later.pop(self._slice)
-            heapify(self.front)
-        return held
+    def take_due(self, now_ns: int) -> list[Held]:
+        """Packets that are due, in their order, which are held no longer."""
+        due: list[Held] = []
+        front = self.front
+        while front and front[0][0] <= now_ns:
+            if (self._slice + 1) << SLICE_BITS <= now_ns:
+                front.sort()  # the whole slice is due
+                due += front
+                front.clear()
+            else:
+                due.append(heappop(front))
+            if not front and self._slices:
+                self._slice = heappop(self._slices)
+                front = self.front = self._later.pop(self._slice)
+                heapify(front)
+        self.size -= len(due)
+        return due
 
 
 class Link:
@@ -296,8 +304,8 @@ class Link:
         errors_ns: list[int] = []
         rows: list[bytes] = []
         way, pack = self._direction, recorder.pack if recorder else None
-        while queue.front and queue.front[0][0] <= now_ns:
-            due_ns, _, datagram, size, lane, number, delay_ns, is_copy = queue.pop()
+        for held in queue.take_due(now_ns):
+            due_ns, _, datagram, size, lane, number, delay_ns, is_copy = held
             self._bytes -= size
             overtaken = number < lane.newest_out
             if overtaken:
@@ -317,6 +325,16 @@ class Link:
         if recorder is not None and rows:
             recorder.append_packed(rows)
         return out
+
+    def is_due(self, now_ns: int) -> bool:
+        """Whether a packet is due, or has passed the bottleneck."""
+        front = self._queue.front
+        if front and front[0][0] <= now_ns:
+            return True
+        if self._bottleneck is None:
+            return False
+        passed_ns = self._bottleneck.next_due_ns()
+        return passed_ns is not None and passed_ns <= now_ns
 
     def next_due_ns(self) -> int | None:
         """Time at which the next packet is due, or has passed the bottleneck, or None."""

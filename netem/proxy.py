@@ -114,7 +114,8 @@ class Proxy(Endpoint):
         # a flood of new clients.
         flow.order.move_to_end(flow.client)
         # What is not delayed leaves now, and not a wake later.
-        self._forward(now_ns)
+        if self.uplink.is_due(now_ns) or self.downlink.is_due(now_ns):
+            self._forward(now_ns)
 
     def _tell_faults(self, flow: Flow) -> None:
         for lane in (flow.uplink, flow.downlink):
@@ -128,8 +129,7 @@ class Proxy(Endpoint):
 
     def _forward(self, now_ns: int) -> None:
         for link in (self.uplink, self.downlink):
-            due_ns = link.next_due_ns()
-            if due_ns is not None and due_ns <= now_ns:
+            if link.is_due(now_ns):
                 self._out += link.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:

@@ -210,6 +210,9 @@ class Segments:
         while first < count:
             size, last = len(payloads[first]), first + 1
             most = min(count, first + min(SEGMENTS_MAX, SEGMENTED_BYTES_MAX // size))
+            # Mostly all are of one size.
+            if len(set(map(len, payloads[first:most]))) == 1:
+                last = most
             while last < most and len(payloads[last]) == size:
                 last += 1
             control = [(_SOL_UDP, _UDP_SEGMENT, size.to_bytes(2, sys.byteorder))]

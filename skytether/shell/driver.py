@@ -13,6 +13,8 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from itertools import groupby
+from operator import itemgetter
 from socket import socket
 from typing import Any
 
@@ -40,6 +42,8 @@ BURST_MAX = BATCH_MAX
 TOGETHER_MIN = 4
 """Fewest datagrams that are sent by one `sendmmsg`, or came to a socket last time where `recvmmsg`
 reads the next: fewer take less time one by one."""
+SOCKET = itemgetter(2)
+"""Function that takes the number of its socket from a datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""
@@ -291,16 +295,14 @@ class Shell:
 
     def _send_all(self, datagrams: Sequence[Datagram]) -> None:
         """Send datagrams in their order; those in a row that use one socket go together."""
-        first, count = 0, len(datagrams)
-        while first < count:
-            number, last = datagrams[first].socket, first + 1
-            while last < count and datagrams[last].socket == number and last - first < BURST_MAX:
-                last += 1
-            row = datagrams[first:last]
-            # What was not sent together is sent alone: a lost packet is one that failed there, too.
-            for datagram in row[self._send_together(row) :] if len(row) > 1 else row:
-                self._send(datagram)
-            first = last
+        for _, each in groupby(datagrams, SOCKET):
+            same = list(each)
+            for first in range(0, len(same), BURST_MAX):
+                row = same[first : first + BURST_MAX]
+                sent = self._send_together(row) if len(row) > 1 else 0
+                # What was not sent together is sent alone: what failed there fails here, too.
+                for datagram in row[sent:]:
+                    self._send(datagram)
 
     def _send_together(self, row: Sequence[Datagram]) -> int:
         """Send datagrams of one socket in few calls; returns how many went, from the first on."""

@@ -333,11 +333,9 @@ def test_slices_of_time_give_packets_in_the_order_of_one_heap(
         queue.push(held)
         heappush(heap, held)
         now_ns += pause_ns
-        while heap and heap[0][0] <= now_ns:
-            assert queue.front[0] is heap[0]
-            assert queue.pop() is heappop(heap)
+        due = [heappop(heap) for _ in range(sum(held[0] <= now_ns for held in heap))]
+        assert queue.take_due(now_ns) == due
         assert queue.size == len(heap)
-        assert bool(queue.front) == bool(heap)
-    while heap:
-        assert queue.pop() is heappop(heap)
+        assert queue.front[:1] == heap[:1]
+    assert queue.take_due(1 << 62) == sorted(heap)
     assert (queue.size, queue.front, queue._later, queue._slices) == (0, [], {}, [])
