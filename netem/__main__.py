@@ -7,6 +7,7 @@ from skytether.shell.start import run
 if __name__ == "__main__":  # before the imports below, which take a while
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
+import gc
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -22,6 +23,10 @@ from skytether.shell.command import ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
 from skytether.shell.udp import files_max, sockets_max
+
+COLLECT_AFTER = 100_000
+"""Number of new objects after which garbage is collected: packets under way are no garbage, and the
+default of 700 objects looks through all of them many times a second."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,7 @@ def emulate(argv: Sequence[str]) -> None:
     SIGUSR1 prints what was counted so far, the end does so, too. With --control, `skytether set`
     changes directions meanwhile. Without --uplink and --downlink the network is the scenario's.
     """
+    gc.set_threshold(COLLECT_AFTER)
     options = _with_directions(
         command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__)
     )

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
 from skytether.shared.core.events import Fault, FlowOpened
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
@@ -93,7 +93,7 @@ class Proxy(Endpoint):
             if flow is None:
                 self.refused += 1
                 return
-            onward = Datagram(payload, self._server, flow.socket)
+            onward = make_datagram((payload, self._server, flow.socket))
             self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
@@ -101,21 +101,27 @@ class Proxy(Endpoint):
             if flow is None or peer != self._server:
                 self.refused += 1
                 return
-            self.uplink.take(Datagram(payload, flow.client), flow.uplink, now_ns=now_ns)
+            onward = make_datagram((payload, flow.client, 0))
+            self.uplink.take(onward, flow.uplink, now_ns=now_ns)
             # Its place is earned by the server's answer, for a sender's address can be made up.
             if flow.order is self._unanswered:
                 flow.order = self._answered
                 self._answered[flow.client] = self._unanswered.pop(flow.client)
-        for lane in (flow.uplink, flow.downlink):
-            if lane.fates.fault and lane.fates.fault not in self._faults:
-                self._faults.add(lane.fates.fault)
-                self._events.append(Fault(traceback=lane.fates.fault))
+        if flow.uplink.fates.fault or flow.downlink.fates.fault:
+            self._tell_faults(flow)
         flow.used_ns = now_ns
         # Both dictionaries stay ordered by use: the oldest flow is found without a search, also in
         # a flood of new clients.
         flow.order.move_to_end(flow.client)
         # What is not delayed leaves now, and not a wake later.
-        self._forward(now_ns)
+        if self.uplink.is_due(now_ns) or self.downlink.is_due(now_ns):
+            self._forward(now_ns)
+
+    def _tell_faults(self, flow: Flow) -> None:
+        for lane in (flow.uplink, flow.downlink):
+            if lane.fates.fault and lane.fates.fault not in self._faults:
+                self._faults.add(lane.fates.fault)
+                self._events.append(Fault(traceback=lane.fates.fault))
 
     def wake(self, *, now_ns: int) -> None:
         """Send the packets that are due."""
@@ -123,8 +129,7 @@ class Proxy(Endpoint):
 
     def _forward(self, now_ns: int) -> None:
         for link in (self.uplink, self.downlink):
-            due_ns = link.next_due_ns()
-            if due_ns is not None and due_ns <= now_ns:
+            if link.is_due(now_ns):
                 self._out += link.give(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:

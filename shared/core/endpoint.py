@@ -8,7 +8,8 @@ many in virtual time.
 
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 from skytether.shared.core.events import Event, Omitted
@@ -34,6 +35,10 @@ class Datagram(NamedTuple):
     """Address of the sender, or of the receiver."""
     socket: int = 0
     """Number of the endpoint's own socket that it uses; 0 is the one that is bound."""
+
+
+make_datagram: Callable[[tuple[bytes, Address, int]], Datagram] = partial(tuple.__new__, Datagram)
+"""A datagram, of its three values: in half of the time that `Datagram` takes."""
 
 
 class Form(NamedTuple):

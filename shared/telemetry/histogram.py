@@ -1,6 +1,6 @@
 """Histograms of durations, which take as much memory for many as for few."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from skytether.shared.base.units import MILLISECOND_NS
 
@@ -27,6 +27,16 @@ class Histogram:
         self.counts[index if index < BINS else -1] += 1
         if value_ns > self.largest_ns:  # noqa: PLR1730
             self.largest_ns = value_ns
+
+    def add_all(self, values_ns: Iterable[int]) -> None:
+        """Count durations [ns]."""
+        counts, bin_ns, largest_ns = self.counts, self.bin_ns, self.largest_ns
+        for value_ns in values_ns:
+            index = value_ns // bin_ns
+            counts[index if index < BINS else -1] += 1
+            if value_ns > largest_ns:  # noqa: PLR1730
+                largest_ns = value_ns
+        self.largest_ns = largest_ns
 
     def quantile_ms(self, share: float) -> float:
         """Upper edge of the bin in which the quantile of this share lies [ms]; 0 without any."""

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -207,6 +207,9 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     )
 
 
+PIECE_ROWS = 1024
+"""Most rows that a recorder gives to a sink in one piece."""
+
 UPLINK, DOWNLINK = 0, 1
 
 PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
@@ -251,6 +254,8 @@ class Recorder:
         self.columns = columns
         self._sinks: list[Sink] = []
         self._row = _row(columns)
+        self.pack = self._row.pack
+        """Function that makes the bytes of a row, of a value for every column in order."""
         if sink is not None:
             sink.write(json.dumps(columns.descr).encode() + b"\n")
             self._sinks.append(sink)
@@ -271,6 +276,12 @@ class Recorder:
         row = self._row.pack(*values)
         for sink in self._sinks:
             sink.write(row)
+
+    def append_packed(self, rows: Sequence[bytes]) -> None:
+        """Append rows, made by `pack`, in few pieces."""
+        # A sink that has no room drops a whole piece, so a piece is not long.
+        for first in range(0, len(rows), PIECE_ROWS):
+            self._write(b"".join(rows[first : first + PIECE_ROWS]))
 
     def _write(self, rows: bytes) -> None:
         for sink in self._sinks:

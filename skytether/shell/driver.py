@@ -1,6 +1,7 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp`. The
+All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp` and
+`shell.batch`. The
 shell knows nothing of control or of the protocol: datagrams and time go in, datagrams and events
 come out.
 """
@@ -13,13 +14,16 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from itertools import groupby
+from operator import itemgetter
 from socket import socket
 from typing import Any
 
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shell.batch import BATCH_MAX, Batch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.stream import ByteStream
@@ -31,12 +35,16 @@ from skytether.shell.udp import (
     is_loopback,
     kernel_drops,
     open_socket,
-    to_kernel,
     within_reach_of,
 )
 
-BURST_MAX = 128
+BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
+TOGETHER_MIN = 4
+"""Fewest datagrams that are sent by one `sendmmsg`, or came to a socket last time where `recvmmsg`
+reads the next: fewer take less time one by one."""
+SOCKET = itemgetter(2)
+"""Function that takes the number of its socket from a datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""
@@ -104,6 +112,12 @@ class Shell:
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """Buffer of every datagram: making room for the longest costs more than to copy."""
+        self._batches: dict[int, Batch | None] = {}
+        """Arrays for the sockets of each family; None where the system has no such calls."""
+        self._crowded: dict[int, Batch] = {}
+        """Sockets to which several datagrams came at once, by number, and the arrays that read the
+        next."""
+        self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
         """Address of socket 0."""
 
@@ -154,8 +168,7 @@ class Shell:
                 self._feed.end()
             self._timer.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
-            for datagram in self.endpoint.outbox():
-                self._send(datagram)
+            self._send_all(self.endpoint.outbox())
             self._drops = self.kernel_drops()
             for sock in self._sockets.values():
                 self._loop.remove_reader(sock)
@@ -169,14 +182,72 @@ class Shell:
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
-        self._loop.add_reader(self._sockets[number], self._read, number)
+        self._loop.add_reader(self._sockets[number], self._hear, number)
+
+    def _hear(self, number: int) -> None:
+        """Hear the datagrams that have come to a socket, at most BURST_MAX."""
+        batch = self._crowded.get(number)
+        if batch is None:
+            self._read(number)
+        else:
+            self._read_batch(number, batch)
+
+    def _batch(self, sock: socket) -> Batch | None:
+        """Arrays of the socket's family, made when they are first used."""
+        if sock.family not in self._batches:
+            try:
+                self._batches[sock.family] = Batch(sock.family)
+            except OSError:
+                self._batches[sock.family] = None
+        return self._batches[sock.family]
+
+    def _read_batch(self, number: int, batch: Batch) -> None:
+        """Hear datagrams that one call reads."""
+        self._stopwatch.start()
+        payloads, raws = batch.receive(self._sockets[number])
+        # All of them were here by now; stamped one by one, those behind would seem to come later.
+        now_ns = time.monotonic_ns()
+        if len(payloads) < TOGETHER_MIN:
+            del self._crowded[number]
+        if not payloads:
+            self._read(number)  # nothing came, or an error, which the plain call tells apart
+            return
+        try:
+            peers = self._names.heard_all(raws)
+        except OSError:  # an interface has gone since
+            payloads, peers = self._still_here(payloads, raws)
+        datagrams = [
+            make_datagram((payload, peer, number))
+            for payload, peer in zip(payloads, peers, strict=True)
+        ]
+        self._stopwatch.lap("receive")
+        hear = self.endpoint.receive
+        for datagram in datagrams:
+            try:
+                hear(datagram, now_ns=now_ns)
+            except Exception as error:  # a fault of ours is told, and the next datagram is heard
+                self._loop.call_exception_handler({"message": str(error), "exception": error})
+        self._after()
+
+    def _still_here(
+        self, payloads: Sequence[bytes], raws: Sequence[bytes]
+    ) -> tuple[list[bytes], list[Address]]:
+        """Payloads and senders of the datagrams that came over an interface that is still there."""
+        kept: list[bytes] = []
+        peers: list[Address] = []
+        for payload, raw in zip(payloads, raws, strict=True):
+            with contextlib.suppress(OSError):
+                peers.append(self._names.heard(raw))
+                kept.append(payload)
+        return kept, peers
 
     def _read(self, number: int) -> None:
+        """Hear datagrams that are read one by one."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch = self._stopwatch
         try:
-            for _ in range(BURST_MAX):
+            for count in range(BURST_MAX):  # noqa: B007 - used below
                 stopwatch.start()
                 try:
                     size, sender = receive(room)
@@ -187,6 +258,9 @@ class Shell:
                     continue
                 stopwatch.lap("receive")
                 hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+            batch = self._batch(self._sockets[number]) if count >= TOGETHER_MIN else None
+            if batch is not None:
+                self._crowded[number] = batch
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
             self._after()
 
@@ -203,8 +277,11 @@ class Shell:
         """Send what the endpoint wants sent, arm its timer, hand on its events and its rows."""
         endpoint = self.endpoint
         self._stopwatch.start()
-        for datagram in endpoint.outbox():
-            self._send(datagram)
+        out = endpoint.outbox()
+        if len(out) == 1:
+            self._send(out[0])
+        elif out:
+            self._send_all(out)
         self._stopwatch.lap("send")
         due_ns = endpoint.next_wake_ns()
         if due_ns != self._armed:
@@ -217,6 +294,31 @@ class Shell:
         if self._feed:
             self._feed.take()
 
+    def _send_all(self, datagrams: Sequence[Datagram]) -> None:
+        """Send datagrams in their order; those in a row that use one socket go together."""
+        for _, each in groupby(datagrams, SOCKET):
+            same = list(each)
+            for first in range(0, len(same), BURST_MAX):
+                row = same[first : first + BURST_MAX]
+                sent = self._send_together(row) if len(row) > 1 else 0
+                # What was not sent together is sent alone: what failed there fails here, too.
+                for datagram in row[sent:]:
+                    self._send(datagram)
+
+    def _send_together(self, row: Sequence[Datagram]) -> int:
+        """Send datagrams of one socket in few calls; returns how many went, from the first on."""
+        sock = self._sockets.get(row[0].socket)
+        if sock is None:
+            return 0
+        payloads, peers, _ = zip(*row, strict=True)
+        try:
+            if peers.count(peers[0]) == len(peers) and self._segments.suits(payloads):
+                return self._segments.send(sock, payloads, self._names.kernel(peers[0]))
+            batch = self._batch(sock) if len(row) >= TOGETHER_MIN else None
+            return batch.send(sock, payloads, list(map(self._names.raw, peers))) if batch else 0
+        except OSError:  # an address that is none
+            return 0
+
     def _send(self, datagram: Datagram) -> None:
         payload, peer, number = datagram
         if peer == LINE:
@@ -227,7 +329,7 @@ class Shell:
             if sock is None:
                 sock = self._sockets[number] = open_socket(self._elsewhere)
                 self._listen(number)
-            sock.sendto(payload, to_kernel(self._names.number(peer)))
+            sock.sendto(payload, self._names.kernel(peer))
         except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
             self.send_errors += 1
 

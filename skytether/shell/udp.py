@@ -12,10 +12,11 @@ import socket
 import struct
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 from skytether.shared.core.endpoint import Address, Form
 from skytether.shared.core.events import address_text
+from skytether.shell.batch import RawAddress, pack_address, unpack_address
 
 BUFFER_BYTES = 4 * 1024 * 1024
 """Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
@@ -23,6 +24,9 @@ BUFFER_BYTES = 4 * 1024 * 1024
 FLOODED_BYTES = 16 * 1024 * 1024
 """Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
 come through, what a process can read that waits for a core for half a second."""
+
+ADDRESSES_MAX = 8192
+"""Most addresses whose other forms are kept; with more peers they are worked out again."""
 
 SPARE_FILES = 48
 """Number of open files that a process may need beside its sockets, with all who look on."""
@@ -192,6 +196,8 @@ class Names:
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
         self._names: list[Address] = []
+        self._heard: dict[RawAddress, Address] = {}
+        self._reached: dict[Address, tuple[tuple[Any, ...], RawAddress]] = {}
         for peer in peers:
             self.add(peer)
 
@@ -225,6 +231,64 @@ class Names:
         """Peer with a numeric address, as the user has written it."""
         return self._by_number.get(number, number)
 
+    def heard(self, raw: RawAddress) -> Address:
+        """Peer with an address in the kernel's own form, as the user has written it.
+
+        Raises:
+            OSError: there is no such interface as its scope.
+        """
+        peer = self._heard.get(raw)
+        if peer is None:
+            number = from_kernel(unpack_address(raw))
+            peer = self.name(number)
+            # An interface that was unplugged may come back with another index.
+            if "%" not in number[0]:
+                if len(self._heard) >= ADDRESSES_MAX:
+                    self._heard.clear()
+                self._heard[raw] = peer
+        return peer
+
+    def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
+        """Peers, as by `heard`.
+
+        Raises:
+            OSError: there is no such interface as the scope of one.
+        """
+        known = list(map(self._heard.get, raws))
+        if None not in known:
+            return cast("list[Address]", known)
+        return list(map(self.heard, raws))
+
+    def kernel(self, peer: Address) -> tuple[Any, ...]:
+        """Numeric address of a peer, as a socket takes it.
+
+        Raises:
+            OSError: there is no such interface as its scope.
+        """
+        return self._reach(peer)[0]
+
+    def raw(self, peer: Address) -> RawAddress:
+        """Numeric address of a peer in the kernel's own form; empty where it has none.
+
+        Raises:
+            OSError: there is no such interface as its scope.
+        """
+        return self._reach(peer)[1]
+
+    def _reach(self, peer: Address) -> tuple[tuple[Any, ...], RawAddress]:
+        reached = self._reached.get(peer)
+        if reached is None:
+            address, raw = to_kernel(self.number(peer)), b""
+            # The socket's plain call says what is wrong with an address that cannot be packed.
+            with contextlib.suppress(OSError, OverflowError):
+                raw = pack_address(address)
+            reached = address, raw
+            if len(address) == 2:  # without a scope, see `heard`
+                if len(self._reached) >= ADDRESSES_MAX:
+                    self._reached.clear()
+                self._reached[peer] = reached
+        return reached
+
     def look_up(self) -> dict[Address, Address]:
         """All names looked up anew, without those that cannot be found just now; blocks."""
         found = {}
@@ -237,6 +301,8 @@ class Names:
         """Let these numbers stand for these peers from now on."""
         self._numbers |= found
         self._by_number = {number: name for name, number in self._numbers.items()}
+        self._heard.clear()
+        self._reached.clear()
 
 
 def look_up(peer: Address) -> Address:

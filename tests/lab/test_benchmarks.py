@@ -23,6 +23,7 @@ from skytether.lab.benchmarks import (
     link,
     netem,
     restarts,
+    sockets,
     solvers,
     starting,
     tick,
@@ -55,6 +56,7 @@ TINY = MappingProxyType(
         "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
         "growth": growth.GrowthCounts((10, 20), (2,), (1, 4), 2),
         "wire": wire.WireCounts(each=10),
+        "sockets": sockets.SocketCounts(datagrams=1, turns=2),
         "accuracy": accuracy.AccuracyCounts(ticks=3, random=2, horizons=(1, 30)),
         "link": link.LinkCounts(
             packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable
+from heapq import heappop, heappush
 
 import pytest
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from skytether.netem import link as link_module
 from skytether.netem.fate import Fates
-from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
+from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, Held, Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
@@ -312,3 +313,29 @@ def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
         seen.append((link.next_due_ns() or 0) - now_ns)
     assert seen == [fates.at(slot).delay_ns for slot in (60, 60, 61)]
     assert seen[0] != seen[2]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3 << SLICE_BITS), st.integers(0, 2 << SLICE_BITS)),
+        max_size=60,
+    )
+)
+def test_slices_of_time_give_packets_in_the_order_of_one_heap(
+    steps: list[tuple[int, int]],
+) -> None:
+    """By due time and then by order of entry, whenever packets enter and leave."""
+    queue, now_ns = link_module.Queue(), 0
+    heap: list[Held] = []
+    lane = make_lane()
+    for entered, (delay_ns, pause_ns) in enumerate(steps):
+        held = (now_ns + delay_ns, entered, packet(""), 0, lane, entered, delay_ns, False)
+        queue.push(held)
+        heappush(heap, held)
+        now_ns += pause_ns
+        due = [heappop(heap) for _ in range(sum(held[0] <= now_ns for held in heap))]
+        assert queue.take_due(now_ns) == due
+        assert queue.size == len(heap)
+        assert queue.front[:1] == heap[:1]
+    assert queue.take_due(1 << 62) == sorted(heap)
+    assert (queue.size, queue.front, queue._later, queue._slices) == (0, [], {}, [])

@@ -1,0 +1,227 @@
+"""Batches of datagrams: one system call receives or sends many of them, on Linux.
+
+`recvmmsg` and `sendmmsg` take an array of message headers, which this module lays out once in
+memory that stays where it is. A third way, UDP segmentation offload, sends datagrams of one size to
+one peer as a single long one, which the kernel cuts up as late as it can.
+
+None of them says which datagram failed and why. Where one does not do all of its work, the caller
+repeats the first datagram that is left by the plain call of its socket, which raises the error that
+belongs to it.
+"""
+
+import contextlib
+import ctypes
+import errno
+import mmap
+import socket
+import struct
+import sys
+from collections.abc import Sequence
+from operator import ne
+from typing import Any
+
+BATCH_MAX = 128
+"""Most datagrams in one call."""
+SIZE_MAX = 2048
+"""Largest payload that `Batch.send` takes [B]: packets of a flight have at most 1200."""
+SEGMENTS_MAX = 64
+"""Most datagrams that are sent as one; older kernels take no more."""
+SEGMENTED_BYTES_MAX = 65_000
+"""Largest payload of all datagrams that are sent as one [B]; IP allows a little more."""
+SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
+"""Largest payload of a datagram that is sent with another one as one [B]."""
+
+_STRIDE = 65_536 + 4096 + 64
+"""Distance of two datagrams that are received [B]: room for the longest, and an odd number of cache
+lines, so that their first bytes do not all compete for the same lines."""
+_STARTS = range(0, _STRIDE * BATCH_MAX, _STRIDE)
+_SOL_UDP, _UDP_SEGMENT = 17, 103
+_HEADER = struct.Struct("@QI4xQQQQi4xI4x")
+"""Layout of `struct mmsghdr`: address of the name and its size, address and number of the buffers,
+address and size of control data, flags, size of what was received or sent."""
+_BUFFER = struct.Struct("@QQ")
+"""Layout of `struct iovec`: address of a buffer and its size."""
+_MSG_DONTWAIT = 0x40
+_IPV4, _IPV6 = struct.Struct("=HH4s8x"), struct.Struct("=HHI16sI")
+"""Layouts of `struct sockaddr_in` and `sockaddr_in6`; ports are in network order."""
+
+RawAddress = bytes
+"""Address of a peer in the kernel's own form, `struct sockaddr_in` or `sockaddr_in6`."""
+
+
+def pack_address(address: tuple[str, int] | tuple[str, int, int, int]) -> RawAddress:
+    """Numeric address in the kernel's own form.
+
+    Args:
+        address: of two values for IPv4, or for IPv6 without a scope, and else of four.
+
+    Raises:
+        OSError: the host is no numeric address.
+        OverflowError: the port is not between 0 and 65535.
+    """
+    host, port, flow, scope = address if len(address) == 4 else (*address, 0, 0)
+    if not 0 <= port <= 0xFFFF:
+        raise OverflowError(f"got port {port}, expected 0 to 65535")
+    if ":" in host:
+        number = socket.inet_pton(socket.AF_INET6, host)
+        return _IPV6.pack(socket.AF_INET6, socket.htons(port), socket.htonl(flow), number, scope)
+    number = socket.inet_pton(socket.AF_INET, host)
+    return _IPV4.pack(socket.AF_INET, socket.htons(port), number)
+
+
+def unpack_address(raw: RawAddress) -> tuple[str, int] | tuple[str, int, int, int]:
+    """Address as `socket.recvfrom` returns it."""
+    if len(raw) == _IPV4.size:
+        _, port, number = _IPV4.unpack(raw)
+        return socket.inet_ntop(socket.AF_INET, number), socket.ntohs(port)
+    _, port, flow, number, scope = _IPV6.unpack(raw)
+    host = socket.inet_ntop(socket.AF_INET6, number)
+    return host, socket.ntohs(port), socket.ntohl(flow), scope
+
+
+class _Headers:
+    """Array of `struct mmsghdr`, each with one buffer and one name.
+
+    Args:
+        stride: distance of two buffers [B].
+        size: size of each buffer [B].
+        name_bytes: size of an address of the sockets' family [B].
+    """
+
+    def __init__(self, stride: int, size: int, name_bytes: int) -> None:
+        # Pages that were never written to take no memory: a process that receives one datagram at
+        # a time takes one page and not 9 MB, which a bytearray would, or a huge page.
+        room = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        with contextlib.suppress(OSError):  # a kernel without huge pages
+            room.madvise(mmap.MADV_NOHUGEPAGE)
+        self.room = memoryview(room)
+        self.names = bytearray(name_bytes * BATCH_MAX)
+        buffers, headers = bytearray(_BUFFER.size * BATCH_MAX), bytearray(_HEADER.size * BATCH_MAX)
+        at, names_at, buffers_at = (_address(each) for each in (room, self.names, buffers))
+        for i in range(BATCH_MAX):
+            _BUFFER.pack_into(buffers, i * _BUFFER.size, at + i * stride, size)
+            name, buffer = names_at + i * name_bytes, buffers_at + i * _BUFFER.size
+            _HEADER.pack_into(headers, i * _HEADER.size, name, name_bytes, buffer, 1, 0, 0, 0, 0)
+        self.first = ctypes.c_void_p(_address(headers))
+        """Address of the array."""
+        self.sizes = memoryview(buffers).cast("Q")[1::2]
+        """Sizes of the buffers [B]; shape (BATCH_MAX,)."""
+        self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
+        """Sizes of what was received [B]; shape (BATCH_MAX,)."""
+
+
+def _address(room: bytearray | mmap.mmap) -> int:
+    """Address of memory, which cannot be moved any more."""
+    return ctypes.addressof(ctypes.c_char.from_buffer(room))
+
+
+class Batch:
+    """Preallocated arrays with which all sockets of one family receive and send.
+
+    Args:
+        family: AF_INET or AF_INET6.
+
+    Raises:
+        OSError: this system has no such calls.
+    """
+
+    def __init__(self, family: int) -> None:
+        if sys.platform != "linux" or _HEADER.size != 64:
+            raise OSError(errno.ENOSYS, "recvmmsg and sendmmsg are used on 64-bit Linux alone")
+        # The interpreter's lock is kept: neither call ever waits, and a thread that took the lock
+        # meanwhile would keep it for 5 ms.
+        libc = ctypes.PyDLL(None)
+        try:
+            self._receive, self._send = libc.recvmmsg, libc.sendmmsg
+        except AttributeError as missing:
+            raise OSError(errno.ENOSYS, "this libc has no recvmmsg") from missing
+        self._name_bytes = (_IPV4 if family == socket.AF_INET else _IPV6).size
+        self._in = _Headers(_STRIDE, 65_536, self._name_bytes)
+        self._out = _Headers(SIZE_MAX, 0, self._name_bytes)
+
+    def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress]]:
+        """Payloads and senders of the datagrams that have arrived, at most BATCH_MAX.
+
+        Args:
+            sock: socket of this family.
+
+        Returns:
+            payloads and senders in the order of arrival; none where nothing came, or an error.
+        """
+        rows, size = self._in, self._name_bytes
+        count = self._receive(sock.fileno(), rows.first, BATCH_MAX, _MSG_DONTWAIT, None)
+        if count <= 0:
+            return [], []
+        room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
+        lengths = rows.done[:count].tolist()
+        payloads = [
+            room[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
+        ]
+        return payloads, [names[at : at + size] for at in range(0, ends, size)]
+
+    def send(
+        self, sock: socket.socket, payloads: Sequence[bytes], peers: Sequence[RawAddress]
+    ) -> int:
+        """Send datagrams in their order; returns how many went, from the first on.
+
+        Args:
+            sock: socket of this family.
+            payloads: at most BATCH_MAX; none goes where one is longer than SIZE_MAX.
+            peers: address of each; none goes where one is of another family.
+        """
+        rows, count, at, name_bytes = self._out, len(payloads), 0, self._name_bytes
+        if max(map(len, payloads)) > SIZE_MAX or any(len(peer) != name_bytes for peer in peers):
+            return 0
+        room, sizes = rows.room, rows.sizes
+        for i, payload in enumerate(payloads):
+            size = sizes[i] = len(payload)
+            room[at : at + size] = payload
+            at += SIZE_MAX
+        rows.names[: count * name_bytes] = b"".join(peers)
+        return max(0, self._send(sock.fileno(), rows.first, count, _MSG_DONTWAIT))
+
+
+class Segments:
+    """UDP segmentation offload: datagrams of one size to one peer leave in one call."""
+
+    def __init__(self) -> None:
+        self.size_max = SEGMENT_BYTES_MAX if sys.platform == "linux" else 0
+        """Largest payload of one datagram for which it is tried [B]. The kernel refuses what is
+        longer than the path's MTU, and old kernels refuse all; neither is tried again."""
+
+    def suits(self, payloads: Sequence[bytes]) -> bool:
+        """Whether payloads in this order are sent in fewer calls, and may be."""
+        sizes = list(map(len, payloads))
+        if not 0 < min(sizes) <= max(sizes) <= self.size_max:
+            return False
+        # A call for segments takes as long as two datagrams.
+        changes = sum(map(ne, sizes, sizes[1:]))
+        return 2 * (changes + 1) <= len(sizes)
+
+    def send(self, sock: socket.socket, payloads: Sequence[bytes], peer: tuple[Any, ...]) -> int:
+        """Send datagrams in their order; returns how many went, from the first on.
+
+        Args:
+            sock: socket to send from.
+            payloads: payloads that suit.
+            peer: their receiver, as the kernel takes it.
+        """
+        first, count = 0, len(payloads)
+        while first < count:
+            size, last = len(payloads[first]), first + 1
+            most = min(count, first + min(SEGMENTS_MAX, SEGMENTED_BYTES_MAX // size))
+            # Mostly all are of one size.
+            if len(set(map(len, payloads[first:most]))) == 1:
+                last = most
+            while last < most and len(payloads[last]) == size:
+                last += 1
+            control = [(_SOL_UDP, _UDP_SEGMENT, size.to_bytes(2, sys.byteorder))]
+            try:
+                sock.sendmsg(payloads[first:last], control, 0, peer)
+            except BlockingIOError:
+                break  # no room for all of them; perhaps there is some for one
+            except OSError:
+                self.size_max = min(self.size_max, size - 1)
+                break
+            first = last
+        return first

@@ -1,0 +1,373 @@
+"""`shell.batch`: many datagrams in one system call, and the driver that uses it."""
+
+import asyncio
+import socket
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+
+import pytest
+
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Event, Fault
+from skytether.shell import batch as batch_module
+from skytether.shell import driver
+from skytether.shell.batch import (
+    BATCH_MAX,
+    SEGMENTS_MAX,
+    SIZE_MAX,
+    Batch,
+    Segments,
+    pack_address,
+    unpack_address,
+)
+from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.udp import ADDRESSES_MAX, Names, open_socket
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux has these calls alone")
+
+FAMILIES = {"127.0.0.1": socket.AF_INET, "::1": socket.AF_INET6}
+
+
+@pytest.fixture(params=FAMILIES)
+def host(request: pytest.FixtureRequest) -> str:
+    """Loopback address of either family."""
+    return str(request.param)
+
+
+@pytest.fixture
+def ends(host: str) -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two sockets of one family."""
+    with ExitStack() as stack:
+        here, there = (stack.enter_context(open_socket((host, 0))) for _ in range(2))
+        yield here, there
+
+
+def received(sock: socket.socket) -> list[bytes]:
+    """Payloads that wait at a socket."""
+    found = []
+    while True:
+        try:
+            found.append(sock.recv(70_000))
+        except BlockingIOError:
+            return found
+
+
+def raw_of(sock: socket.socket) -> bytes:
+    """Address of a socket in the kernel's own form."""
+    return pack_address(sock.getsockname())
+
+
+def test_datagrams_arrive_whole_in_order_and_with_their_senders(
+    host: str, ends: tuple[socket.socket, socket.socket]
+) -> None:
+    """Whatever their size, from none to the longest that UDP carries."""
+    here, there = ends
+    batch, payloads = Batch(FAMILIES[host]), [b"", b"a", bytes(range(256)) * 255, b"z" * 1200]
+    for payload in payloads:
+        there.sendto(payload, here.getsockname())
+    came, raws = batch.receive(here)
+    assert came == payloads
+    assert [unpack_address(raw) for raw in raws] == [there.getsockname()] * len(payloads)
+    assert batch.receive(here) == ([], [])
+
+
+def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
+    host: str, ends: tuple[socket.socket, socket.socket]
+) -> None:
+    """No more than BATCH_MAX at once, so that timers and other sockets have their turn."""
+    here, there = ends
+    batch, numbered = Batch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
+    assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
+    assert batch.send(there, numbered[BATCH_MAX:], [raw_of(here)] * 3) == 3
+    assert batch.receive(here)[0] == numbered[:BATCH_MAX]
+    assert batch.receive(here)[0] == numbered[BATCH_MAX:]
+
+
+def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
+    """Also after a batch of other sizes and peers: nothing of it is left in the arrays."""
+    with ExitStack() as stack:
+        socks = [stack.enter_context(open_socket((host, 0))) for _ in range(5)]
+        batch, payloads = Batch(FAMILIES[host]), [b"%d" % i * (i + 1) for i in range(4)]
+        assert batch.send(socks[4], [b"x" * SIZE_MAX] * 4, [raw_of(socks[0])] * 4) == 4
+        assert batch.send(socks[4], payloads, [raw_of(sock) for sock in socks[:4]]) == 4
+        assert received(socks[0]) == [b"x" * SIZE_MAX] * 4 + payloads[:1]
+        assert [received(sock) for sock in socks[1:4]] == [[payload] for payload in payloads[1:]]
+
+
+def test_sending_stops_at_the_first_that_fails() -> None:
+    """What went is counted from the first on: port 0 is none that anybody can have."""
+    with open_socket(("127.0.0.1", 0)) as here, open_socket(("127.0.0.1", 0)) as there:
+        batch, good, bad = Batch(socket.AF_INET), raw_of(there), pack_address(("127.0.0.1", 0))
+        assert batch.send(here, [b"1", b"2", b"3", b"4"], [good, good, bad, good]) == 2
+        assert batch.send(here, [b"3", b"4"], [bad, good]) == 0
+        assert received(there) == [b"1", b"2"]
+
+
+def test_nothing_is_sent_that_is_too_long_or_of_another_family() -> None:
+    """The plain call of the socket sends it, or says why it cannot."""
+    with open_socket(("127.0.0.1", 0)) as here:
+        batch, own = Batch(socket.AF_INET), raw_of(here)
+        assert batch.send(here, [b"1", b"2" * (SIZE_MAX + 1)], [own, own]) == 0
+        assert batch.send(here, [b"1", b"2"], [own, pack_address(("::1", 1))]) == 0
+        assert batch.send(here, [b"1", b"2"], [own, b""]) == 0
+        assert received(here) == []
+
+
+@pytest.mark.parametrize(
+    ("address", "length"),
+    [
+        (("192.0.2.1", 5000), 16),
+        (("2001:db8::1", 65535, 0, 0), 28),
+        (("fe80::1", 1, 0, 7), 28),
+    ],
+)
+def test_addresses_keep_their_value_in_the_kernels_form(
+    address: tuple[str, int], length: int
+) -> None:
+    """Scope included."""
+    raw = pack_address(address)
+    assert (len(raw), unpack_address(raw)) == (length, address)
+
+
+@pytest.mark.parametrize("address", [("nobody.invalid", 1), ("", 1), ("192.0.2", 1)])
+def test_a_name_has_no_kernels_form(address: Address) -> None:
+    """Nothing is looked up while datagrams wait."""
+    with pytest.raises(OSError, match="illegal"):
+        pack_address(address)
+    names = Names(())
+    assert names.raw(address) == b""
+    assert names.kernel(address) == address
+
+
+def test_known_addresses_are_forgotten_with_a_name_that_moves() -> None:
+    """A restarted host has a new number; so does what was worked out from the old one."""
+    names, peer = Names(()), ("ground", 5000)
+    names.learn({peer: ("192.0.2.1", 5000)})
+    old, new = pack_address(("192.0.2.1", 5000)), pack_address(("192.0.2.2", 5000))
+    assert (names.raw(peer), names.heard_all([old, new])) == (
+        old,
+        [peer, ("192.0.2.2", 5000)],
+    )
+    names.learn({peer: ("192.0.2.2", 5000)})
+    assert (names.raw(peer), names.kernel(peer)) == (new, ("192.0.2.2", 5000))
+    assert names.heard_all([old, new]) == [("192.0.2.1", 5000), peer]
+
+
+def test_strangers_take_no_more_memory_than_allowed() -> None:
+    """A flood from made-up addresses fills neither table."""
+    names = Names(())
+    for i in range(ADDRESSES_MAX + 10):
+        address = (f"10.{i >> 16}.{i >> 8 & 255}.{i & 255}", 1)
+        assert names.heard(pack_address(address)) == address
+        assert names.kernel(address) == address
+    assert len(names._heard) == len(names._reached) == 10
+
+
+def test_segments_arrive_as_the_datagrams_that_they_were(
+    ends: tuple[socket.socket, socket.socket],
+) -> None:
+    """In order, with their own lengths, and more of them than one call takes."""
+    here, there = ends
+    segments, payloads = Segments(), [b"%4d" % i * 25 for i in range(SEGMENTS_MAX + 7)]
+    payloads += [b"%4d" % i for i in range(20)]
+    assert segments.suits(payloads)
+    assert segments.send(here, payloads, there.getsockname()) == len(payloads)
+    assert received(there) == payloads
+
+
+@pytest.mark.parametrize(
+    ("sizes", "suit"),
+    [
+        ([100, 100], True),
+        ([100, 100, 7, 7], True),
+        ([100, 7], False),
+        ([100, 100, 7], False),
+        ([0, 0, 0], False),
+        ([40_000, 40_000], False),
+    ],
+)
+def test_segments_suit_payloads_of_few_sizes(sizes: Sequence[int], suit: bool) -> None:
+    """An empty datagram is none of them: a call cannot be cut into empty pieces."""
+    assert Segments().suits([bytes(size) for size in sizes]) is suit
+
+
+def test_segments_that_the_kernel_refuses_are_not_tried_again() -> None:
+    """Such as those longer than the path's MTU; shorter ones still are."""
+    with open_socket(("127.0.0.1", 0)) as here:
+        segments, nowhere = Segments(), ("127.0.0.1", 0)
+        assert segments.send(here, [bytes(900)] * 3, nowhere) == 0
+        assert not segments.suits([bytes(900)] * 3)
+        assert segments.suits([bytes(899)] * 3)
+
+
+# -- the driver ------------------------------------------------------------------------------
+
+
+class Answering(Endpoint):
+    """An endpoint that answers what it hears, in one go, once it has heard enough."""
+
+    def __init__(self, enough: int, answer: Callable[[Datagram], Sequence[Datagram]]) -> None:
+        super().__init__()
+        self.heard: list[Datagram] = []
+        self.stamps_ns: list[int] = []
+        self._enough, self._answer = enough, answer
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has heard enough."""
+        return len(self.heard) >= self._enough
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Keep a datagram; fail at the one that asks for it."""
+        self.heard.append(datagram)
+        self.stamps_ns.append(now_ns)
+        if self.finished:
+            for each in self.heard:
+                self._out += self._answer(each)
+        if datagram.payload == b"fail":
+            raise ZeroDivisionError("by zero")
+
+    def wake(self, *, now_ns: int) -> None:
+        """Do nothing."""
+
+    def next_wake_ns(self) -> int | None:
+        """Never."""
+        return None
+
+
+@pytest.fixture(params=[True, False], ids=["batches", "plain"])
+def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the system has the calls for batches; where it has none, the plain ones serve."""
+    if not request.param:
+
+        def missing(_: int) -> Batch:
+            raise OSError("this system has no such calls")
+
+        monkeypatch.setattr(driver, "Batch", missing)
+        monkeypatch.setattr(batch_module, "SEGMENT_BYTES_MAX", 0)
+    return bool(request.param)
+
+
+def converse(
+    endpoint: Endpoint, pieces: Sequence[tuple[socket.socket, Sequence[bytes]]]
+) -> tuple[Shell, list[Event]]:
+    """Send pieces to a driven endpoint, each after the one before was heard, until it finishes."""
+    events: list[Event] = []
+
+    async def fly() -> Shell:
+        shell = Shell(endpoint, ("127.0.0.1", 0))
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: events.append(driver._fault(context)))
+        task = loop.create_task(shell.run(events.append))
+        await asyncio.sleep(0)
+        for sock, payloads in pieces:
+            for payload in payloads:
+                sock.sendto(payload, shell.address)
+            await asyncio.sleep(0.01)
+        await asyncio.wait_for(task, 5.0)
+        return shell
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        return runner.run(fly()), events
+
+
+@pytest.mark.usefixtures("batches")
+def test_a_burst_is_heard_and_answered_in_order() -> None:
+    """The first burst is read one by one, the second in one call, the third one by one again."""
+    with open_socket(("127.0.0.1", 0)) as sock, open_socket(("127.0.0.1", 0)) as other:
+        bursts = [[b"%d" % i for i in range(200)], [b"%d" % i for i in range(200, 300)], [b"300"]]
+        endpoint = Answering(302, lambda datagram: [datagram])
+        shell, _ = converse(
+            endpoint, [(sock, bursts[0]), (sock, bursts[1]), (sock, bursts[2]), (other, [b"other"])]
+        )
+        numbered = [payload for burst in bursts for payload in burst]
+        assert [datagram.payload for datagram in endpoint.heard] == [*numbered, b"other"]
+        assert endpoint.heard[-1].peer == other.getsockname()
+        assert {datagram.peer for datagram in endpoint.heard[:-1]} == {sock.getsockname()}
+        assert endpoint.stamps_ns == sorted(endpoint.stamps_ns)
+        assert (received(sock), received(other)) == (numbered, [b"other"])
+        assert shell.send_errors == 0
+
+
+@pytest.mark.usefixtures("batches")
+def test_a_datagram_that_cannot_be_sent_is_counted_and_the_others_go() -> None:
+    """Too long, to no port, and to another family."""
+    nowhere: list[Address] = [("127.0.0.1", 0), ("::1", 5000)]
+
+    def answer(datagram: Datagram) -> list[Datagram]:
+        good = datagram._replace(payload=b"good")
+        too_long = datagram._replace(payload=bytes(65_508))
+        lost = [Datagram(b"lost", peer) for peer in nowhere]
+        return [good, too_long, good, lost[0], good, lost[1], good, good]
+
+    with open_socket(("127.0.0.1", 0)) as sock:
+        shell, _ = converse(Answering(1, answer), [(sock, [b"hello"])])
+        assert received(sock) == [b"good"] * 5
+        assert shell.send_errors == 3
+
+
+@pytest.mark.usefixtures("batches")
+@pytest.mark.parametrize("size", [4, 1200, 30_000])
+def test_answers_of_one_size_arrive_one_by_one(size: int) -> None:
+    """However long, and however many there are."""
+    with open_socket(("127.0.0.1", 0)) as sock:
+        payloads = [b"%4d" % i * (size // 4) for i in range(70)]
+        endpoint = Answering(1, lambda datagram: [datagram._replace(payload=p) for p in payloads])
+        shell, _ = converse(endpoint, [(sock, [b"hello"])])
+        assert received(sock) == payloads
+        assert shell.send_errors == 0
+
+
+@pytest.mark.usefixtures("batches")
+def test_a_peer_that_has_gone_disturbs_nobody_else() -> None:
+    """The kernel is told that its port is closed, in the middle of answers to others."""
+    with open_socket(("127.0.0.1", 0)) as sock:
+        with open_socket(("127.0.0.1", 0)) as gone:
+            closed = gone.getsockname()
+
+        def answer(datagram: Datagram) -> list[Datagram]:
+            return [datagram, Datagram(b"lost", closed)] if datagram.peer != closed else []
+
+        numbered = [b"%d" % i for i in range(20)]
+        shell, _ = converse(Answering(20, answer), [(sock, numbered)])
+        assert received(sock) == numbered
+        assert shell.send_errors == 0
+
+
+@pytest.mark.usefixtures("batches")
+def test_a_fault_in_the_middle_of_a_batch_costs_no_other_datagram() -> None:
+    """It is told as often as it happens, and what came behind it is heard."""
+    with open_socket(("127.0.0.1", 0)) as sock:
+        burst = [b"%d" % i for i in range(20)]
+        endpoint = Answering(42, lambda _: [])
+        _, events = converse(endpoint, [(sock, burst), (sock, [b"fail", *burst, b"fail"])])
+        assert [each.payload for each in endpoint.heard] == [*burst, b"fail", *burst, b"fail"]
+        assert [type(event) for event in events] == [Fault, Fault]
+
+
+def test_a_crowded_socket_is_read_in_batches_and_a_quiet_one_is_not() -> None:
+    """One datagram takes less time by the plain call."""
+    with open_socket(("127.0.0.1", 0)) as sock:
+        seen: list[bool] = []
+        endpoint = Answering(31, lambda _: [])
+        shells: list[Shell] = []
+
+        class Watched(Shell):
+            def _hear(self, number: int) -> None:
+                seen.append(number in self._crowded)
+                super()._hear(number)
+
+        async def fly() -> None:
+            shells.append(Watched(endpoint, ("127.0.0.1", 0)))
+            task = asyncio.get_running_loop().create_task(shells[0].run())
+            await asyncio.sleep(0)
+            for count in (1, 10, 10, 1, 9):
+                for _ in range(count):
+                    sock.sendto(b"x", shells[0].address)
+                await asyncio.sleep(0.01)
+            await asyncio.wait_for(task, 5.0)
+
+        with asyncio.Runner(loop_factory=new_event_loop) as runner:
+            runner.run(fly())
+        assert seen == [False, False, True, True, False]
