@@ -1,9 +1,8 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
 All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp` and
-`shell.batch`. The
-shell knows nothing of control or of the protocol: datagrams and time go in, datagrams and events
-come out.
+`shell.batch`. The shell knows nothing of control or of the protocol: datagrams and time go in,
+datagrams and events come out.
 """
 
 import asyncio
