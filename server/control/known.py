@@ -45,6 +45,8 @@ class Known:
         """Motion to be sent at this step."""
         self.turned = 0.0
         """Angle by which it aims to the right of its goal [rad]."""
+        self.number = 0
+        """Its number, when it was last observed."""
         self.heard = False
         """Whether an observation has come in this session."""
         self.unknown_until = -1
