@@ -10,7 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.shared.base.kernel import B1, F1, F2, F3, I1, making_kernel, making_part
+from skytether.shared.base.kernel import (
+    B1,
+    F1,
+    F2,
+    F3,
+    I1,
+    kernel,
+    making_kernel,
+    making_part,
+    part,
+)
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
 
@@ -55,9 +65,9 @@ class FlownMotions:
         self.count = 0
         self.scale, self.dt_s = scale, dt_s
         room, axes = 64, len(scale)
-        numbers = [np.zeros(room, dtype=np.int64) for _ in range(3)]
-        knots = np.zeros((2, room, KNOTS, axes))
-        self.arrays = Flown(*numbers, np.zeros(room), *knots, *np.zeros((2, room, axes)))
+        numbers, widths = np.zeros((3, room), dtype=np.int64), np.zeros(room)
+        knots, corners = np.zeros((2, room, KNOTS, axes)), np.zeros((2, room, axes))
+        self.arrays = Flown._make([*numbers, widths, *knots, *corners])
 
     def replace(self, row: int, motions: Sequence[Motion], ahead: int, wide_m: float) -> None:
         """Replace all motions of a vehicle; see `add`."""
@@ -75,8 +85,9 @@ class FlownMotions:
             wide_m: distance to be kept from it beyond that from others [m].
         """
         if self.count == len(self.arrays.of):
-            doubled = [np.concatenate([each, np.zeros_like(each)]) for each in self.arrays]
-            self.arrays = Flown(*doubled)
+            self.arrays = Flown._make(
+                np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
+            )
         _add(self.arrays, self.count, row, motion, ahead, wide_m, self.scale, self.dt_s)
         self.count += 1
 
@@ -84,6 +95,23 @@ class FlownMotions:
     def of(self) -> Indices:
         """Row of the vehicle of each; shape (count,)."""
         return self.arrays.of[: self.count]
+
+
+def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
+    """Positions [m] and velocities [m/s] of a motion at steps SPACING apart; see `Motion.at`.
+
+    Args:
+        motion: any.
+        begin: the first step.
+        count: number of steps.
+        dt_s: length of a step [s].
+
+    Returns:
+        two arrays of shape (count, axes).
+    """
+    position, velocity = np.empty((2, count, motion.position.shape[1]))
+    _states(motion, begin, dt_s, position, velocity)
+    return position, velocity
 
 
 def too_near(
@@ -164,30 +192,46 @@ def half_planes(
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
-@making_part
-def _place(motion: Motion, axis: int, step: float, dt_s: float) -> float:
-    """Position of a motion on an axis at a step."""
+@part
+def _state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
+    """Position and velocity of a motion on an axis at a step; see `Motion.at`."""
     position, velocity = motion.position, motion.velocity
     along = (step - motion.first) / SPACING
     if along <= 0.0:
-        return float(position[0, axis])
+        return position[0, axis], velocity[0, axis]
     if along >= len(position) - 1:
-        return float(position[-1, axis])
+        return position[-1, axis], velocity[-1, axis]
     knot = int(along)
     T = SPACING * dt_s
     t = (along - knot) * T
     v = velocity[knot, axis]
-    return float(position[knot, axis] + t * (v + 0.5 * t / T * (velocity[knot + 1, axis] - v)))
+    gained = t / T * (velocity[knot + 1, axis] - v)
+    return position[knot, axis] + t * (v + 0.5 * gained), v + gained
 
 
-@making_part
+@part
+def _place(motion: Motion, axis: int, step: float, dt_s: float) -> float:
+    """Position of a motion on an axis at a step."""
+    return _state(motion, axis, step, dt_s)[0]
+
+
+@kernel
+def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2) -> None:
+    """Fill in `states`."""
+    for i in range(len(position)):
+        for x in range(position.shape[1]):
+            step = float(begin + i * SPACING)
+            position[i, x], velocity[i, x] = _state(motion, x, step, dt_s)
+
+
+@making_part  # numba counts references to what it returns
 def _flown_one(flown: Flown, m: int) -> Motion:
     """The motion at a place of those that may be flown."""
     n = flown.knots[m]
     return Motion(flown.first[m], flown.position[m, :n], flown.velocity[m, :n])
 
 
-@making_part
+@part
 def _bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
     """Fill in two corners of a box around a motion, scaled [m]."""
     position, velocity = motion.position, motion.velocity
@@ -203,7 +247,7 @@ def _bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
         low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
 
 
-@making_part
+@part
 def _is_far(flown: Flown, m: int, low: F1, high: F1, keep: float) -> bool:
     """Whether boxes alone say that a motion keeps its distance from one that may be flown."""
     square = 0.0
@@ -213,20 +257,35 @@ def _is_far(flown: Flown, m: int, low: F1, high: F1, keep: float) -> bool:
     return square > keep * keep
 
 
-@making_kernel
+@part
+def _write(
+    flown: Flown, m: int, row: int, first: int, position: F2, velocity: F2, wide: float
+) -> None:
+    """Write a motion down at a place, but for its box."""
+    n, axes = position.shape
+    flown.first[m], flown.knots[m], flown.of[m], flown.wide[m] = first, n, row, wide
+    for knot in range(n):
+        for x in range(axes):
+            flown.position[m, knot, x] = position[knot, x]
+            flown.velocity[m, knot, x] = velocity[knot, x]
+
+
+@kernel
 def _remove(flown: Flown, count: int, row: int) -> int:
     """Remove the motions of a vehicle, the last ones taking their places; number that is left."""
     for m in range(count - 1, -1, -1):
-        if flown.of[m] == row:
-            count -= 1
-            flown.first[m], flown.knots[m] = flown.first[count], flown.knots[count]
-            flown.of[m], flown.wide[m] = flown.of[count], flown.wide[count]
-            flown.position[m], flown.velocity[m] = flown.position[count], flown.velocity[count]
-            flown.low[m], flown.high[m] = flown.low[count], flown.high[count]
+        if flown.of[m] != row:
+            continue
+        count -= 1
+        n, wide = flown.knots[count], flown.wide[count]
+        position, velocity = flown.position[count, :n], flown.velocity[count, :n]
+        _write(flown, m, flown.of[count], flown.first[count], position, velocity, wide)
+        for x in range(flown.low.shape[1]):
+            flown.low[m, x], flown.high[m, x] = flown.low[count, x], flown.high[count, x]
     return count
 
 
-@making_kernel
+@kernel
 def _add(
     flown: Flown,
     m: int,
@@ -238,14 +297,12 @@ def _add(
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
-    n = len(motion.position)
-    flown.first[m], flown.knots[m] = motion.first - ahead, n
-    flown.of[m], flown.wide[m] = row, wide
-    flown.position[m, :n], flown.velocity[m, :n] = motion.position, motion.velocity
+    first, position, velocity = motion.first - ahead, motion.position, motion.velocity
+    _write(flown, m, row, first, position, velocity, wide)
     _bound(motion, scale, dt_s, flown.low[m], flown.high[m])
 
 
-@making_part
+@part
 def _least_apart(
     one: Motion, other: Motion, begin: int, scale: F1, dt_s: float, here: F1, there: F1
 ) -> float:
@@ -254,17 +311,16 @@ def _least_apart(
     Args:
         here, there: scratch; shape (axes,).
     """
-    longest = max(len(one.position) * SPACING + one.first, len(other.position) * SPACING + other.first)
+    longest = max(
+        len(one.position) * SPACING + one.first, len(other.position) * SPACING + other.first
+    )
     pieces = max(-(-(longest - SPACING - begin) * SAMPLES // SPACING), 1)
     nearest = np.inf
     for i in range(pieces + 1):
         step = begin + i * (SPACING / SAMPLES)
         for x in range(len(scale)):
-            here[x] = there[x]
             away = _place(one, x, step, dt_s) - _place(other, x, step, dt_s)
-            there[x] = scale[x] * away
-        if i == 0:
-            here[:] = there
+            here[x], there[x] = there[x] if i else scale[x] * away, scale[x] * away
         way, off = 0.0, 0.0
         for x in range(len(scale)):
             way += (there[x] - here[x]) ** 2

@@ -72,7 +72,10 @@ class MotionPlan:
             # along an axis cautious.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         place = np.arange(n)
-        to_velocity, to_position = T * np.tril(np.ones((n, n))), _positions(place + 1.0, place, T)
+        to_velocity, to_position = (
+            T * np.tril(np.ones((n, n))),
+            _positions(np.arange(1.0, n + 1.0), place, T),
+        )
         self.times: Array = np.arange(n * SUB + 1) / SUB
         """Times at which distances are kept, in intervals from where the plan begins."""
         weights = np.ones(n)
@@ -98,18 +101,20 @@ class MotionPlan:
         """Largest distance between two motions from one state at those times [m]."""
 
     def solve(
-        self, p0: Array, v0: Array, goal: Array, planes: HalfPlanes | None = None
+        self, kept_p: Array, kept_v: Array, goal: Array, planes: HalfPlanes | None = None
     ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots, the given state first; None without a solution.
+        """Positions and velocities of the knots, the given ones first; None without a solution.
 
         Args:
-            p0, v0: where it begins [m, m/s]; shape (axes,).
+            kept_p, kept_v: knots of the motion in force, the last one where the plan begins
+                [m, m/s]; shape (kept, axes).
             goal: what it aims at, g [m]; shape (axes,).
             planes: constraints on positions at `times`.
         """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
         least = np.empty(fixed + (len(planes.at) if planes else 0))
+        p0, v0 = kept_p[-1], kept_v[-1]
         _pose(self._posing, p0, v0, goal, linear, least)
         # The constraints that are always there are kept as columns, and half-planes are put behind
         # them.
@@ -120,12 +125,13 @@ class MotionPlan:
         x = self._solver.solve(linear, columns, least, self._axes)
         if x is None:
             return None
-        position, velocity = np.empty((2, INTERVALS + 1, self._axes))
-        _fly(self._posing, x, p0, v0, position, velocity)
+        position, velocity = np.empty((2, len(kept_p) + INTERVALS, self._axes))
+        _fly(self._posing, x, kept_p, kept_v, position, velocity)
         return position, velocity
 
     def at_times(self, position: Array, velocity: Array) -> Array:
         """Positions at `times` of knots that `solve` has found [m]; shape (times, axes)."""
+        position, velocity = position[-INTERVALS - 1 :], velocity[-INTERVALS - 1 :]
         accelerations = np.diff(velocity, axis=0) / self._posing.T
         drifting = position[0] + self.times[:, None] * self._posing.T * velocity[0]
         placed: Array = drifting + self._posing.to_sample @ accelerations
@@ -154,9 +160,7 @@ def _pose(posing: Posing, p0: F1, v0: F1, goal: F1, linear: F1, least: F1) -> No
 
 
 @kernel
-def _keep_apart(
-    posing: Posing, p0: F1, v0: F1, planes: HalfPlanes, columns: F2, least: F1
-) -> None:
+def _keep_apart(posing: Posing, p0: F1, v0: F1, planes: HalfPlanes, columns: F2, least: F1) -> None:
     """Fill in the last columns and bounds, those of half-planes."""
     n, fixed = len(posing.weights), len(least) - len(planes.at)
     for m in range(len(planes.at)):
@@ -171,20 +175,23 @@ def _keep_apart(
 
 
 @kernel
-def _fly(posing: Posing, found: F1, p0: F1, v0: F1, position: F2, velocity: F2) -> None:
-    """Fill in the knots by the accelerations that were found."""
-    n = len(posing.weights)
-    for x in range(len(p0)):
-        position[0, x], velocity[0, x] = p0[x], v0[x]
+def _fly(posing: Posing, found: F1, kept_p: F2, kept_v: F2, position: F2, velocity: F2) -> None:
+    """Fill in the knots: those that are kept, and others by the accelerations that were found."""
+    n, kept = len(posing.weights), len(kept_p)
+    for x in range(position.shape[1]):
+        for knot in range(kept):
+            position[knot, x], velocity[knot, x] = kept_p[knot, x], kept_v[knot, x]
+        p0, v0 = kept_p[kept - 1, x], kept_v[kept - 1, x]
         gained, moved = 0.0, 0.0
         for i in range(n):
+            knot = kept + i
             gained += posing.T * found[x * n + i]
             # The last velocity is 0 to within the tolerance of the solver, and a motion has to end
             # at rest.
-            velocity[i + 1, x] = v0[x] + gained if i < n - 1 else 0.0
+            velocity[knot, x] = v0 + gained if i < n - 1 else 0.0
             # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
-            moved += 0.5 * posing.T * (velocity[i + 1, x] + velocity[i, x])
-            position[i + 1, x] = p0[x] + moved
+            moved += 0.5 * posing.T * (velocity[knot, x] + velocity[knot - 1, x])
+            position[knot, x] = p0 + moved
 
 
 def _positions(times: Array, place: Indices, T: float) -> Array:

@@ -28,7 +28,6 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from statistics import median
 
 import numpy as np
 
@@ -65,6 +64,10 @@ STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
+
+SILENT = np.zeros((), dtype=FIGURES)
+"""Figures of a vehicle to which nothing is sent."""
+SILENT["gap"], SILENT["solved"] = 1, True
 
 
 class Together:
@@ -129,8 +132,13 @@ class Together:
         )
         self._now, self._ahead = 0, np.zeros(capacity, dtype=np.int64)
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
-        self._met = np.zeros(capacity, dtype=np.bool_)
-        """Whether that is known of a row."""
+        self._met, self._heard, self._asks = np.zeros((3, capacity), dtype=np.bool_)
+        """Whether that is known of a row, an observation has come in this session, and one is to
+        tell whether a motion was taken."""
+        self._number = np.zeros(capacity, dtype=np.int64)
+        """Number of the vehicle that was observed in a row last."""
+        self._unknown_until = np.full(capacity, -1, dtype=np.int64)
+        """Step from which on a motion is over that another server has sent, by row."""
         self._flown = FlownMotions(self._scale, terms.dt_s)
         """All motions that may be flown, but for those of rows in `_changed`."""
         self._changed: set[int] = set()
@@ -144,8 +152,7 @@ class Together:
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
-        if row in self._rows:
-            self._rows[row].heard = False
+        self._heard[row] = False
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -155,7 +162,7 @@ class Together:
         self.observed_step[row] = k
         self._state[row] = observation.state
         known = self._rows.setdefault(row, Known())
-        known.number = self._number_of(row)
+        self._number[row] = self._number_of(row)
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
@@ -164,10 +171,10 @@ class Together:
         elif known.in_force is None or known.in_force.step != observation.in_force:
             found = next((each for each in known.sent if each.step == observation.in_force), None)
             if found is None:  # of another server, or of a vehicle that was in this row before
-                known.unknown_until = observation.in_force + LONGEST
+                self._unknown_until[row] = observation.in_force + LONGEST
                 found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
             known.in_force = found
-        if k <= known.unknown_until:
+        if k <= self._unknown_until[row]:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         self._changed.add(row)
         newest, motion = known.in_force
@@ -176,7 +183,7 @@ class Together:
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
             known.learn(gone.step == newest and k <= observation.since + 1)
-        known.heard = True
+        self._heard[row], self._asks[row] = True, bool(known.sent)
         return True
 
     def _measure(self, row: int, known: Known, expected: Array) -> None:
@@ -212,19 +219,16 @@ class Together:
         """Plan for vehicles every SPACING steps, not all at the same."""
         figures, n = self.figures, len(rows)
         self._meet(rows, step)
-        figures["row"][:n], figures["step"][:n] = rows, step
-        figures["start"][:n], figures["gap"][:n] = step, 1
-        figures["solved"], figures["fresh"] = True, False
-        for name in ("state_gap", "expected_gap", "cost_gap", "deviation_m"):
-            figures[name] = 0.0
-        for i, (row, k) in enumerate(zip(rows.tolist(), step.tolist(), strict=True)):
-            known = self._rows.get(row)
-            if known is None:
-                continue
-            known.again = known.owed(k) if known.sent else None
-            # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
-            # before it.
-            if known.heard and (k - known.number) % SPACING == 0:
+        figures[:n] = SILENT
+        figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
+        # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+        # before it.
+        turn = self._heard[rows] & ((step - self._number[rows]) % SPACING == 0)
+        for i in (turn | self._asks[rows]).nonzero()[0].tolist():
+            row, k = int(rows[i]), int(step[i])
+            known = self._rows[row]
+            known.again = known.owed(k)
+            if turn[i]:
                 self._decide(row, known, k)
             # A figure above any threshold: a motion that was found has to be sent.
             if known.next or known.again:
@@ -250,6 +254,8 @@ class Together:
             found.told.back[i] = int(step[i]) - k
             if not known.again:
                 known.sent.append(Sent(k, motion))
+                self._asks[rows[i]] = True
+                self._changed.add(int(rows[i]))
 
     # -- zones -------------------------------------------------------------------------------------
 
@@ -283,19 +289,18 @@ class Together:
     def _meet(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
         # The median, for one vehicle that begins anew must not move the grid of all others.
-        known = (step - self._ahead[rows])[self._met[rows]]
-        self._now = int(median(known.tolist())) if len(known) else self._now + 1
-        self._changed.update(rows[step - self._now != self._ahead[rows]].tolist())
+        ahead = self._ahead[rows]
+        known = (step - ahead)[self._met[rows]]
+        middle = len(known) // 2
+        self._now = int(np.partition(known, middle)[middle]) if len(known) else self._now + 1
+        self._changed.update(rows[step - self._now != ahead].tolist())
         self._ahead[rows], self._met[rows] = step - self._now, True
         for row in self._decided.intersection(rows.tolist()):
             self._rows[row].next = None
             self._changed.add(row)
             self._decided.remove(row)
-        self._foreign = None
-        for row, each in self._rows.items():
-            if each.heard and self.observed_step[row] <= each.unknown_until:
-                self._foreign = row
-                break
+        foreign = self._heard & (self.observed_step <= self._unknown_until)
+        self._foreign = int(foreign.argmax()) if foreign.any() else None
 
     def _gather(self) -> None:
         """Bring all motions that may be flown side by side, those that are others since then."""
@@ -353,7 +358,7 @@ class Together:
             return
         self._gather()
         way = self._way(row, goal)
-        if known.is_stuck(k, goal, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())):
+        if known.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:]))):
             self._ask(row, way)
         known.next = self._toward(row, known, k, goal)
         if known.next is None:
@@ -364,8 +369,8 @@ class Together:
     def _goal(self, row: int) -> Array:
         """Goal of a vehicle at the present step [m]; shape (axes,)."""
         k = self._now + int(self._ahead[row])
-        wanted: Array = self._references(self._number_of(row))(np.array(k * self._dt_s))[:, 0]
-        return wanted
+        wanted = self._references(self._number_of(row))(np.array(k * self._dt_s))
+        return np.ascontiguousarray(wanted[:, 0])  # kernels reckon with that
 
     def _way(self, row: int, goal: Array) -> Array:
         """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
@@ -419,27 +424,24 @@ class Together:
         assert known.in_force is not None
         dt_s, plan, base = self._dt_s, self._plan, known.in_force.motion
         due = k + self._lead
-        kept_p, kept_v = base.at(np.arange(k, due + 1, SPACING, dtype=np.float64), dt_s)
-        p0, v0 = kept_p[-1], kept_v[-1]
+        kept = apart.states(base, k, self._lead // SPACING + 1, dt_s)
+        p0 = kept[0][-1]
         planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
         for aim in self._aims.of(known, k, p0, goal, partial(self._rests, row)):
             for _ in range(ROUNDS):
                 held = planes.of_some(taken) if planes else None
-                solved = plan.solve(p0, v0, aim, held)
+                solved = plan.solve(*kept, aim, held)
                 if solved is None:
                     self.counts["unsolved"] += 1
                     return None
-                p, v = solved
-                motion = Motion(
-                    k, np.concatenate([kept_p, p[1:]]), np.concatenate([kept_v, v[1:]])
-                )
+                motion = Motion(k, *solved)
                 hit = self._hit(row, motion, k)
                 if not (hit & ~taken).any():
                     break
                 taken |= hit
                 planes = planes or self._planes(row, base, due)
             # A plan that hardly moves is taken for stuck, and another aim is tried.
-            moved_m, far_m = math.dist(p[-1], p0), math.dist(aim, p0)
+            moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(aim, p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
                 return motion
