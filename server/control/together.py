@@ -133,8 +133,8 @@ class Together:
         self._now, self._ahead = 0, np.zeros(capacity, dtype=np.int64)
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
         self._met, self._heard, self._asks = np.zeros((3, capacity), dtype=np.bool_)
-        """Whether that is known of a row, an observation has come in this session, and one is to
-        tell whether a motion was taken."""
+        """Whether that is known of a row, an observation has come in this session, and a motion may
+        be sent once more."""
         self._number = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle that was observed in a row last."""
         self._unknown_until = np.full(capacity, -1, dtype=np.int64)
@@ -176,15 +176,20 @@ class Together:
             known.in_force = found
         if k <= self._unknown_until[row]:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
-        self._changed.add(row)
         newest, motion = known.in_force
         self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
             known.learn(gone.step == newest and k <= observation.since + 1)
-        self._heard[row], self._asks[row] = True, bool(known.sent)
+        self._heard[row] = True
+        self._note(row, known)
         return True
+
+    def _note(self, row: int, known: Known) -> None:
+        """Take note that what may be flown, or sent again, is something else."""
+        self._changed.add(row)
+        self._asks[row], known.again = bool(known.sent) and known.copies > 1, None
 
     def _measure(self, row: int, known: Known, expected: Array) -> None:
         """Take note of how far a vehicle may be from where its motion has it."""
@@ -254,8 +259,7 @@ class Together:
             found.told.back[i] = int(step[i]) - k
             if not known.again:
                 known.sent.append(Sent(k, motion))
-                self._asks[rows[i]] = True
-                self._changed.add(int(rows[i]))
+                self._note(int(rows[i]), known)
 
     # -- zones -------------------------------------------------------------------------------------
 
@@ -291,10 +295,11 @@ class Together:
         # The median, for one vehicle that begins anew must not move the grid of all others.
         ahead = self._ahead[rows]
         known = (step - ahead)[self._met[rows]]
-        middle = len(known) // 2
-        self._now = int(np.partition(known, middle)[middle]) if len(known) else self._now + 1
-        self._changed.update(rows[step - self._now != ahead].tolist())
-        self._ahead[rows], self._met[rows] = step - self._now, True
+        known.sort()
+        self._now = int(known[len(known) // 2]) if len(known) else self._now + 1
+        found = step - self._now
+        self._changed.update(rows[found != ahead].tolist())
+        self._ahead[rows], self._met[rows] = found, True
         for row in self._decided.intersection(rows.tolist()):
             self._rows[row].next = None
             self._changed.add(row)
@@ -351,7 +356,7 @@ class Together:
         if known.aside and (self._now > known.aside.until or not self._to_pass(known.aside, home)):
             known.aside = None
         goal = known.aside.place if known.aside else home
-        if np.abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
+        if abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
             known.turned = 0.0
             if known.aside:
                 known.waits = f"vehicle {self._number_of(known.aside.asker)} to pass"
