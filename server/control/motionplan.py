@@ -44,7 +44,7 @@ class Posing(NamedTuple):
     most: F1
     """Bound of v_n + τ a_n on each axis, u [m/s]; shape (axes,)."""
     weights: F1
-    """w_n; shape (N,)."""
+    """Weights w_n of positions; shape (N,)."""
     to_position: F2
     """Positions of the knots by accelerations [s²]; shape (N, N)."""
     times: F1

@@ -309,11 +309,10 @@ class Together:
 
     def _gather(self) -> None:
         """Bring all motions that may be flown side by side, those that are others since then."""
-        for row in self._changed:
-            each = self._rows.get(row)
+        for row in self._changed & self._rows.keys():
+            each = self._rows[row]
             # All that may be flown, also those whose acknowledgement is still under way.
-            motions = each.motions() if each else ()
-            self._flown.replace(row, motions, int(self._ahead[row]), each.off_m if each else 0.0)
+            self._flown.replace(row, each.motions(), int(self._ahead[row]), each.off_m)
         self._changed.clear()
 
     def _decide(self, row: int, known: Known, k: int) -> None:
