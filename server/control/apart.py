@@ -5,11 +5,22 @@ are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, hig
 as downwash asks for.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from skytether.shared.base.kernel import F1, F2, F3, I1, making_kernel, making_part
+from skytether.shared.base.kernel import (
+    B1,
+    F1,
+    F2,
+    F3,
+    I1,
+    kernel,
+    making_kernel,
+    making_part,
+    part,
+)
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
 
@@ -17,91 +28,114 @@ KNOTS = INTERVALS + JOIN_MAX + 1
 """Largest number of knots of a motion."""
 SAMPLES = 4
 """Number of straight pieces that an interval of a motion is taken for."""
+NEARER_M = 1e-3
+"""Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
+
+
+class Flown(NamedTuple):
+    """Motions that may be flown, side by side, by steps that all vehicles have in common."""
+
+    first: I1
+    """Step of the first knot; shape (room,)."""
+    knots: I1
+    """Number of knots; shape (room,)."""
+    of: I1
+    """Row of the vehicle; shape (room,)."""
+    wide: F1
+    """Distance to be kept beyond that from others [m]; shape (room,)."""
+    position: F3
+    """Positions of the knots [m]; shape (room, KNOTS, axes)."""
+    velocity: F3
+    """Velocities there [m/s]; shape (room, KNOTS, axes)."""
+    low: F2
+    """Corner of a box around the whole motion, scaled [m]; shape (room, axes)."""
+    high: F2
+    """The opposite corner."""
 
 
 class FlownMotions:
-    """Motions that may be flown, side by side, by steps that all vehicles have in common.
+    """All motions that may be flown. Those of a vehicle are replaced when they change.
 
     Args:
-        axes: number of axes.
+        scale: see above; shape (axes,).
+        dt_s: length of a step [s].
     """
 
-    def __init__(self, axes: int) -> None:
-        self._axes = axes
-        self.clear(64)
-
-    def clear(self, room: int = 0) -> None:
-        """Remove all motions; makes room for so many where that is more than there was."""
+    def __init__(self, scale: Array, dt_s: float) -> None:
         self.count = 0
-        if room:
-            self._first, self._knots, self._of = (np.zeros(room, dtype=np.int64) for _ in range(3))
-            self._wide = np.zeros(room)
-            self._position, self._velocity = np.zeros((2, room, KNOTS, self._axes))
+        self.scale, self.dt_s = scale, dt_s
+        room, axes = 64, len(scale)
+        numbers, widths = np.zeros((3, room), dtype=np.int64), np.zeros(room)
+        knots, corners = np.zeros((2, room, KNOTS, axes)), np.zeros((2, room, axes))
+        self.arrays = Flown._make([*numbers, widths, *knots, *corners])
 
-    def add(self, motion: Motion, ahead: int, row: int, wide_m: float = 0.0) -> None:
+    def replace(self, row: int, motions: Sequence[Motion], ahead: int, wide_m: float) -> None:
+        """Replace all motions of a vehicle; see `add`."""
+        self.count = _remove(self.arrays, self.count, row)
+        for motion in motions:
+            self.add(row, motion, ahead, wide_m)
+
+    def add(self, row: int, motion: Motion, ahead: int, wide_m: float) -> None:
         """Add a motion.
 
         Args:
+            row: of the vehicle.
             motion: by the steps of its vehicle.
             ahead: number of steps by which that is ahead of those in common.
-            row: of the vehicle.
             wide_m: distance to be kept from it beyond that from others [m].
         """
-        i, knots = self.count, len(motion.position)
-        if i == len(self._first):
-            for name in ("_first", "_knots", "_of", "_wide", "_position", "_velocity"):
-                held = getattr(self, name)
-                setattr(self, name, np.concatenate([held, np.zeros_like(held)]))
-        self._first[i], self._knots[i], self._of[i] = motion.first - ahead, knots, row
-        self._wide[i] = wide_m
-        self._position[i, :knots], self._velocity[i, :knots] = motion.position, motion.velocity
+        if self.count == len(self.arrays.of):
+            self.arrays = Flown._make(
+                np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
+            )
+        _add(self.arrays, self.count, row, motion, ahead, wide_m, self.scale, self.dt_s)
         self.count += 1
 
     @property
     def of(self) -> Indices:
         """Row of the vehicle of each; shape (count,)."""
-        return self._of[: self.count]
-
-    @property
-    def wide_m(self) -> Array:
-        """Distance to be kept from each beyond that from others [m]; shape (count,)."""
-        return self._wide[: self.count]
-
-    @property
-    def arrays(self) -> tuple[Indices, Indices, Array, Array, Indices]:
-        """First step, number of knots, positions and velocities of these, and row of each."""
-        n = self.count
-        return self._first[:n], self._knots[:n], self._position[:n], self._velocity[:n], self.of
-
-    @property
-    def last(self) -> int:
-        """Step from which on all of them rest."""
-        first, knots, *_ = self.arrays
-        return int((first + (knots - 1) * SPACING).max(initial=-(2**62)))
+        return self.arrays.of[: self.count]
 
 
-def least_apart(
-    motion: Motion, begin: int, row: int, flown: FlownMotions, scale: Array, dt_s: float
-) -> Array:
-    """Least distance of a motion from each that may be flown, from a step on for ever [m].
-
-    It is that of straight pieces, SAMPLES an interval, which `bend_m` makes up for.
+def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
+    """Positions [m] and velocities [m/s] of a motion at steps SPACING apart; see `Motion.at`.
 
     Args:
-        motion: by the steps in common.
-        begin: step from which on.
-        row: the vehicle's, whose own motions do not count.
-        flown: motions of all.
-        scale: see above; shape (axes,).
+        motion: any.
+        begin: the first step.
+        count: number of steps.
         dt_s: length of a step [s].
 
     Returns:
-        shape (flown.count,); infinite for its own.
+        two arrays of shape (count, axes).
     """
-    least = np.empty(flown.count)
-    points, _ = motion.at(pieces_of(begin, max(motion.last, flown.last)), dt_s)
-    _least_apart(points, begin, row, *flown.arrays, scale, dt_s, least)
-    return least
+    position, velocity = np.empty((2, count, motion.position.shape[1]))
+    _states(motion, begin, dt_s, position, velocity)
+    return position, velocity
+
+
+def too_near(
+    motion: Motion, base: Motion, begin: int, row: int, flown: FlownMotions, keep_m: float
+) -> Flags:
+    """Motions that may be flown to which another one comes too near, from a step on for ever.
+
+    Distances are those of straight pieces, SAMPLES an interval, which `bend_m` makes up for.
+
+    Args:
+        motion: by the steps in common.
+        base: the one in force. Where that is nearer already, the other need only come no nearer by
+            NEARER_M: it may always fly away.
+        begin: step from which on.
+        row: the vehicle's, whose own motions do not count.
+        flown: motions of all.
+        keep_m: distance that is kept from them [m].
+
+    Returns:
+        shape (flown.count + 1,); the last, which is for zones, is False.
+    """
+    hit = np.zeros(flown.count + 1, dtype=np.bool_)
+    _too_near(motion, base, begin, row, flown.arrays, flown.scale, flown.dt_s, keep_m, hit)
+    return hit
 
 
 def pieces_of(begin: int, end: int) -> Array:
@@ -118,13 +152,13 @@ def bend_m(acceleration_mps2: float, dt_s: float) -> float:
 class HalfPlanes(NamedTuple):
     """Constraints normal · p ≥ least on positions at some times."""
 
-    at: Indices
+    at: I1
     """Index of the time; shape (n,)."""
-    normal: Array
+    normal: F2
     """Shape (n, axes)."""
-    least: Array
+    least: F1
     """Shape (n,) [m]."""
-    of: Indices
+    of: I1
     """Index of the other motion; shape (n,)."""
 
     def of_some(self, taken: Flags) -> "HalfPlanes":
@@ -134,14 +168,7 @@ class HalfPlanes(NamedTuple):
 
 
 def half_planes(
-    times: Array,
-    held: Array,
-    reach_m: Array,
-    row: int,
-    flown: FlownMotions,
-    scale: Array,
-    apart_m: float,
-    dt_s: float,
+    times: Array, held: Array, reach_m: Array, row: int, flown: FlownMotions, apart_m: float
 ) -> HalfPlanes:
     """Half-planes normal to the lines from the others' motions to the one in force.
 
@@ -151,81 +178,187 @@ def half_planes(
         reach_m: distance from there within which the plan stays [m]; shape (n,).
         row: the vehicle's, whose own motions do not count.
         flown: motions of all.
-        scale: see above; shape (axes,).
         apart_m: distance that is kept [m]; less where the one in force is nearer already.
-        dt_s: length of a step [s].
     """
     most = len(times) * flown.count
     found = HalfPlanes(
         np.empty(most, dtype=np.int64),
-        np.empty((most, len(scale))),
+        np.empty((most, held.shape[1])),
         np.empty(most),
         np.empty(most, dtype=np.int64),
     )
-    those = (*flown.arrays, flown.wide_m + apart_m)
-    n = _half_planes(times, held, reach_m, row, *those, scale, dt_s, *found)
+    those = flown.arrays, flown.count, flown.scale, flown.dt_s
+    n = _half_planes(times, held, reach_m, row, *those, apart_m, found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
-@making_part
-def _place(
-    first: int, knots: int, position: F2, velocity: F2, axis: int, step: float, dt_s: float
-) -> float:
-    """Position of a motion on an axis at a step."""
-    along = (step - first) / SPACING
+@part
+def _state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
+    """Position and velocity of a motion on an axis at a step; see `Motion.at`."""
+    position, velocity = motion.position, motion.velocity
+    along = (step - motion.first) / SPACING
     if along <= 0.0:
-        return float(position[0, axis])
-    if along >= knots - 1:
-        return float(position[knots - 1, axis])
+        return position[0, axis], velocity[0, axis]
+    if along >= len(position) - 1:
+        return position[-1, axis], velocity[-1, axis]
     knot = int(along)
     T = SPACING * dt_s
     t = (along - knot) * T
     v = velocity[knot, axis]
-    return float(position[knot, axis] + t * (v + 0.5 * t / T * (velocity[knot + 1, axis] - v)))
+    gained = t / T * (velocity[knot + 1, axis] - v)
+    return position[knot, axis] + t * (v + 0.5 * gained), v + gained
+
+
+@part
+def _place(motion: Motion, axis: int, step: float, dt_s: float) -> float:
+    """Position of a motion on an axis at a step."""
+    return _state(motion, axis, step, dt_s)[0]
+
+
+@kernel
+def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2) -> None:
+    """Fill in `states`."""
+    for i in range(len(position)):
+        for x in range(position.shape[1]):
+            step = float(begin + i * SPACING)
+            position[i, x], velocity[i, x] = _state(motion, x, step, dt_s)
+
+
+@making_part  # numba counts references to what it returns
+def _flown_one(flown: Flown, m: int) -> Motion:
+    """The motion at a place of those that may be flown."""
+    n = flown.knots[m]
+    return Motion(flown.first[m], flown.position[m, :n], flown.velocity[m, :n])
+
+
+@part
+def _bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
+    """Fill in two corners of a box around a motion, scaled [m]."""
+    position, velocity = motion.position, motion.velocity
+    for x in range(len(scale)):
+        low[x], high[x], turn = np.inf, -np.inf, 0.0
+        for knot in range(len(position)):
+            low[x] = min(low[x], position[knot, x])
+            high[x] = max(high[x], position[knot, x])
+            if knot:
+                turn = max(turn, abs(velocity[knot, x] - velocity[knot - 1, x]))
+        # Between two knots, T apart, a parabola is off the straight line by Δv T / 8 at most.
+        bend = turn * SPACING * dt_s / 8.0
+        low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
+
+
+@part
+def _is_far(flown: Flown, m: int, low: F1, high: F1, keep: float) -> bool:
+    """Whether boxes alone say that a motion keeps its distance from one that may be flown."""
+    square = 0.0
+    for x in range(len(low)):
+        off = max(low[x] - flown.high[m, x], flown.low[m, x] - high[x], 0.0)
+        square += off * off
+    return square > keep * keep
+
+
+@part
+def _write(
+    flown: Flown, m: int, row: int, first: int, position: F2, velocity: F2, wide: float
+) -> None:
+    """Write a motion down at a place, but for its box."""
+    n, axes = position.shape
+    flown.first[m], flown.knots[m], flown.of[m], flown.wide[m] = first, n, row, wide
+    for knot in range(n):
+        for x in range(axes):
+            flown.position[m, knot, x] = position[knot, x]
+            flown.velocity[m, knot, x] = velocity[knot, x]
+
+
+@kernel
+def _remove(flown: Flown, count: int, row: int) -> int:
+    """Remove the motions of a vehicle, the last ones taking their places; number that is left."""
+    for m in range(count - 1, -1, -1):
+        if flown.of[m] != row:
+            continue
+        count -= 1
+        n, wide = flown.knots[count], flown.wide[count]
+        position, velocity = flown.position[count, :n], flown.velocity[count, :n]
+        _write(flown, m, flown.of[count], flown.first[count], position, velocity, wide)
+        for x in range(flown.low.shape[1]):
+            flown.low[m, x], flown.high[m, x] = flown.low[count, x], flown.high[count, x]
+    return count
+
+
+@kernel
+def _add(
+    flown: Flown,
+    m: int,
+    row: int,
+    motion: Motion,
+    ahead: int,
+    wide: float,
+    scale: F1,
+    dt_s: float,
+) -> None:
+    """Write a motion down at a place, see `FlownMotions.add`."""
+    first, position, velocity = motion.first - ahead, motion.position, motion.velocity
+    _write(flown, m, row, first, position, velocity, wide)
+    _bound(motion, scale, dt_s, flown.low[m], flown.high[m])
+
+
+@part
+def _least_apart(
+    one: Motion, other: Motion, begin: int, scale: F1, dt_s: float, here: F1, there: F1
+) -> float:
+    """Least distance of two motions from a step on, of straight pieces [m].
+
+    Args:
+        here, there: scratch; shape (axes,).
+    """
+    longest = max(
+        len(one.position) * SPACING + one.first, len(other.position) * SPACING + other.first
+    )
+    pieces = max(-(-(longest - SPACING - begin) * SAMPLES // SPACING), 1)
+    nearest = np.inf
+    for i in range(pieces + 1):
+        step = begin + i * (SPACING / SAMPLES)
+        for x in range(len(scale)):
+            away = _place(one, x, step, dt_s) - _place(other, x, step, dt_s)
+            here[x], there[x] = there[x] if i else scale[x] * away, scale[x] * away
+        way, off = 0.0, 0.0
+        for x in range(len(scale)):
+            way += (there[x] - here[x]) ** 2
+            off -= here[x] * (there[x] - here[x])
+        # Nearest point of the straight piece from `here` to `there` to the origin, where the
+        # other one is.
+        t = min(max(off / way, 0.0), 1.0) if way > 0.0 else 0.0
+        square = 0.0
+        for x in range(len(scale)):
+            square += (here[x] + t * (there[x] - here[x])) ** 2
+        nearest = min(nearest, square)
+    return float(np.sqrt(nearest))
 
 
 @making_kernel
-def _least_apart(
-    points: F2,
+def _too_near(
+    motion: Motion,
+    base: Motion,
     begin: int,
     row: int,
-    first: I1,
-    knots: I1,
-    position: F3,
-    velocity: F3,
-    rows: I1,
+    flown: Flown,
     scale: F1,
     dt_s: float,
-    least: F1,
+    keep: float,
+    hit: B1,
 ) -> None:
-    """Fill in `least_apart` of points SPACING / SAMPLES steps apart, from `begin` on."""
-    axes = points.shape[1]
-    here, there = np.empty(axes), np.empty(axes)
-    for m in range(len(first)):
-        nearest = np.inf
-        if rows[m] == row:
-            least[m] = nearest
+    """Fill in `too_near`."""
+    here, there, low, high = np.empty((4, len(scale)))
+    _bound(motion, scale, dt_s, low, high)
+    for m in range(len(hit) - 1):
+        keep_m = keep + flown.wide[m]
+        if flown.of[m] == row or _is_far(flown, m, low, high, keep_m):
             continue
-        for i in range(len(points)):
-            step = begin + i * (SPACING / SAMPLES)
-            for x in range(axes):
-                q = _place(first[m], knots[m], position[m], velocity[m], x, step, dt_s)
-                here[x] = there[x]
-                there[x] = scale[x] * (points[i, x] - q)
-            if i == 0:
-                here[:] = there
-            way, off = 0.0, 0.0
-            for x in range(axes):
-                way += (there[x] - here[x]) ** 2
-                off -= here[x] * (there[x] - here[x])
-            # Nearest point of the straight piece from `here` to `there` to the origin, where the
-            # other one is.
-            t = min(max(off / way, 0.0), 1.0) if way > 0.0 else 0.0
-            square = 0.0
-            for x in range(axes):
-                square += (here[x] + t * (there[x] - here[x])) ** 2
-            nearest = min(nearest, square)
-        least[m] = np.sqrt(nearest)
+        other = _flown_one(flown, m)
+        least = _least_apart(motion, other, begin, scale, dt_s, here, there)
+        if least < keep_m:
+            nearer = _least_apart(base, other, begin, scale, dt_s, here, there) - NEARER_M
+            hit[m] = least < nearer
 
 
 @making_kernel
@@ -234,42 +367,40 @@ def _half_planes(
     held: F2,
     reach: F1,
     row: int,
-    first: I1,
-    knots: I1,
-    position: F3,
-    velocity: F3,
-    rows: I1,
-    apart: F1,
+    flown: Flown,
+    count: int,
     scale: F1,
     dt_s: float,
-    at: I1,
-    normal: F2,
-    least: F1,
-    of: I1,
+    apart: float,
+    found: HalfPlanes,
 ) -> int:
     """Fill in `half_planes`; the number of them."""
     n, axes = 0, len(scale)
-    place, off = np.empty(axes), np.empty(axes)
-    for m in range(len(first)):
-        if rows[m] == row:
+    place, off, low, high = np.empty((4, axes))
+    for x in range(axes):
+        low[x], high[x] = scale[x] * held[:, x].min(), scale[x] * held[:, x].max()
+    for m in range(count):
+        keep = apart + flown.wide[m]
+        if flown.of[m] == row or _is_far(flown, m, low, high, keep + reach.max()):
             continue
+        other = _flown_one(flown, m)
         for i in range(len(times)):
             square = 0.0
             for x in range(axes):
-                place[x] = _place(first[m], knots[m], position[m], velocity[m], x, times[i], dt_s)
+                place[x] = _place(other, x, times[i], dt_s)
                 off[x] = scale[x] * (held[i, x] - place[x])
                 square += off[x] * off[x]
             away = np.sqrt(square)
             # Out of reach, the constraint could never be active; at the very same place it has no
             # direction.
-            if away >= apart[m] + reach[i] or away == 0.0:
+            if away >= keep + reach[i] or away == 0.0:
                 continue
             # Where two are too near already, the plane runs just behind the motion in force, which
             # so remains a solution.
-            offset = min(apart[m], away - 1e-4)
+            offset = min(keep, away - 1e-4)
             for x in range(axes):
-                normal[n, x] = scale[x] * off[x] / away
-                offset += normal[n, x] * place[x]
-            at[n], least[n], of[n] = i, offset, m
+                found.normal[n, x] = scale[x] * off[x] / away
+                offset += found.normal[n, x] * place[x]
+            found.at[n], found.least[n], found.of[n] = i, offset, m
             n += 1
     return n

@@ -49,9 +49,9 @@ class DualSolver:
             least: b; shape (m,).
             equal: number of constraints, the first ones, that hold with equality.
         """
-        x = self._root.T @ (self._root @ linear)
+        x = np.empty(len(linear))
         scratch = np.empty(len(least)), self._basis, self._triangle, self._work, self._active
-        done = _solve(self._root, x, columns, least, equal, *scratch)
+        done = _solve(self._root, linear, x, columns, least, equal, *scratch)
         return x if done == SOLVED else None
 
 
@@ -62,6 +62,7 @@ class DualSolver:
 @making_kernel
 def _solve(
     root: F2,
+    linear: F1,
     x: F1,
     columns: R2,
     least: F1,
@@ -72,10 +73,11 @@ def _solve(
     work: F2,
     active: I1,
 ) -> int:
-    """Move x from the minimum without constraints to that with them.
+    """Fill in x: moved from the minimum without constraints, G⁻¹ g, to that with them.
 
     Args:
         root: Jᵀ of the beginning; shape (n, n).
+        linear: g; shape (n,).
         x: shape (n,).
         columns, least, equal: see `DualSolver.solve`.
         slack: scratch: how far each constraint is from being violated; shape (m,).
@@ -87,6 +89,7 @@ def _solve(
     n, q = len(x), 0
     d, z, r, u, normal = work[0], work[1], work[2], work[3], work[4]
     J[:] = root
+    _begin(root, linear, x)
     for _ in range(ROUNDS * n):
         # The equality that comes next, or else the constraint that is violated most.
         at = q if q < equal else _most_violated(columns, least, equal, x, slack)
@@ -129,6 +132,18 @@ def _solve(
             _let_go(J, R, u, active, leaves, q)
             q -= 1
     return ENDLESS
+
+
+@making_part
+def _begin(root: F2, linear: F1, x: F1) -> None:
+    """Fill in the minimum without constraints, J Jᵀ g."""
+    x[:] = 0.0
+    for i in range(len(x)):
+        along = 0.0
+        for j in range(len(x)):
+            along += root[i, j] * linear[j]
+        for j in range(len(x)):
+            x[j] += along * root[i, j]
 
 
 @making_part

@@ -45,10 +45,6 @@ class Known:
         """Motion to be sent at this step."""
         self.turned = 0.0
         """Angle by which it aims to the right of its goal [rad]."""
-        self.heard = False
-        """Whether an observation has come in this session."""
-        self.unknown_until = -1
-        """Step from which on a motion is over that another server has sent."""
         self.off_m = 0.0
         """Distance by which it was outside its tube when it was last observed [m]."""
         self.speed_mps = 0.0

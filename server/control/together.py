@@ -24,10 +24,10 @@ way out: it needs no packet.
 zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from statistics import median
 
 import numpy as np
 
@@ -62,10 +62,12 @@ ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
-NEARER_M = 1e-3
-"""Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
+
+SILENT = np.zeros((), dtype=FIGURES)
+"""Figures of a vehicle to which nothing is sent."""
+SILENT["gap"], SILENT["solved"] = 1, True
 
 
 class Together:
@@ -128,18 +130,29 @@ class Together:
             round(DETOUR_S / terms.dt_s),
             stream(scenario.seed, "together"),
         )
-        self._now, self._ahead = 0, dict[int, int]()
+        self._now, self._ahead = 0, np.zeros(capacity, dtype=np.int64)
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
-        self._flown = FlownMotions(terms.axes)
-        """All motions that may be flown at this tick; none until one vehicle is planned for."""
+        self._met, self._heard, self._asks = np.zeros((3, capacity), dtype=np.bool_)
+        """Whether that is known of a row, an observation has come in this session, and a motion may
+        be sent once more."""
+        self._number = np.zeros(capacity, dtype=np.int64)
+        """Number of the vehicle that was observed in a row last."""
+        self._unknown_until = np.full(capacity, -1, dtype=np.int64)
+        """Step from which on a motion is over that another server has sent, by row."""
+        self._flown = FlownMotions(self._scale, terms.dt_s)
+        """All motions that may be flown, but for those of rows in `_changed`."""
+        self._changed: set[int] = set()
+        """Rows of the vehicles whose motions that may be flown are others since they were gathered,
+        or how far these are kept away from, or how their steps are counted."""
+        self._decided: set[int] = set()
+        """Rows of the vehicles that have a motion to be sent at their newest step."""
         self._foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None of none."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
-        if row in self._rows:
-            self._rows[row].heard = False
+        self._heard[row] = False
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -149,6 +162,7 @@ class Together:
         self.observed_step[row] = k
         self._state[row] = observation.state
         known = self._rows.setdefault(row, Known())
+        self._number[row] = self._number_of(row)
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
@@ -157,10 +171,10 @@ class Together:
         elif known.in_force is None or known.in_force.step != observation.in_force:
             found = next((each for each in known.sent if each.step == observation.in_force), None)
             if found is None:  # of another server, or of a vehicle that was in this row before
-                known.unknown_until = observation.in_force + LONGEST
+                self._unknown_until[row] = observation.in_force + LONGEST
                 found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
             known.in_force = found
-        if k <= known.unknown_until:
+        if k <= self._unknown_until[row]:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         newest, motion = known.in_force
         self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
@@ -168,8 +182,14 @@ class Together:
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
             known.learn(gone.step == newest and k <= observation.since + 1)
-        known.heard = True
+        self._heard[row] = True
+        self._note(row, known)
         return True
+
+    def _note(self, row: int, known: Known) -> None:
+        """Take note that what may be flown, or sent again, is something else."""
+        self._changed.add(row)
+        self._asks[row], known.again = bool(known.sent) and known.copies > 1, None
 
     def _measure(self, row: int, known: Known, expected: Array) -> None:
         """Take note of how far a vehicle may be from where its motion has it."""
@@ -202,26 +222,23 @@ class Together:
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
         """Plan for vehicles every SPACING steps, not all at the same."""
-        figures = self.figures
-        steps = dict(zip(rows.tolist(), step.tolist(), strict=True))
-        self._meet(steps)
-        figures["row"][: len(rows)], figures["step"][: len(rows)] = rows, step
-        figures["start"][: len(rows)], figures["gap"][: len(rows)] = step, 1
-        figures["solved"], figures["fresh"] = True, False
-        for name in ("state_gap", "expected_gap", "cost_gap", "deviation_m"):
-            figures[name] = 0.0
-        for i, (row, k) in enumerate(steps.items()):
-            known = self._rows.get(row) or self._rows.setdefault(row, Known())
-            known.again = known.owed(k) if known.sent else None
-            # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
-            # before it.
-            turn = (k - self._number_of(row)) % SPACING == 0
-            if turn and known.in_force is not None and known.heard:
+        figures, n = self.figures, len(rows)
+        self._meet(rows, step)
+        figures[:n] = SILENT
+        figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
+        # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+        # before it.
+        turn = self._heard[rows] & ((step - self._number[rows]) % SPACING == 0)
+        for i in (turn | self._asks[rows]).nonzero()[0].tolist():
+            row, k = int(rows[i]), int(step[i])
+            known = self._rows[row]
+            known.again = known.owed(k)
+            if turn[i]:
                 self._decide(row, known, k)
             # A figure above any threshold: a motion that was found has to be sent.
             if known.next or known.again:
                 figures["expected_gap"][i] = 1e9
-        self.planned[: len(rows)] = self._state[rows]
+        self.planned[:n] = self._state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; the knots of what is sent."""
@@ -242,6 +259,7 @@ class Together:
             found.told.back[i] = int(step[i]) - k
             if not known.again:
                 known.sent.append(Sent(k, motion))
+                self._note(int(rows[i]), known)
 
     # -- zones -------------------------------------------------------------------------------------
 
@@ -258,7 +276,7 @@ class Together:
                 return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._rows.items():
             for motion in known.motions():
-                k = self._now + self._ahead.get(row, 0)
+                k = self._now + int(self._ahead[row])
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
                 if zone := zones.in_the_way(points, self._tube_m + self._bend_m):
                     left_s = max(motion.last - k, 0) * self._dt_s
@@ -272,41 +290,38 @@ class Together:
 
     # -- what is decided ---------------------------------------------------------------------------
 
-    def _meet(self, steps: dict[int, int]) -> None:
+    def _meet(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
         # The median, for one vehicle that begins anew must not move the grid of all others.
-        known = [k - self._ahead[row] for row, k in steps.items() if row in self._ahead]
-        self._now = int(median(known)) if known else self._now + 1
-        self._ahead |= {row: k - self._now for row, k in steps.items()}
-        self._flown.clear()
-        self._foreign = None
-        for row, each in self._rows.items():
-            if row in steps:
-                each.next = None
-            if (
-                self._foreign is None
-                and each.heard
-                and self.observed_step[row] <= each.unknown_until
-            ):
-                self._foreign = row
+        ahead = self._ahead[rows]
+        known = (step - ahead)[self._met[rows]]
+        known.sort()
+        self._now = int(known[len(known) // 2]) if len(known) else self._now + 1
+        found = step - self._now
+        self._changed.update(rows[found != ahead].tolist())
+        self._ahead[rows], self._met[rows] = found, True
+        for row in self._decided.intersection(rows.tolist()):
+            self._rows[row].next = None
+            self._changed.add(row)
+            self._decided.remove(row)
+        foreign = self._heard & (self.observed_step <= self._unknown_until)
+        self._foreign = int(foreign.argmax()) if foreign.any() else None
 
     def _gather(self) -> None:
-        """Bring all motions that may be flown side by side, once a tick.
-
-        In most ticks nobody needs them: vehicles have arrived, or wait for an acknowledgement.
-        """
-        if self._flown.count:
-            return
-        for row, each in self._rows.items():
+        """Bring all motions that may be flown side by side, those that are others since then."""
+        for row in self._changed & self._rows.keys():
+            each = self._rows[row]
             # All that may be flown, also those whose acknowledgement is still under way.
-            for motion in each.motions():
-                self._flown.add(motion, self._ahead.get(row, 0), row, each.off_m)
+            self._flown.replace(row, each.motions(), int(self._ahead[row]), each.off_m)
+        self._changed.clear()
 
     def _decide(self, row: int, known: Known, k: int) -> None:
         """Find the motion to be sent to a vehicle now, if any."""
         known.waits = ""
         if self._plans(known, k):
             self._fly_on(row, known, k)
+        if known.next:
+            self._decided.add(row)
 
     def _plans(self, known: Known, k: int) -> bool:
         """Whether a vehicle may be given another motion; what it waits for, if not."""
@@ -340,26 +355,26 @@ class Together:
         if known.aside and (self._now > known.aside.until or not self._to_pass(known.aside, home)):
             known.aside = None
         goal = known.aside.place if known.aside else home
-        if np.abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
+        if abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
             known.turned = 0.0
             if known.aside:
                 known.waits = f"vehicle {self._number_of(known.aside.asker)} to pass"
             return
         self._gather()
         way = self._way(row, goal)
-        if known.is_stuck(k, goal, float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())):
+        if known.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:]))):
             self._ask(row, way)
         known.next = self._toward(row, known, k, goal)
         if known.next is None:
             self.counts["stuck"] += 1
         else:
-            self._flown.add(known.next, self._ahead[row], row, known.off_m)
+            self._flown.add(row, known.next, int(self._ahead[row]), known.off_m)
 
     def _goal(self, row: int) -> Array:
         """Goal of a vehicle at the present step [m]; shape (axes,)."""
-        k = self._now + self._ahead[row]
-        wanted: Array = self._references(self._number_of(row))(np.array(k * self._dt_s))[:, 0]
-        return wanted
+        k = self._now + int(self._ahead[row])
+        wanted = self._references(self._number_of(row))(np.array(k * self._dt_s))
+        return np.ascontiguousarray(wanted[:, 0])  # kernels reckon with that
 
     def _way(self, row: int, goal: Array) -> Array:
         """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
@@ -377,7 +392,7 @@ class Together:
         """Ask the first vehicle that rests at its goal in another vehicle's way to step aside."""
         keep_m, ends, homes = self._apart_m + MARGIN_M, list[tuple[int, Array]](), list[int]()
         for other, each in self._rows.items():
-            if other == row or each.in_force is None or other not in self._ahead:
+            if other == row or each.in_force is None or not self._met[other]:
                 continue
             flown = each.motions()
             ends += [(other, motion.position[-1]) for motion in flown]
@@ -413,25 +428,24 @@ class Together:
         assert known.in_force is not None
         dt_s, plan, base = self._dt_s, self._plan, known.in_force.motion
         due = k + self._lead
-        (p0,), (v0,) = base.at(np.array([float(due)]), dt_s)
-        kept_p, kept_v = base.at(np.arange(k, due, SPACING, dtype=np.float64), dt_s)
+        kept = apart.states(base, k, self._lead // SPACING + 1, dt_s)
+        p0 = kept[0][-1]
         planes, taken = None, np.zeros(self._flown.count + 1, dtype=np.bool_)
         for aim in self._aims.of(known, k, p0, goal, partial(self._rests, row)):
             for _ in range(ROUNDS):
                 held = planes.of_some(taken) if planes else None
-                solved = plan.solve(p0, v0, aim, held and held[:3])
+                solved = plan.solve(*kept, aim, held)
                 if solved is None:
                     self.counts["unsolved"] += 1
                     return None
-                p, v = solved
-                motion = Motion(k, np.concatenate([kept_p, p]), np.concatenate([kept_v, v]))
+                motion = Motion(k, *solved)
                 hit = self._hit(row, motion, k)
                 if not (hit & ~taken).any():
                     break
                 taken |= hit
                 planes = planes or self._planes(row, base, due)
             # A plan that hardly moves is taken for stuck, and another aim is tried.
-            moved_m, far_m = (float(np.linalg.norm(end - p0)) for end in (p[-1], aim))
+            moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(aim, p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not hit.any():
                 known.waits, known.turned = "", max(0.0, known.turned - TURN_BACK)
                 return motion
@@ -444,7 +458,7 @@ class Together:
         """Resting places of all vehicles but one [m]."""
         found = []
         for other, each in self._rows.items():
-            motions, now = each.motions(), self._now + self._ahead.get(other, 0)
+            motions, now = each.motions(), self._now + self._ahead[other]
             if other != row and motions and all(motion.last <= now for motion in motions):
                 found.append(motions[0].position[-1])
         return found
@@ -460,9 +474,7 @@ class Together:
             plan.reach_m,
             row,
             self._flown,
-            self._scale,
             self._apart_m + MARGIN_M + self._rows[row].off_m,
-            self._dt_s,
         )
         if not self._zones:
             return found
@@ -492,20 +504,14 @@ class Together:
 
     def _hit(self, row: int, motion: Motion, k: int) -> Flags:
         """Which motions of others one comes too near to, ever, and last whether it does a zone."""
-        least = self._least(row, motion, k)
-        enters = False
+        known, ahead = self._rows[row], int(self._ahead[row])
+        assert known.in_force is not None
+        common, base = (
+            each._replace(first=each.first - ahead) for each in (motion, known.in_force.motion)
+        )
+        keep_m = self._apart_m + 2.0 * self._bend_m + known.off_m
+        hit = apart.too_near(common, base, k - ahead, row, self._flown, keep_m)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-            enters = bool((self._zones.along(points) < self._tube_m + self._bend_m).any())
-        kept_m = self._apart_m + 2.0 * self._bend_m + self._rows[row].off_m + self._flown.wide_m
-        base = self._rows[row].in_force
-        if base and (least < kept_m).any():
-            # Where they are nearer already, it need only come no nearer: it may always fly away.
-            kept_m = np.minimum(kept_m, self._least(row, base.motion, k) - NEARER_M)
-        return np.append(least < kept_m, enters)
-
-    def _least(self, row: int, motion: Motion, k: int) -> Array:
-        """Smallest distance of a vehicle's motion from each motion of all, from step k on [m]."""
-        ahead = self._ahead[row]
-        common = Motion(motion.first - ahead, motion.position, motion.velocity)
-        return apart.least_apart(common, k - ahead, row, self._flown, self._scale, self._dt_s)
+            hit[-1] = (self._zones.along(points) < self._tube_m + self._bend_m).any()
+        return hit

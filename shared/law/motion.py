@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.shared.base.kernel import F2
 from skytether.shared.law.model import Array
 
 SPACING = 10
@@ -24,9 +25,9 @@ class Motion(NamedTuple):
 
     first: int
     """Step of the first knot, a multiple of SPACING."""
-    position: Array
+    position: F2
     """Position of each knot [m]; shape (knots, axes)."""
-    velocity: Array
+    velocity: F2
     """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
 
     @property

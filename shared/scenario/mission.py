@@ -71,7 +71,7 @@ class Mission:
         """Goals at times [s]; see `Reference`."""
         t = np.asarray(t, dtype=np.float64)
         state = np.zeros((*t.shape, self._axes, 2))
-        at = np.searchsorted(self._times_s, t, side="right") - 1
+        at = self._times_s.searchsorted(t, side="right") - 1
         state[..., 0] = self._points_m[np.maximum(at, 0)]
         return state
 

@@ -18,15 +18,18 @@ from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks import published
 from skytether.lab.benchmarks.together import MortalServer
-from skytether.server.control import aside
+from skytether.server.control import apart, aside
 from skytether.server.control import known as known_vehicles
 from skytether.server.control.aims import Aims
+from skytether.server.control.apart import FlownMotions
+from skytether.server.control.clock import ClockMap
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.known import PROMPT, Known, Sent
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.routes import Routes
 from skytether.server.control.together import LONGEST, Together
 from skytether.shared.core.events import ChangeRefused
+from skytether.shared.law.model import Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.scenario import reading, zones
@@ -151,7 +154,9 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
 ) -> None:
     """Under inputs that leave a tenth of the bound to the regulator aboard."""
     terms = scenario(4).terms()
-    found = MotionPlan(terms, 0.6, 0.0).solve(np.zeros(2), np.array(velocity), np.array(goal))
+    found = MotionPlan(terms, 0.6, 0.0).solve(
+        np.zeros((1, 2)), np.array([velocity]), np.array(goal)
+    )
     assert found is not None
     position, v = found
     assert len(position) == INTERVALS + 1
@@ -161,6 +166,71 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
         assert np.abs(ends + terms.tau_s[0] * a).max() < 0.9 * terms.u_max[0] + 1e-6
     nearer = np.linalg.norm(position[-1] - goal) <= np.linalg.norm(position[0] - goal) + 1.0
     assert nearer
+
+
+# -- distances of motions --------------------------------------------------------------------------
+
+
+def drawn(rng: np.random.Generator, knots: int) -> Motion:
+    """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
+    T = SPACING * DT_S
+    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, 2)), axis=0)
+    velocity[-1] = 0.0
+    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
+    position = rng.uniform(-4.0, 4.0, 2) + np.vstack([np.zeros((1, 2)), moved])
+    return Motion(int(rng.integers(10)) * SPACING, position, velocity)
+
+
+@given(st.integers(0, 2**31), st.integers(0, 60))
+def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
+    """Also those that boxes around them tell apart; near already, one need only come no nearer."""
+    rng = np.random.default_rng(seed)
+    scale, keep_m = np.array([1.0, 0.7]), 1.5
+    motion, base, *others = (drawn(rng, int(rng.integers(1, 17))) for _ in range(12))
+    flown = FlownMotions(scale, DT_S)
+    for row, other in enumerate(others):
+        flown.replace(row, [drawn(rng, 5)], 0, 0.0)  # which is replaced by others
+        flown.replace(row, [other, other], 0, 0.1 * row)
+    flown.replace(3, [], 0, 0.0)
+
+    def least_m(one: Motion, other: Motion) -> float:
+        steps = apart.pieces_of(begin, max(one.last, other.last))
+        away = scale * (one.at(steps, DT_S)[0] - other.at(steps, DT_S)[0])
+        along = np.diff(away, axis=0)
+        square = np.maximum((along**2).sum(axis=1), 1e-18)
+        t = np.clip(-(away[:-1] * along).sum(axis=1) / square, 0.0, 1.0)
+        return float(np.linalg.norm(away[:-1] + t[:, None] * along, axis=1).min())
+
+    hit = apart.too_near(motion, base, begin, 1, flown, keep_m)
+    assert sorted(flown.of) == sorted([0, 1, 2, 4, 5, 6, 7, 8, 9] * 2)
+    for row, is_hit in zip(flown.of, hit[:-1], strict=True):
+        least, already = least_m(motion, others[row]), least_m(base, others[row])
+        assert is_hit == (row != 1 and least < min(keep_m + 0.1 * row, already - 1e-3))
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.5])
+def test_what_is_kept_from_are_all_motions_that_may_be_flown(
+    loss: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every plan, though only those are gathered that are others than before."""
+    real, looked_at = Together._gather, list[int]()
+
+    def gather(self: Together) -> None:
+        real(self)
+        expected = sorted(
+            (row, motion.first - int(self._ahead[row]), len(motion.position), known.off_m)
+            for row, known in self._rows.items()
+            for motion in known.motions()
+        )
+        count, held = self._flown.count, self._flown.arrays
+        found = zip(held.of, held.first, held.knots, held.wide, strict=True)
+        assert sorted(list(found)[:count]) == expected
+        looked_at.append(count)
+
+    monkeypatch.setattr(Together, "_gather", gather)
+    flight.fly(scenario(6, loss, duration=20.0), vehicles=6)
+    assert len(looked_at) > 10
+    assert max(looked_at) > 6
 
 
 # -- what may be flown -----------------------------------------------------------------------------
@@ -295,6 +365,35 @@ def test_a_link_that_is_cut_leaves_them_apart() -> None:
         swaps = scenario(6, duration=25.0)
         flown = flight.fly(swaps, vehicles=6, changes=[(cut_s, LOST)])
         assert separation_m(flown) > 0.5
+
+
+@pytest.mark.parametrize("steps", [2, -2, 25, -25])
+def test_clocks_that_are_wrong_are_within_the_tube_or_noticed(
+    steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The theorem's fourth assumption, where the server mistakes the steps of half the vehicles.
+
+    By 0.1 s, which the tube has room for, they keep apart and arrive. By more than `link.join_s` it
+    is seen: vehicles whose steps come too early leave their tubes, and those whose steps come too
+    late take no motion aboard, which is told as lost.
+    """
+    real = ClockMap.steps
+
+    def mistaken(clock: ClockMap, rows: Indices, now_ns: int) -> Indices:
+        return real(clock, rows, now_ns) + steps * (rows % 2)
+
+    monkeypatch.setattr(ClockMap, "steps", mistaken)
+    flown = flight.fly(scenario(8, duration=40.0), vehicles=8)
+    counts = flown.figures["server"]["counts"]
+    if abs(steps) == 2:
+        assert separation_m(flown) > 0.5
+        assert max(left_m(flown, 8)) < 0.3
+        assert "left_tube" not in counts
+    elif steps > 0:
+        assert counts["left_tube"] > 10
+    else:
+        assert separation_m(flown) > 0.5
+        assert counts["horizons_lost"] > 100
 
 
 @pytest.mark.long
