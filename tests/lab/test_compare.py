@@ -345,7 +345,7 @@ def test_a_run_that_went_astray_moves_the_mean_and_not_the_median() -> None:
 
 
 def test_the_best_within_a_budget_is_marked_and_ours_is_measured_against_it() -> None:
-    """What does not fly within a budget has a dash there; what failed comes last."""
+    """A contender over the budget has a dash in its column; one that failed comes last."""
     ours = flew("trajectory-expected", [0.3, 0.31], packets_per_s=3.0)
     best = flew("feedback-gap", [0.2, 0.21], packets_per_s=4.0)
     failed = flew("paper-event", [None, None], packets_per_s=1.0)
