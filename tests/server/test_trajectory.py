@@ -420,7 +420,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
     st.tuples(st.floats(-5, 5), st.floats(-1, 1)),
     st.lists(st.floats(-9, 9), min_size=41, max_size=41),
 )
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_what_a_vehicle_is_told_can_be_flown(
     start: tuple[float, float], places: list[float]
 ) -> None:
