@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -376,7 +376,16 @@ TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
 
 
 @pytest.fixture(scope="module")
-def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fewer() -> Iterator[None]:
+    """Thresholds of `--quick` without those below the found one; a long test of docs/ flies all."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("NEAR", "PERIODS"):
+            patch.setattr(contenders, name, getattr(contenders, name)[3:])
+        yield
+
+
+@pytest.fixture(scope="module")
+def tuned(fewer: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
     """The folder of quick searches, with the file of the weights that they have found."""
     folder = tmp_path_factory.mktemp("tuned")
     assert main([*TUNE, "--out", str(folder)]) == 0
