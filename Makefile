@@ -118,7 +118,7 @@ lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, w
 	$(COMPILE) --group setup -o requirements-setup.lock
 	for need in "" client mavlink page server bench fuzz docs; do \
 		case "$$need" in \
-			"") extras="--extra server --extra page --extra plot";; \
+			"") extras="--extra server --extra page --extra plot --extra record";; \
 			client) extras="";; \
 			*) extras="--extra $$need";; \
 		esac; \

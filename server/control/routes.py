@@ -19,7 +19,7 @@ OFF_M = 0.1
 GRAPHS_MAX = 64
 """Largest number of graphs that are kept, each of the zones at some heights."""
 TINY_M = 1e-6
-"""As much as floating point may make of that."""
+"""Rounding tolerance."""
 
 
 class Routes:

@@ -5,7 +5,7 @@ from typing import Protocol
 from skytether.shared.law.model import Array, Flags
 
 NEAR = 1.0 - 1e-6
-"""How much of its bound a guessed input must reach to count as being at it: it was a float32."""
+"""Share of its bound at which a guessed input counts as at the bound: guesses were float32."""
 
 
 class SolverFailed(Exception):

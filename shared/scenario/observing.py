@@ -18,8 +18,8 @@ class Unreported(NamedTuple):
     """Knowledge that the server lacks, at one step of one vehicle."""
 
     off_m: float
-    """How far the vehicle has left where the server must believe it, see
-    `client.reporting.BelievedState` [m]."""
+    """Distance between the vehicle and the place where the server must believe it [m]; see
+    `client.reporting.BelievedState`."""
     is_news: bool
     """Whether another horizon has come into force since the newest observation, or another mode, or
     the horizon in force has come once more: then the server may not know that it is."""

@@ -306,7 +306,7 @@ _Check = range | Callable[[object, Terms], object]
 
 
 def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
-    """As many values as checks, each as its check makes it."""
+    """Values, one for each check, each as its check returns it."""
     for i, check in enumerate(checks):
         if type(check) is range:
             # `type`, not `isinstance`: True is no integer on this wire.

@@ -51,9 +51,10 @@ class AutopilotOptions:
         Argument(
             metavar="NAME@SECONDS",
             append=True,
-            help="Something that goes wrong so long after arming; may come several times. "
-            "silence@20-25: it sends nothing for 5 s; pilot@20: a pilot takes over; disarm@20: its "
-            "rotors stop; battery@20: 5 %% are left; estimate@20-25: it does not know where it is.",
+            help="Fault to simulate, with its time after arming; may come several times. "
+            "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
+            "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
+            "estimate@20-25: it does not know where it is.",
         ),
     ] = ()
     insecure: bool = False

@@ -83,30 +83,40 @@ _PROCESS = (
         ("feed", "dropped"),
         "feed_dropped_readers_total",
         "counter",
-        "Readers of the feed that were too slow, and dropped.",
+        "Readers of the feed that were disconnected because they were too slow.",
     ),
     Metric(
         ("feed", "refused"),
         "feed_refused_readers_total",
         "counter",
-        "Readers of the feed that were turned away for want of a place.",
+        "Readers of the feed that were refused because the feed was full.",
     ),
 )
 _SERVER = (
     Metric(("vehicles",), "server_vehicles", "gauge", "Vehicles in session."),
-    Metric(("degraded",), "server_degraded", "gauge", "Whether it misses more ticks than it may."),
-    Metric(("missed",), "server_missed_ticks_total", "counter", "Ticks that were slept through."),
+    Metric(
+        ("degraded",),
+        "server_degraded",
+        "gauge",
+        "Whether the server misses more ticks than allowed: 1 or 0.",
+    ),
+    Metric(
+        ("missed",),
+        "server_missed_ticks_total",
+        "counter",
+        "Ticks that were missed because the process ran too late.",
+    ),
     Metric(
         ("observations",),
         "server_observations_total",
         "counter",
-        "Observations that were believed.",
+        "Observations that were accepted as plausible.",
     ),
     Metric(
         ("ticks_within_ms", Label("le")),
         "server_tick_seconds",
         "histogram",
-        "How long a tick took, all vehicles together.",
+        "Duration of a tick, for all vehicles together.",
         MILLI,
     ),
     Metric(
@@ -116,12 +126,17 @@ _SERVER = (
         "Time spent on each part of the work.",
         NANO,
     ),
-    Metric(("counts", "steps"), "server_steps_total", "counter", "Steps of vehicles decided on."),
+    Metric(
+        ("counts", "steps"),
+        "server_steps_total",
+        "counter",
+        "Steps of vehicles at which the server decided whether to send.",
+    ),
     Metric(
         ("counts", "events"),
         "server_events_total",
         "counter",
-        "Steps among them at which a horizon was sent.",
+        "Steps of vehicles at which the server sent a horizon.",
     ),
     Metric(
         ("counts", "unsolved"),
@@ -133,46 +148,53 @@ _SERVER = (
         ("counts", "horizons_lost"),
         "server_lost_horizons_total",
         "counter",
-        "Horizons that were sent, and not flown in time.",
+        "Horizons that were sent but did not come into force in time.",
     ),
     Metric(
         ("dropped", Label("reason")),
         "server_dropped_datagrams_total",
         "counter",
-        "Datagrams that were no vehicle's, or made no sense.",
+        "Datagrams that came from no vehicle or could not be read, by reason.",
     ),
     Metric(
         ("refused", Label("reason")),
         "server_refused_vehicles_total",
         "counter",
-        "HELLOs of vehicles that were refused.",
+        "Requests for a session (HELLO) that were refused, by reason.",
     ),
     Metric(
         (*_VEHICLE, "step"),
         "server_vehicle_step",
         "gauge",
-        "Step of the vehicle that was decided on last.",
+        "Newest step of the vehicle for which the server made a decision.",
     ),
     Metric(
         (*_VEHICLE, "clock_bound_ms"),
         "server_vehicle_clock_bound_seconds",
         "gauge",
-        "How far off the map of the vehicle's clock may be.",
+        "Largest possible error of the server's estimate of the vehicle's clock.",
         MILLI,
     ),
 )
 _NETEM = (
-    Metric(("flows",), "netem_flows", "gauge", "Clients that packets pass for."),
+    Metric(("flows",), "netem_flows", "gauge", "Clients whose packets are forwarded."),
     Metric(
         ("refused",),
         "netem_refused_packets_total",
         "counter",
-        "Packets for which there was no flow.",
+        "Packets of clients without a flow, or of strangers at the socket of a flow.",
     ),
     *_each_way(("packets",), "netem_packets_total", "counter", "Packets that entered."),
-    *_each_way(("bytes",), "netem_bytes_total", "counter", "UDP payload of these."),
+    *_each_way(
+        ("bytes",), "netem_bytes_total", "counter", "UDP payload of the packets that entered."
+    ),
     *_each_way(("forwarded",), "netem_forwarded_packets_total", "counter", "Packets that left."),
-    *_each_way(("lost",), "netem_lost_packets_total", "counter", "Packets lost, as was drawn."),
+    *_each_way(
+        ("lost",),
+        "netem_lost_packets_total",
+        "counter",
+        "Packets that the scenario's loss model dropped.",
+    ),
     *_each_way(
         ("reordered",),
         "netem_reordered_packets_total",
@@ -189,27 +211,37 @@ _NETEM = (
         ("overflowed",),
         "netem_overflowed_packets_total",
         "counter",
-        "Packets for which there was no room.",
+        "Packets that were dropped because netem's memory for packets was full.",
     ),
     *_each_way(
         ("dropped",),
         "netem_dropped_packets_total",
         "counter",
-        "Packets that the queue of a finite rate has dropped.",
+        "Packets that the queue of a limited rate dropped.",
     ),
-    *_each_way(("duplicated",), "netem_duplicated_packets_total", "counter", "Copies made."),
+    *_each_way(
+        ("duplicated",),
+        "netem_duplicated_packets_total",
+        "counter",
+        "Duplicates of packets that were made.",
+    ),
     *_each_way(
         ("corrupted",),
         "netem_corrupted_packets_total",
         "counter",
-        "Packets of which a bit was flipped.",
+        "Packets in which a bit was flipped.",
     ),
-    *_each_way(("queue",), "netem_queued_packets", "gauge", "Packets under way."),
+    *_each_way(
+        ("queue",),
+        "netem_queued_packets",
+        "gauge",
+        "Packets that are delayed now and have not left.",
+    ),
     *_each_way(
         ("delays_within_ms", Label("le")),
         "netem_delay_seconds",
         "histogram",
-        "Delays of packets that left, as drawn.",
+        "Delays that the network model drew for packets that left.",
         MILLI,
     ),
     *(
@@ -219,7 +251,7 @@ _NETEM = (
             (f"error_ms_{figure}",),
             "netem_lateness_seconds",
             "summary",
-            "Time by which packets left later than drawn.",
+            "Time by which packets left later than the network model demanded.",
             MILLI,
             quantile=quantile,
         )
@@ -231,27 +263,32 @@ _NETEM = (
             (f"queueing_ms_{figure}",),
             "netem_queueing_seconds",
             "summary",
-            "Time that packets took to pass a finite rate.",
+            "Time that packets waited for a limited rate.",
             MILLI,
             quantile=quantile,
         )
     ),
 )
 _CLIENT = (
-    Metric(("missed",), "client_missed_steps_total", "counter", "Steps that were slept through."),
+    Metric(
+        ("missed",),
+        "client_missed_steps_total",
+        "counter",
+        "Steps that were missed because the process ran too late.",
+    ),
     Metric(
         (*_VEHICLE, "mode"),
         "client_mode",
         "modes",
-        "Whether the vehicle is in the mode, see docs/failsafe.md.",
+        "Mode of the vehicle, see docs/failsafe.md: 1 for the present mode, 0 for the others.",
     ),
-    Metric((*_VEHICLE, "step"), "client_step", "gauge", "Step that comes next."),
-    Metric((*_VEHICLE, "steps"), "client_steps", "gauge", "Steps of the flight."),
+    Metric((*_VEHICLE, "step"), "client_step", "gauge", "Number of the vehicle's next step."),
+    Metric((*_VEHICLE, "steps"), "client_steps", "gauge", "Number of steps of the whole flight."),
     Metric(
         (*_VEHICLE, "age_ms"),
         "client_age_seconds",
         "gauge",
-        "Age of the observation behind the input that is flown.",
+        "Age of the observation from which the input in force was planned.",
         MILLI,
     ),
     Metric(
@@ -271,18 +308,23 @@ _CLIENT = (
         (*_VEHICLE, "dropped", Label("reason")),
         "client_dropped_datagrams_total",
         "counter",
-        "Datagrams that were not the server's, too late, or made no sense.",
+        "Datagrams that were not the server's, came too late or could not be read, by reason.",
     ),
 )
 _AUTOPILOT = (*_VEHICLE, "autopilot")
 """Path of the figures of a vehicle's own autopilot."""
 _ABOARD = (
-    Metric((*_AUTOPILOT, "armed"), "autopilot_armed", "gauge", "Whether it is armed."),
+    Metric(
+        (*_AUTOPILOT, "armed"),
+        "autopilot_armed",
+        "gauge",
+        "Whether the autopilot is armed: 1 or 0.",
+    ),
     Metric(
         (*_AUTOPILOT, "mode_number"),
         "autopilot_mode",
         "gauge",
-        "Number of its mode, as MAVLink's heartbeat has it.",
+        "Number of the autopilot's mode (custom_mode of its heartbeat).",
     ),
     Metric((*_AUTOPILOT, "battery"), "autopilot_battery_ratio", "gauge", "Charge of the battery."),
     Metric(
@@ -292,48 +334,56 @@ _ABOARD = (
         (*_AUTOPILOT, "home", Label("coordinate")),
         "autopilot_home",
         "gauge",
-        "Home: latitude and longitude in degrees, altitude above the sea in metres.",
+        "Autopilot's home: latitude and longitude in degrees, altitude above the sea in metres.",
     ),
     Metric(
         (*_AUTOPILOT, "fence", Label("parameter")),
         "autopilot_fence",
         "gauge",
-        "Parameters of its own fence.",
+        "Values of the autopilot's own fence parameters.",
     ),
     Metric(
         (*_AUTOPILOT, "measurements"),
         "autopilot_measurements_total",
         "counter",
-        "Positions of the autopilot that were taken.",
+        "Positions from the autopilot that were accepted.",
     ),
-    Metric((*_AUTOPILOT, "heard"), "autopilot_messages_total", "counter", "Messages it sent us."),
     Metric(
-        (*_AUTOPILOT, "setpoints"), "autopilot_setpoints_total", "counter", "Velocities sent to it."
+        (*_AUTOPILOT, "heard"),
+        "autopilot_messages_total",
+        "counter",
+        "Messages received from the autopilot.",
+    ),
+    Metric(
+        (*_AUTOPILOT, "setpoints"),
+        "autopilot_setpoints_total",
+        "counter",
+        "Velocity set-points sent to the autopilot.",
     ),
     Metric(
         (*_AUTOPILOT, "dropped", Label("reason")),
         "autopilot_dropped_messages_total",
         "counter",
-        "Messages at its line that were not its own, not for us, or of an impossible time.",
+        "Messages on the autopilot's line from others, for others, or with an impossible time.",
     ),
     Metric(
         (*_AUTOPILOT, "garbage_bytes"),
         "autopilot_garbage_bytes_total",
         "counter",
-        "Bytes at its line that belong to no message.",
+        "Bytes on the autopilot's line that belong to no valid message.",
     ),
     Metric(
         (*_AUTOPILOT, "round_trip_ms"),
         "autopilot_round_trip_seconds",
         "gauge",
-        "Least round trip to it of late.",
+        "Smallest recent round-trip time to the autopilot.",
         MILLI,
     ),
     Metric(
         (*_AUTOPILOT, "drift_ppm"),
         "autopilot_clock_drift_ppm",
         "gauge",
-        "Rate at which our clock gains on its clock.",
+        "Rate at which the client's clock runs faster than the autopilot's.",
     ),
 )
 TABLES = {
@@ -363,10 +413,20 @@ LEFT_OUT: dict[str, tuple[Path, ...]] = {
 }
 """Figures that are deliberately not exported."""
 OWN = (
-    Metric((), "info", "gauge", "What the process is, and what it flies; always 1."),
+    Metric(
+        (),
+        "info",
+        "gauge",
+        "Labels that name the process and what it flies; the value is always 1.",
+    ),
     Metric((), "step_seconds", "gauge", "Length of a step, the deadline of a tick."),
-    Metric((), "snapshot_age_seconds", "gauge", "Age of all other numbers."),
-    Metric((), "unmapped_figures", "gauge", "Figures of the process that no metric tells."),
+    Metric((), "snapshot_age_seconds", "gauge", "Time since the other metrics were updated."),
+    Metric(
+        (),
+        "unmapped_figures",
+        "gauge",
+        "Figures of the process that no metric exports; more than 0 is a mistake in Skytether.",
+    ),
 )
 """Metrics of the process itself and of the exporter, which export no figure."""
 
@@ -403,7 +463,7 @@ def trouble(process: str, figures: Mapping[str, Any]) -> str:
         process, figures: see `families`.
     """
     if process == "server" and figures.get("degraded"):
-        return "it misses more ticks than it may"
+        return "it misses more ticks than allowed"
     if process == "client":
         for vehicle, told in figures["by_vehicle"].items():
             if told["mode"] not in HEALTHY:

@@ -61,7 +61,7 @@ def scenario(line: str, **model: object) -> Scenario:
 
 
 OF_ARDUCOPTER = {"tau_s": [0.47, 0.47, 0.21], "dead_time_s": [0.27, 0.27, 0.24]}
-"""As measured at steps of 1 m/s."""
+"""Model of ArduCopter, measured with steps of 1 m/s."""
 
 
 @contextlib.asynccontextmanager
@@ -88,7 +88,7 @@ async def arducopter(folder: Path) -> AsyncIterator[None]:
 
 
 class Heard(asyncio.DatagramProtocol):
-    """What an autopilot says on a line of its own."""
+    """Listener on a second line of the autopilot."""
 
     def __init__(self) -> None:
         self._codec = Codec(254, 190)
@@ -187,7 +187,7 @@ class Flight:
             yield client, netem
 
     def rows(self) -> Rows:
-        """What the client recorded."""
+        """Rows of the client's record."""
         return parse((self.folder / "client").read_bytes())
 
     def rmse_m(self) -> float:

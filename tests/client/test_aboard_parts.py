@@ -144,7 +144,7 @@ def test_any_bytes_raise_nothing_and_arm_nothing(
 @given(st.lists(st.binary(max_size=300), max_size=30))
 @settings(max_examples=50, deadline=None)
 def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
-    """As over TCP or a serial line."""
+    """Random bytes on a TCP or serial line get no answer and raise nothing."""
     flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
     assert flies.port is not None
     for piece in pieces:

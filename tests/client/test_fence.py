@@ -10,6 +10,7 @@ from fenced_flights import furthest_m, scenario
 from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import FenceHolds
+from skytether.shared.scenario.fence import SLOW_STEPS, inner
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.sim.flight import fly
@@ -106,3 +107,14 @@ def test_what_leads_over_the_fence_is_refused(fence: dict[str, Any], said: str) 
     """The line says where and how fast the trajectory is, and how far inside the fence keeps."""
     with pytest.raises(ConfigError, match=said):
         scenario(fence=fence)
+
+
+def test_near_a_bound_the_speed_towards_it_is_the_distance_over_t() -> None:
+    """T = τ + 2 Δt: without τ in it, a vehicle of a larger inertia would come too close."""
+    flown = scenario(fence={"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]})
+    terms, (_, high, _) = flown.terms(), inner(flown)
+    T = terms.tau_s[0] + SLOW_STEPS * flown.control.dt
+    distance = 0.1 * flown.vehicle.brake_mps2 * T * T
+    places = [(high[0] - distance, 0.0), *[(0.0, 0.0)] * (len(high) - 1)]
+    told = Fence(flown).limited([9.0, *[0.0] * (len(high) - 1)], places, [9.0] * len(high))
+    assert told[0] == pytest.approx(distance / T / terms.gain[0])

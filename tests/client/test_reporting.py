@@ -21,7 +21,7 @@ STILL = [(0.0, 0.0), (0.0, 0.0)]
 
 
 def now(off_m: float = 0.0, steps: int = 1, *, is_news: bool = False) -> Unreported:
-    """What is not told yet."""
+    """State that the vehicle has not reported yet."""
     return Unreported(off_m, is_news, steps, 0.05)
 
 

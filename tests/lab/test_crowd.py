@@ -113,7 +113,7 @@ def test_schemes_share_the_network_and_the_target() -> None:
 def test_it_writes_a_table_and_a_picture_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was flown is not flown again, and other numbers are added to it."""
+    """A second run keeps the flights of the first and adds other numbers of vehicles."""
     argv = ("crowd", "--out", str(tmp_path / "c"), "--schemes", "threshold", "budget", *FAST)
     assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
     said = capsys.readouterr().out
@@ -172,7 +172,7 @@ def test_bad_options_are_one_line(
 
 
 def test_a_table_of_points_has_a_column_for_each_figure() -> None:
-    """As plain CSV."""
+    """The table is plain CSV, with a header of the fields' names."""
     lines = points_csv([point(3)]).splitlines()
     assert lines[0].split(",") == list(CrowdPoint.__struct_fields__)
     assert lines[1].startswith("budget,3,0.3,")

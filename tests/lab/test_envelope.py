@@ -425,19 +425,19 @@ def test_more_points_go_on_where_fewer_ended(
 ) -> None:
     """The table of all points is the same as in one go, and the picture is drawn."""
     once, twice = tmp_path / "once", tmp_path / "twice"
-    main([*SHORT, "--points", "12", "--out", str(once)])
-    main([*SHORT, "--points", "5", "--out", str(twice)])
+    main([*SHORT, "--points", "8", "--out", str(once)])
+    main([*SHORT, "--points", "3", "--out", str(twice)])
     kept = (twice / "journal.jsonl").read_bytes()
-    assert len((twice / "points.csv").read_text().splitlines()) == 6
+    assert len((twice / "points.csv").read_text().splitlines()) == 4
     capsys.readouterr()
-    main([*SHORT, "--points", "12", "--out", str(twice)])
+    main([*SHORT, "--points", "8", "--out", str(twice)])
     assert (twice / "journal.jsonl").read_bytes().startswith(kept)
     assert (twice / "points.csv").read_bytes() == (once / "points.csv").read_bytes()
     assert (twice / "envelope.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((once / "points.csv").read_text().splitlines()))
-    assert [int(row["number"]) for row in rows] == list(range(12))
+    assert [int(row["number"]) for row in rows] == list(range(8))
     assert [float(row["control.dt"]) for row in rows] == [
-        draw(1, number)["control.dt"] for number in range(12)
+        draw(1, number)["control.dt"] for number in range(8)
     ]
     refused = sum(row["outcome"] == "refused" for row in rows)
     assert re.search(rf"refused +│ +{refused} │", capsys.readouterr().out)

@@ -42,7 +42,7 @@ def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
 
 
 def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
-    """What the page says of `vehicle.land_after_s` is what the scenario `autopilot` has."""
+    """The time to landing in docs/failsafe.md is `vehicle.land_after_s` of `autopilot`."""
     outcome = flown("link cut", "ardupilot")
     (_, hovers_s), (_, lands_s) = outcome.modes[1:]
     assert lands_s - hovers_s == pytest.approx(10.0, abs=0.1)

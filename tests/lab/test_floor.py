@@ -27,7 +27,7 @@ def aged(flown: Scenario, age_steps: int, plan_steps: int) -> Rows:
 
 
 def test_the_winds_floor_is_what_it_does_until_an_input_has_done_its_work() -> None:
-    """As far as it blows vehicles that stand: age and one step, to four standard errors."""
+    """The floor equals the drift of 400 hovering vehicles over age and one step, to 4 σ."""
     flown = packaged("paper", duration=10.0, vehicle={"wind": 0.1})
     blown = []
     for seed in range(400):

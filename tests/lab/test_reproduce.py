@@ -57,7 +57,7 @@ TABLES = {"table1", "traffic", "real"}
 
 
 def test_the_methods_are_the_papers_scenarios() -> None:
-    """As `skytether fly` would fly them; their titles are all that differs."""
+    """They equal the packaged scenarios of `skytether fly` in all but their titles."""
     plan = Sweep("paper", PAPER, [studies.METHODS], 1)
     for name, method in (
         ("paper-no-compensation", NONE),

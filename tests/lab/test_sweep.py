@@ -116,7 +116,7 @@ def test_a_grid_that_is_none_is_refused(text: str, said: str) -> None:
     ],
 )
 def test_a_cell_that_cannot_be_flown_is_refused_before_any_is(grids: list[str], said: str) -> None:
-    """As a scenario would be, and with its values."""
+    """The refusal is that of a scenario with these values, and names them."""
     assert refusal(lambda: Sweep("paper", PAPER, list(map(parse_axis, grids)), 3)) == said
 
 

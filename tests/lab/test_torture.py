@@ -351,9 +351,10 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
     faults: tuple[ScheduledFault, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As with horizons; the two that are left out are the link's alone.
+    """A safeguard for trajectories, switched off, breaks an invariant, as one for horizons does.
 
-    What a flood of forgeries does to a server that believes them may be found by what comes of it.
+    Two safeguards are left out: they belong to the link alone. A server that believes a flood of
+    forgeries may also be found by its failure to recover.
     """
     found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
     assert found in (invariant, "recovers")
@@ -479,7 +480,7 @@ def run(*argv: str) -> "subprocess.CompletedProcess[str]":
 
 @pytest.mark.long
 def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
-    """As a table, and as JSON."""
+    """The outcome is printed as a table and written as JSON."""
     path = tmp_path / "counts.json"
     done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
     assert done.returncode == 0, done.stderr

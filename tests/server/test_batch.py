@@ -218,7 +218,7 @@ def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
 def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where no place is left, all pages of the reference are forgotten for whoever comes first."""
+    """A full store of reference pages is emptied for the first flight that needs room."""
     made: list[Desired] = []
     init = Desired.__init__
 

@@ -357,7 +357,7 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
 
 @pytest.mark.parametrize("flown", [0, 1, H - 3, H])
 def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
-    """What is told beyond that changes no figure; what is told before changes the costs."""
+    """Inputs beyond the flown ones change no figure; the flown ones change the costs."""
     rng, rows = np.random.default_rng(7), np.array([0])
     first, found = crowd(rng, np.array([0])), crowd(rng, np.array([0]))
     found = found._replace(

@@ -165,7 +165,7 @@ def test_a_vehicle_without_a_horizon_hovers() -> None:
 
 
 def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
-    """What else it told is not known; the input that is flown is."""
+    """The inputs of that horizon are unknown: the input reported as flown is held."""
     replay = make(small())
     see(replay, 50, np.array([[0.0, 1.0], [0.0, -0.5]]), 45, flown=np.array([1.0, -0.5]))
     seen = foresee(replay, 60)
@@ -232,7 +232,7 @@ def test_what_is_flown_is_believed_and_not_what_the_rule_says() -> None:
 
 
 def test_a_vehicle_that_takes_no_horizon_brakes_and_stands_still() -> None:
-    """What is under way to it comes to nothing, until it says that it takes them again."""
+    """Horizons under way count again as soon as the vehicle says that it takes horizons."""
     flown = small(observer_s=0.0)
     old, new = plans(6, 2 * H, BOUND + H)
     replay, x = make(flown), np.array([[1.0, 0.6], [-1.0, 0.0]])
@@ -359,7 +359,7 @@ TIGHT = {
     "input_weight": 1e-3,
     "change_weight": 0.0,
 }
-"""What a scheme can afford that knows where the vehicle is; S = 0."""
+"""Firm weights, for a scheme that knows the vehicle's state; S = 0."""
 
 
 FIRM = {

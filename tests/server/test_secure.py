@@ -428,7 +428,7 @@ def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
 
 
 def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
-    """Where its first answer is lost; foreign ones that came meanwhile change nothing."""
+    """The answer is sent again after a loss; foreign challenges in between change nothing."""
     client, server = link(), gate()
     asked(client, server, 0, foreign_first=False)  # all answers are lost
     hello = client.hello(HELLO, now_ns=AGAIN_NS)

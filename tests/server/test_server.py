@@ -335,7 +335,7 @@ def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None
 
 
 def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
-    """As long as the first is heard; both operators read it, once for each life."""
+    """It is refused while the first is heard; both logs say so, once for each boot."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(vehicle=3, boot_id=5)
     for step in range(100):
@@ -481,7 +481,7 @@ def test_a_wake_before_its_time_does_nothing() -> None:
 
 
 def test_a_silent_server_sends_heartbeats() -> None:
-    """Where no event sends a horizon, a heartbeat keeps the session alive."""
+    """A heartbeat keeps the session alive while no event sends a horizon."""
     vehicles = Vehicles(scenario(trigger="state_gap", epsilon=1e9))
     welcome = vehicles.open()
     sent = []

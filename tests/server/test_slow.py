@@ -201,7 +201,7 @@ def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def far_without_m(*growing: tuple[str, str]) -> list[float]:
-    """How far flights at TIGHT weights get over delays that grow [m], by their names and sides."""
+    """Largest distances of flights at TIGHT weights over growing delays, by name and side [m]."""
     flown = scenario(duration=54.0, control={"dt": 0.02, "horizon": 20})
     return [*map(far_m, fly_over(flown, [ways(side, GROWING[name]) for name, side in growing]))]
 

@@ -56,7 +56,7 @@ class Probe(Endpoint):
         self.times_ns.append(now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """As it was told."""
+        """Wake time that the test set [ns]."""
         return self.due_ns
 
 
@@ -81,7 +81,7 @@ def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
 
 
 def test_a_change_is_made_at_steady_time() -> None:
-    """As all that happens to an endpoint."""
+    """A change while the clock stands back happens at the latest time so far."""
     probe = Probe()
     steady = Steady(probe)
     hear(steady, [HOUR_NS])
@@ -142,7 +142,7 @@ def test_a_wake_that_was_asked_for_late_is_no_jump() -> None:
 
 
 def test_all_else_is_the_endpoints_own() -> None:
-    """What it sends, says and has counted, and whether it has finished."""
+    """Datagrams, events, figures and `finished` are passed on unchanged."""
     server = Server(reading.load("demo"), boot_id=1, entropy=stream(1, "entropy").bytes)
     steady = Steady(server)
     hear(steady, [1])

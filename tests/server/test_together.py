@@ -293,6 +293,18 @@ def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
     assert refused.value.reason is Drop.TOO_LATE
 
 
+def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
+    """The motion of this step counts once, also when it is already in force."""
+    known = Known()
+    first, sent, new = (resting(step, np.zeros(2)) for step in (100, 104, 108))
+    known.in_force, known.next = Sent(100, first), new
+    known.sent.append(Sent(104, sent))
+    pairs = zip(known.motions(), (first, sent, new), strict=True)
+    assert all(each is other for each, other in pairs)
+    known.next = first
+    assert len(known.motions()) == 2
+
+
 def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
     """Not before the first loss; the very motion of that step, within what it may be taken in."""
     known = Known()

@@ -1,4 +1,4 @@
-"""When a horizon is worth a packet: policies against numbers worked out by hand, and combined."""
+"""Triggers, alone and combined, against numbers worked out by hand."""
 
 import math
 from collections.abc import Iterator
@@ -397,7 +397,7 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_fires_above_the_threshold() -> None:
-    """What flying on costs, against the key or the argument; a fresh vehicle is always sent to."""
+    """The cost gap exceeds its key or argument; a fresh vehicle is always sent a horizon."""
     for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
         assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]

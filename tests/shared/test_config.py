@@ -446,7 +446,7 @@ def test_the_network_of_a_former_flyaway_is_flown_now() -> None:
 
 
 def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
-    """Where no name is near, all names are given."""
+    """The refusal names the nearest scenario, or all of them if none is near."""
     assert refusal("papr") == "papr: no such scenario; did you mean paper?"
     assert refusal("xyz") == f"xyz: no such scenario; there are {', '.join(reading.names())}"
 

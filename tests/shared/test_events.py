@@ -313,7 +313,7 @@ def test_figures_are_names_and_numbers_in_two_columns() -> None:
 
 
 def test_two_groups_of_a_kind_share_the_lines() -> None:
-    """As the two directions of netem do; what one of them has alone is 0 in the other."""
+    """Netem's two directions are two columns; a figure of one alone is 0 in the other."""
     ways = {
         "uplink": {"lost": 12, "delays_ms": {"20": 7}},
         "downlink": {"lost": 3, "delays_ms": {"40": 1234}},
@@ -421,7 +421,7 @@ def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixt
 def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """What a process says of itself is always told; what is left out is told before the end."""
+    """A process's own events are never omitted; the omitted ones are counted before the end."""
     log = Log("client", "text")
     for vehicle in range(4318):
         log.hear(Flying(vehicle=vehicle))

@@ -96,7 +96,7 @@ def fly(scenario: Scenario) -> str:
 
 
 @settings(
-    max_examples=int(os.environ.get("LIMITS_EXAMPLES", "150")),
+    max_examples=int(os.environ.get("LIMITS_EXAMPLES", "100")),
     deadline=None,
     suppress_health_check=list(HealthCheck),
 )

@@ -114,7 +114,7 @@ def test_a_scenario_s_gain_is_for_its_model_but_for_the_dead_time() -> None:
 
 
 def test_a_vehicle_with_dead_time_flies_calmly_where_that_is_known() -> None:
-    """Where the model has none, firm feedback swings without end, at its bounds."""
+    """Without dead time in the model, firm feedback swings at its bounds without end."""
     commands = {}
     for dead_time_s in (0.0, 0.3):
         flown = scenario(model={"dead_time_s": dead_time_s})

@@ -89,7 +89,7 @@ prepare(kernel.missing())
 
 
 def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
-    """What the caller prints: the result, and whether its machine code came from the disk.
+    """Output of the caller: the result, and 1 if its machine code came from the disk.
 
     Args:
         file_bytes: size at which a file cannot grow, as if the disk were full.
@@ -125,7 +125,7 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path
 
 
 def quiet(folder: Path, code: str, *argv: str) -> str:
-    """What a program prints on stderr that keeps machine code in a folder."""
+    """Standard error of a program that keeps its machine code in `folder`."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", code, *argv],
         cwd=folder,
@@ -174,7 +174,7 @@ def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path)
 
 
 def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
-    """What can be opened and not written: it compiles, and keeps nothing."""
+    """A file that can be opened but not written keeps nothing; the kernel still compiles."""
     (tmp_path / "helper.py").write_text(HELPER)
     (tmp_path / "caller.py").write_text(CALLER)
     assert run(tmp_path, file_bytes=100) == "2.0 0"

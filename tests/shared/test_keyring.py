@@ -21,7 +21,7 @@ A, B, C = (bytes([i]) * 32 for i in (0xA1, 0xB2, 0xC3))
 
 
 class Run(NamedTuple):
-    """What came of a command."""
+    """Outcome of a command."""
 
     returncode: int
     stdout: str
@@ -115,7 +115,7 @@ def test_any_bytes_give_keys_or_one_line() -> None:
 
 @pytest.mark.parametrize("mode", [0o640, 0o620, 0o604, 0o602, 0o666, 0o700, 0o610])
 def test_a_file_that_others_can_read_or_write_is_refused(mode: int, tmp_path: Path) -> None:
-    """As ssh does: who could read it had the keys."""
+    """Other users who can read the file have the keys; ssh refuses such a file, too."""
     path = put(tmp_path / "keys", write(1, 1, A).encode(), mode)
     with pytest.raises(ConfigError, match=rf"its mode is {mode:04o}, expected 0600"):
         load(path)

@@ -5,7 +5,7 @@ import pytest
 from skytether.shared.law.leap import position_leaps, velocity_leaps
 
 LEAST = 1e-9
-"""What is too much by this is too much [m, m/s]."""
+"""Smallest excess over a bound that counts [m, m/s]."""
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_batch_steps_as_its_singles(seed: int, vehicles: int, axes: int) -> None
 
 @pytest.mark.parametrize("tau_s", [1e3, 1e6, 1e9])
 def test_very_long_time_constant_stays_exact(tau_s: float) -> None:
-    """Where 1 - exp(-Δt/τ) is nearly zero, A and B still are those of the exponential."""
+    """A and B equal the matrix exponential's although 1 - exp(-Δt/τ) is nearly zero."""
     model = discretise(np.array([tau_s]), 0.05)
     A, B = sampled(tau_s, 0.05)
     np.testing.assert_allclose(model.A[0], A, rtol=1e-15, atol=1e-17)

@@ -20,7 +20,7 @@ PSK = bytes(range(32))
 
 
 class Vector(NamedTuple):
-    """What an independent implementation of Noise (noiseprotocol 0.3.1) makes of fixed keys."""
+    """Handshake of fixed keys by an independent implementation of Noise, noiseprotocol 0.3.1."""
 
     prologue: str
     hello: str

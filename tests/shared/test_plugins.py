@@ -115,7 +115,7 @@ def example(document: Path) -> str:
 def test_the_documented_plugin_flies_with_the_documented_command(
     document: Path, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As it stands there, put into the file of that name."""
+    """The page's example, saved under the name it gives, flies with the page's command."""
     (line,) = re.findall(r"^skytether .*--plugin.*$", document.read_text(), re.MULTILINE)
     (tmp_path / file).write_text(example(document))
     with chdir(tmp_path):
@@ -350,7 +350,7 @@ def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) ->
 
 
 def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
-    """As ours are."""
+    """The refusal is worded as for a packaged trigger."""
     code = """
         @trigger(schemes=("committed",))
         def mine(now):
@@ -453,7 +453,7 @@ def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
 
 
 def test_a_flag_without_its_file_is_told_by_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """As for any other flag."""
+    """The command exits with code 2 and names the flag on stderr."""
     with pytest.raises(SystemExit) as caught:
         main(["triggers", "--plugin"])
     assert caught.value.code == 2
@@ -642,7 +642,7 @@ SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
 
 
 def run(line: str, *more: str, folder: Path, path: str = "") -> str:
-    """What a command prints that ends well, in a process of its own."""
+    """Output of a command that must succeed, run as a process of its own."""
     argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
     env = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
@@ -694,7 +694,7 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
 
 
 def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
-    """As it adds the others."""
+    """An impairment of an installed package is listed, and flies in a command."""
     listed = run("impairments", folder=tmp_path, path=installed)
     assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed
     network = ("--network.uplink", "constant(0.2) & dark(2)")

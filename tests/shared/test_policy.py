@@ -97,11 +97,11 @@ REFUSED = {
         "state_gap or state_gap(epsilon, decay_rate) with 0 <= epsilon and 0 <= decay_rate",
     ),
 }
-"""What is no trigger: the part that is said to be wrong, and what would be right."""
+"""Texts that are no trigger, each with the part that is named as wrong and what was expected."""
 
 
 def refusal(text: str) -> str:
-    """What is said of a scenario with this trigger."""
+    """Refusal of a scenario with this trigger."""
     return helpers.refusal(lambda: reading.check({"control": {"trigger": text}}, "mine"))
 
 

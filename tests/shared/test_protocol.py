@@ -215,7 +215,7 @@ def test_a_stamp_of_long_ago_is_taken_for_one_of_half_an_hour_about_now(
 def test_the_delays_of_both_directions_come_out(
     began_ns: int, sent_ns: int, held_ns: int, late_ns: int, slept_ns: int, back_ns: int
 ) -> None:
-    """As the two ends reckon, from a packet of the server to the observation that tells of it.
+    """The delay each way follows from a server's packet and the observation that echoes it.
 
     Clocks may be centuries apart, delays and the time between the packets a quarter of an hour.
     Sealed packets are opened for ten minutes.
@@ -322,7 +322,7 @@ def test_the_longest_observation() -> None:
 
 
 def test_a_horizon_made_of_bytes_is_the_message() -> None:
-    """What a server sends in numbers is what its arrays would make, with feedback and without."""
+    """Encoding a horizon from raw bytes or from arrays is equal, with and without feedback."""
     inputs = np.arange(84, dtype=np.float32).reshape(2, 42) / 84
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
@@ -492,7 +492,7 @@ def test_random_bytes_are_refused_or_are_a_message(payload: bytes) -> None:
 
 
 def test_the_table_of_messages_is_complete() -> None:
-    """As many checks as fields, for every message; an observation's are fewer on the wire."""
+    """Every message has as many checks as fields; an observation has two fewer on the wire."""
     for message, checks in protocol._TYPES:
         fewer = 2 if message is Observation else 0  # mode and takes, and state and input, are one
         assert len(checks) == len(message._fields) - fewer

@@ -91,7 +91,7 @@ def test_a_part_without_rows_is_read_as_none(columns: Columns) -> None:
     [b"", b"3", b"[]", b"[" * 100_000, b'[["a"]]', b'[["a","f8,("]]', b'[["a","O"]]', b"\xff"],
 )
 def test_what_is_no_part_is_a_value_error(header: bytes) -> None:
-    """As numpy reads kinds of columns as Python, any error of Python's."""
+    """A bad header is a ValueError, whichever error numpy raises while it reads the columns."""
     with pytest.raises(ValueError, match="not a part of a record"):
         parse(header + b"\n" + bytes(100))
 
@@ -139,7 +139,7 @@ def test_a_misspelt_column_is_our_own_mistake() -> None:
 
 
 def test_a_part_is_read_from_its_file(tmp_path: Path) -> None:
-    """As it is from memory."""
+    """A part read from its file equals the part parsed in memory."""
     path = tmp_path / "netem"
     path.write_bytes(written(PACKET_COLUMNS))
     np.testing.assert_array_equal(read(path), parse(written(PACKET_COLUMNS)))
@@ -149,7 +149,7 @@ def test_a_part_is_read_from_its_file(tmp_path: Path) -> None:
     "content", [b"", b"a diary\n", b"\xff\x00", b"3\n", b"null\n", b"[]\n", b'[["a", "zzz"]]\n']
 )
 def test_a_file_that_is_no_part_is_a_value_error(tmp_path: Path, content: bytes) -> None:
-    """As `read` promises, whatever is in it."""
+    """`read` raises nothing but ValueError, whatever the file contains."""
     path = tmp_path / "netem"
     path.write_bytes(content)
     with pytest.raises(ValueError):  # noqa: PT011 - the words are those of json or numpy

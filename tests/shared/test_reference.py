@@ -259,7 +259,7 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("text", "message"), BAD_FILES)
 def test_bad_file_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
-    """Where it is one line's fault, the error names the line."""
+    """The error names the line, if one line is at fault."""
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):

@@ -127,14 +127,14 @@ def test_a_step_flies_what_is_told_and_leads_on_along_it(
 
 
 def test_a_step_without_feedback_or_before_the_first_stage_leads_nowhere() -> None:
-    """What is told is flown, and x̄ stays."""
+    """The told input is flown unchanged, and x̄ stays."""
     state = (1.0, 0.5, 0.0, 0.0)
     assert rule.step(held([0.25, 0.5], feeds_back=False), 1, *state) == (0.5, 0.5, 1.0, 0.5)
     assert rule.step(held([0.25, 0.5]), -1, *state) == (0.25, 0.25, 1.0, 0.5)
 
 
 def test_a_horizon_that_is_not_indexed_tells_its_first_input_at_every_stage() -> None:
-    """As long as it lasts, whatever the others are."""
+    """The first input is told until the horizon ends; its other inputs are ignored."""
     first = held([0.25, 0.5], indexed=False, length=10, feeds_back=False)
     assert {rule.step(first, stage, 0.0, 0.0, 0.0, 0.0)[0] for stage in range(-1, 10)} == {0.25}
 
@@ -235,7 +235,7 @@ def send(replay: Replay, horizon: Horizon) -> None:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """What the server foresees at a step."""
+    """Foresight of the server at a step."""
     found = foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found

@@ -30,7 +30,7 @@ HERE = reading.check(
     },
     "here",
 )
-"""What the server flies, with as little as possible that forbids a single change."""
+"""Scenario of the server, with as few restrictions on single changes as possible."""
 OTHER: dict[str, Any] = {
     "model.axes": 3,
     "control.scheme": "predictive",

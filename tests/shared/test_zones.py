@@ -209,7 +209,7 @@ def test_zones_are_of_missions_alone() -> None:
 
 
 def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
-    """As that of a trajectory does."""
+    """The path of a zones file is relative to the scenario's folder."""
     (tmp_path / "map.json").write_text(geojson([polygon([[9, 9], [10, 9], [9, 10]])]))
     file = tmp_path / "mine.toml"
     file.write_text('extends = "swap"\n[mission]\nzones = "geojson(map.json)"\n')

@@ -300,7 +300,7 @@ def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
     ],
 )
 def test_a_value_is_toml_or_else_a_text(text: str, expected: object) -> None:
-    """As far as a request can carry it."""
+    """A value is read as TOML, and as plain text if it is none."""
     assert value(text) == expected
 
 

@@ -141,7 +141,7 @@ def test_a_frame_longer_than_any_is_refused_before_it_has_come() -> None:
     ids=["key", "depth", "text"],
 )
 def test_figures_that_are_none_are_a_feed_error(value: bytes) -> None:
-    """Where anything may stand, there are things that Python cannot make."""
+    """Values of msgpack that Python cannot represent are a FeedError, too."""
     whole = encode(Figures(time_ns=4, figures={"x": 7}))[4:]
     body = whole[:-1] + value
     with pytest.raises(FeedError, match="got no frame"):
@@ -167,7 +167,7 @@ def test_columns_survive_the_round_trip() -> None:
     ],
 )
 def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
-    """As `columns_of` promises."""
+    """`columns_of` raises nothing but FeedError."""
     with pytest.raises(FeedError, match="no columns"):
         columns_of(text)
 
@@ -420,7 +420,7 @@ def test_what_a_reader_sends_is_never_read(driven: Driven) -> None:
 
 
 def test_one_reader_is_let_in_at_a_time_with_a_rest_after_each(driven: Driven) -> None:
-    """Who comes again and again costs the process little."""
+    """The pause bounds what readers that reconnect all the time cost the process."""
     waiting = [Looker(driven.path) for _ in range(4)]
     driven.opened += waiting
     for count in range(1, 5):
@@ -712,7 +712,7 @@ def test_flights_of_a_batch_keep_no_plans() -> None:
 
 
 def test_events_are_of_the_log_and_limited() -> None:
-    """What a reader is told is what the log has, and no more."""
+    """A reader is sent the events that the log has, and no others."""
     from skytether.shell.log import Log
 
     told: list[Event] = []

@@ -189,7 +189,7 @@ def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> Non
 
 
 def test_figures_of_a_client_in_flight_have_ages() -> None:
-    """As its record has them; before a horizon is in force there are none."""
+    """The ages equal those of the record; there is none before a horizon is in force."""
     seen: list[dict[str, Any]] = []
     fly = Client._fly
 
@@ -225,7 +225,7 @@ def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
 def test_a_server_is_well_while_it_is_in_time() -> None:
     """A netem is while it turns."""
     assert trouble("server", {"degraded": False}) == trouble("netem", {}) == ""
-    assert trouble("server", {"degraded": True}) == "it misses more ticks than it may"
+    assert trouble("server", {"degraded": True}) == "it misses more ticks than allowed"
 
 
 def test_a_process_that_is_stuck_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,7 +281,7 @@ def test_a_thread_that_ends_by_itself_is_closed_in_order(served: Metrics) -> Non
 
 
 def test_metrics_and_health_are_served(served: Metrics) -> None:
-    """As Prometheus and Docker ask for them."""
+    """Requests in the form of Prometheus and of Docker are answered."""
     request = b"GET %s HTTP/1.1\r\nHost: netem:9464\r\nAccept: */*\r\n\r\n"
     status, text = asked(served, request % b"/metrics")
     assert status == b"HTTP/1.1 200 OK"
@@ -369,7 +369,7 @@ def test_an_address_that_is_taken_is_said_in_a_line(
 
 
 def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
-    """What a dashboard may ask for; nothing is served beside them."""
+    """Every metric that a process serves is among the listed names."""
     told: Callable[[str], set[str]] = lambda process: {  # noqa: E731
         name for name, _ in numbers(process, figures[process])
     }

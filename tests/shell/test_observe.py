@@ -59,7 +59,7 @@ def exported(flown: tuple[dict[str, set[str]], str]) -> dict[str, set[str]]:
 
 
 async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
-    """What processes serve while they fly, and what the documented reader of a feed prints."""
+    """Metrics of each process in flight, and the output of the documented reader of a feed."""
     told: dict[str, Address] = {}
     flying = asyncio.Event()
 
@@ -132,7 +132,7 @@ def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]])
 
 
 def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str]], str]) -> None:
-    """As it stands in docs/feed.md, beside the flight of three processes."""
+    """The program in docs/feed.md prints positions while three processes fly."""
     lines = flown[1].splitlines()
     assert len(lines) > 20
     assert all(re.fullmatch(r"vehicle 1 is at \[[^]]*\] m", line) for line in lines)

@@ -10,7 +10,7 @@ from skytether.shell.terminal import progress
 def test_a_bar_shows_title_amount_unit_and_text(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As they are: brackets and braces in them mean nothing."""
+    """The texts are shown literally: brackets and braces in them are no markup."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")

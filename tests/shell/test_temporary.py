@@ -89,7 +89,7 @@ def test_what_is_not_ours_stays(tmp_path: Path) -> None:
 def test_what_is_written_while_it_is_removed_is_cleared_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As by a process that ends a moment later."""
+    """Files that another process adds during the removal are cleared by the next run."""
     with monkeypatch.context() as patch, folder() as made:
         (made / "below").mkdir()
 

@@ -37,7 +37,7 @@ class Interrupted(Server):
     """A server that is gone for a while, and may come back as another life of it."""
 
     gone_s = 0.0, 0.0
-    """When it is gone, from the start of the world [s]."""
+    """Begin and end of the server's absence, from the start of the world [s]."""
     mute = False
     """Whether it does everything but send horizons while it is gone."""
 

@@ -98,7 +98,7 @@ def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
 
 
 def test_a_datagram_to_nobody_is_lost() -> None:
-    """As with UDP, the sender is not told."""
+    """The sender is not told of the loss, as with UDP."""
     world = World()
     world.add("here", Probe([50], answer_to=("nobody", 0)))
     world.run(never, limit_ns=SECOND_NS)
@@ -303,7 +303,7 @@ def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
 
 
 def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() -> None:
-    """As with processes: a stopped one can be killed, and a dead one cannot be stopped."""
+    """Hosts are like processes: a stopped one can be killed, a dead one cannot be stopped."""
     world, old, new = World(), Probe([50]), Probe([60])
     world.add("host", old)
     for time_ns, action in ((10, world.freeze), (20, world.stop), (30, world.freeze)):

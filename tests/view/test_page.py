@@ -338,7 +338,7 @@ def test_a_port_that_is_taken_is_said() -> None:
 
 
 def heard(at: str, folder: Path, seconds: float = 30.0) -> list[str]:
-    """What is said of a page that is served at an address for as long as it takes to be said."""
+    """Lines said by a page's process about its address, and the page itself if it is served."""
     said: list[str] = []
     with page_process.beside([folder], at, said.append):
         ends_s = time.monotonic() + seconds
@@ -370,7 +370,7 @@ def neighbours() -> Iterator[int]:
 def test_a_page_is_served_on_the_next_free_port_where_its_own_is_taken(
     tmp_path: Path, neighbours: int
 ) -> None:
-    """As it says, ready to be copied; and it has nothing in it that is loaded from outside."""
+    """The address that is printed works, and the page loads nothing from outside."""
     at = f"127.0.0.1:{neighbours}"
     address, page = heard(at, tmp_path)
     assert address == f"the page is at http://127.0.0.1:{neighbours + 2} ({at} is taken)"
@@ -392,7 +392,7 @@ def test_where_no_port_is_free_that_is_said(
 
 
 def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:
-    """Where it cannot be served that is said, and nothing is raised."""
+    """A page that cannot be served is reported in a line, and nothing is raised."""
     (line,) = heard("192.0.2.1:8080", tmp_path)
     assert "cannot be listened on" in line
     assert line.endswith("the flight goes on without a page")

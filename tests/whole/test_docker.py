@@ -344,7 +344,7 @@ class Containers:
         assert all(secret not in self.said(each) for each in ("server", "client", "netem"))
 
     def check_privileges(self, service: str) -> None:
-        """As Docker was told, and as the process finds it."""
+        """Limits are set in Docker's configuration and in effect inside the container."""
         host = self.inspect(service)["HostConfig"]
         assert host["ReadonlyRootfs"]
         assert host["CapDrop"] == ["ALL"]

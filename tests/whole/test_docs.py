@@ -75,7 +75,7 @@ def skytether(line: str) -> list[str]:
 def test_a_documented_flight_flies(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As written, and shorter; fleets are smaller, and sweeps have few flights."""
+    """Each documented command succeeds, with shorter flights, fewer runs and smaller fleets."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
     if "envelope" in line:
@@ -134,7 +134,7 @@ def terminals() -> list[list[str]]:
 
 
 def fly_together(lines: list[str], folder: Path) -> str:
-    """What the client says that flies with a server and a netem."""
+    """Output of a client that flies with a server and a netem."""
     server, netem, client = (skytether(line) for line in lines)
     client += ["--settle", "0", "--duration", "6"]  # with keys the first plan comes after 3 s
     with (

@@ -56,7 +56,7 @@ class Server:
         return self.events
 
     def address(self) -> str:
-        """Where it listens, as a client is told."""
+        """Address of the server, as a client takes it."""
         return f"127.0.0.1:{self.port}"
 
 

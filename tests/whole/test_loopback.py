@@ -187,7 +187,7 @@ class Asker(Echo):
 
 
 async def test_names_are_looked_up_and_seen_by_the_endpoint_as_names() -> None:
-    """What it sends to ("localhost", port) is answered by ("localhost", port)."""
+    """The answer to a datagram to ("localhost", port) comes from ("localhost", port)."""
     answerer = Shell(Echo(), LOOPBACK)
     peer = ("localhost", answerer.address[1])
     asker = Asker(peer)
@@ -444,7 +444,7 @@ async def test_datagrams_dropped_by_the_kernel_are_counted(
 
 
 def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where uvloop does not exist, asyncio's own loop is used."""
+    """Without uvloop, the loop is asyncio's own."""
     for module in ("uvloop", "asyncio"):
         loop = new_event_loop()
         loop.close()

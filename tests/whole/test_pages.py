@@ -25,7 +25,7 @@ TERMS = {
     "scheme": r"schemes?",
     "round-trip": r"round[ -]trips?",
 }
-"""How each term is written, by its anchor in docs/glossary.md."""
+"""Spellings of each term, by its anchor in docs/glossary.md."""
 # Code, tables and links: blanked out, at the same length, before terms are looked for.
 NO_PROSE = re.compile(
     r"^```.*?^```"  # code

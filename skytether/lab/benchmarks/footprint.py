@@ -41,7 +41,7 @@ MIB = 2**20
 
 @dataclass(frozen=True)
 class FootprintOptions:
-    """How much to measure."""
+    """Amount to measure."""
 
     runs: int = 5
     """Number of installations and of flights of each kind; the figures are medians."""

@@ -143,7 +143,7 @@ def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict
 
 
 def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, float]:
-    """How many times less ours is than theirs, of the figures of `figures_us`."""
+    """Ratios of the others' figures of `figures_us` to ours."""
     return {name: theirs[f"{name}_us"] / ours[f"{name}_us"] for name in ("p50", "p99")}
 
 

@@ -41,7 +41,7 @@ GOAL_AT_S = 2.0
 
 @dataclass(frozen=True)
 class MissionsOptions:
-    """How much to fly."""
+    """Amount to fly."""
 
     missions: int = 100
     first: int = 1

@@ -52,7 +52,7 @@ FLEETS = (16, 64, 200)
 SHARES = (0.0, 0.1, 0.5)
 """Shares of vehicles near others."""
 LEG_M, APART_M = 3.0, 20.0
-"""How far a vehicle flies to and fro in these fleets, and how far the next is from it [m]."""
+"""Length of a vehicle's way to and fro in these fleets, and distance to the next vehicle [m]."""
 LEG_S = 5.0
 """Time from one goal to the next there [s]."""
 RIVALS = 60
@@ -61,7 +61,7 @@ RIVALS = 60
 
 @dataclass(frozen=True)
 class MotionsOptions:
-    """How much to measure."""
+    """Amount to measure."""
 
     problems: int = 2000
     duration: float = 30.0

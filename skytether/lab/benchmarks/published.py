@@ -58,7 +58,7 @@ class Task(NamedTuple):
     tube_m: float
     """Half of what the plans of the authors keep beyond that [m]."""
     stretch: float
-    """How many times as far apart vehicles are one above the other."""
+    """Factor of the distance between vehicles that fly one above the other."""
     low_m: tuple[float, float, float]
     high_m: tuple[float, float, float]
     """Corners of the box of random places [m]."""
@@ -79,7 +79,7 @@ TASKS = {
 
 @dataclass(frozen=True)
 class PublishedOptions:
-    """How much to fly."""
+    """Amount to fly."""
 
     flights: int = 10
     """Flights of each task over each network."""

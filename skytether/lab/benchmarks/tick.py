@@ -50,7 +50,7 @@ STAGES = ("estimate", "plan", "trigger")
 
 @dataclass(frozen=True)
 class TickCounts:
-    """How much to measure."""
+    """Amount to measure."""
 
     hot: int = 1000
     paced: int = 300

@@ -63,7 +63,7 @@ ARRIVED_M = 0.3
 
 @dataclass(frozen=True)
 class TogetherOptions:
-    """How much to fly."""
+    """Amount to fly."""
 
     flights: int = 30
     """Flights of each cell."""
@@ -167,7 +167,7 @@ class MortalServer(Endpoint):
 
 
 def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
-    """When a server dies and begins anew, drawn from a seed [s]."""
+    """Times at which a server dies and is started again, drawn from a seed [s]."""
     rng = stream(seed, "deaths")
     begins = rng.uniform(np.arange(DEATHS), np.arange(DEATHS) + 1.0) * duration / DEATHS
     for_s = rng.uniform(*DOWN_S, DEATHS)

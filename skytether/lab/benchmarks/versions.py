@@ -63,7 +63,7 @@ class Contest:
 
 @dataclass(frozen=True)
 class VersionsCounts:
-    """How much to measure."""
+    """Amount to measure."""
 
     hot: int = 150
     """Number of turns of 50 hot ticks of one vehicle."""

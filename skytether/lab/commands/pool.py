@@ -57,7 +57,14 @@ class Flags:
     """Number of worker processes; one per core unless given."""
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
     """Address of a Dask scheduler, whose workers fly instead of processes of this machine."""
-    plugin: command.Plugins = ()
+    plugin: Annotated[
+        command.Plugins,
+        tyro.conf.arg(
+            metavar="FILE",
+            help="Python file with triggers or references of one's own; may come several times.",
+        ),
+        tyro.conf.UseAppendAction,  # `read` tells tyro of the outermost record's annotations alone
+    ] = ()
 
     def check(self) -> None:
         """Refuse impossible options.
