@@ -189,7 +189,9 @@ def _signature(dispatcher: Any) -> tuple[Any, ...]:
 def _type(hint: Any) -> Any:
     """Numba's type for an annotation."""
     if hasattr(hint, "__metadata__"):
-        return hint.__metadata__[0]
+        kind = hint.__metadata__[0]
+        # What flies aboard imports no numba: there a number of dimensions stands for the type.
+        return numba.types.Array(numba.float64, kind, "C") if isinstance(kind, int) else kind
     if hasattr(hint, "_fields"):
         fields = get_type_hints(hint, include_extras=True)
         return numba.types.BaseTuple.from_types([*map(_type, fields.values())], hint)

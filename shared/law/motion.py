@@ -5,11 +5,10 @@ constant acceleration between them, and rests from the last one on. It is sent a
 many knots (`shared.law.spline`): the cubic between two of them is that very motion.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from skytether.shared.base.kernel import F2
 from skytether.shared.law.model import Array
 
 SPACING = 10
@@ -20,14 +19,18 @@ JOIN_MAX = 3
 """Largest number of intervals before these, in which a motion is the one that is flown already."""
 
 
+Knots = Annotated[Array, 2]
+"""Numbers of knots; shape (knots, axes). The 2 tells kernels the number of dimensions."""
+
+
 class Motion(NamedTuple):
     """Motion: position of a vehicle at every time, by its own steps."""
 
     first: int
     """Step of the first knot, a multiple of SPACING."""
-    position: F2
+    position: Knots
     """Position of each knot [m]; shape (knots, axes)."""
-    velocity: F2
+    velocity: Knots
     """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
 
     @property
