@@ -34,8 +34,8 @@ from skytether.shared.wire.protocol import (
 
 FOREVER = 2**30
 """Stages for which a place is held: none come after."""
-NO_WIND = (0.0,) * AXES_MAX
-"""Disturbance of each axis where none is known [m/s]."""
+ZEROS = (0.0,) * AXES_MAX
+"""Disturbance and input before of each axis where none are known [m/s]."""
 
 
 class Compensator:
@@ -256,8 +256,8 @@ class Compensator:
         self,
         step: int,
         state: Sequence[tuple[float, float]],
-        disturbance: Sequence[float] = NO_WIND,
-        before: Sequence[float] = NO_WIND,
+        disturbance: Sequence[float] = ZEROS,
+        before: Sequence[float] = ZEROS,
     ) -> list[float]:
         """Input u* for `step` on each axis [m/s].
 
@@ -311,7 +311,7 @@ class Compensator:
     ) -> list[float]:
         """Input along the spline at a stage, see `choose`."""
         flown = []
-        # Not strict: NO_WIND has as many axes as there can be.
+        # Not strict: ZEROS has as many axes as there can be.
         axes = zip(self.guides, disturbance, before, strict=False)
         for axis, (guide, w, last) in enumerate(axes):
             lead = spline.guided_to(guide, self.lead_stage, stage, *self.lead[axis])

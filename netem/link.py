@@ -328,13 +328,8 @@ class Link:
 
     def is_due(self, now_ns: int) -> bool:
         """Whether a packet is due, or has passed the bottleneck."""
-        front = self._queue.front
-        if front and front[0][0] <= now_ns:
-            return True
-        if self._bottleneck is None:
-            return False
-        passed_ns = self._bottleneck.next_due_ns()
-        return passed_ns is not None and passed_ns <= now_ns
+        due_ns = self.next_due_ns()
+        return due_ns is not None and due_ns <= now_ns
 
     def next_due_ns(self) -> int | None:
         """Time at which the next packet is due, or has passed the bottleneck, or None."""

@@ -136,7 +136,7 @@ def _solve(
 
 @making_part
 def _begin(root: F2, linear: F1, x: F1) -> None:
-    """Fill in the minimum without constraints, J Jᵀ g."""
+    """Fill in x with the minimum of the QP without its constraints, J Jᵀ g."""
     x[:] = 0.0
     for i in range(len(x)):
         along = 0.0

@@ -38,7 +38,7 @@ class Posing(NamedTuple):
     """All QPs of motions have these in common."""
 
     T: float
-    """Time between knots [s]."""
+    """Time from one knot of a motion to the next [s]."""
     acceleration: float
     """Largest acceleration on an axis, a_max [m/s²]."""
     most: F1
@@ -72,10 +72,8 @@ class MotionPlan:
             # along an axis cautious.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         place = np.arange(n)
-        to_velocity, to_position = (
-            T * np.tril(np.ones((n, n))),
-            _positions(np.arange(1.0, n + 1.0), place, T),
-        )
+        to_velocity = T * np.tril(np.ones((n, n)))
+        to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * SUB + 1) / SUB
         """Times at which distances are kept, in intervals from where the plan begins."""
         weights = np.ones(n)

@@ -133,8 +133,8 @@ class Together:
         self._now, self._ahead = 0, np.zeros(capacity, dtype=np.int64)
         """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
         self._met, self._heard, self._asks = np.zeros((3, capacity), dtype=np.bool_)
-        """Whether that is known of a row, an observation has come in this session, and a motion may
-        be sent once more."""
+        """Flags of each row: its place on the grid in `_ahead` is known; an observation has come in
+        this session; a motion may have to be sent once more. Each of shape (capacity,)."""
         self._number = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle that was observed in a row last."""
         self._unknown_until = np.full(capacity, -1, dtype=np.int64)
@@ -142,8 +142,8 @@ class Together:
         self._flown = FlownMotions(self._scale, terms.dt_s)
         """All motions that may be flown, but for those of rows in `_changed`."""
         self._changed: set[int] = set()
-        """Rows of the vehicles whose motions that may be flown are others since they were gathered,
-        or how far these are kept away from, or how their steps are counted."""
+        """Rows to gather anew: their motions that may be flown have changed, or the distance kept
+        from these, or their place on the grid."""
         self._decided: set[int] = set()
         """Rows of the vehicles that have a motion to be sent at their newest step."""
         self._foreign: int | None = None
@@ -187,7 +187,7 @@ class Together:
         return True
 
     def _note(self, row: int, known: Known) -> None:
-        """Take note that what may be flown, or sent again, is something else."""
+        """Mark a row whose motions that may be flown, or be sent again, have changed."""
         self._changed.add(row)
         self._asks[row], known.again = bool(known.sent) and known.copies > 1, None
 

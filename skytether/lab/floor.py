@@ -22,6 +22,7 @@ from skytether.client.clamp import clamped
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.law.spline import Guide, follow
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
@@ -83,11 +84,9 @@ def _root(total: float, count: int) -> float:
 def fly_aboard(scenario: Scenario) -> Rows:
     """Fly with the reference aboard, and without a network; the client's part of the record.
 
-        u(k) = λ u(k-1) + (1 - λ) [u_ff(k) + K (x_ref(k) - x(k)) - ŵ]
-
-    u_ff moves the model along the reference. K and λ are the regulator of `shared.law.spline`, ŵ
-    is the disturbance that the filter aboard has found, and inputs pass the same clamp. Winds and
-    noise equal those of a networked flight with this seed.
+    At each step the vehicle follows a spline of the reference (`shared.law.spline.follow`), and
+    inputs pass the same clamp as in a networked flight. Winds and noise equal those of one with
+    this seed.
 
     Raises:
         ValueError: only the server knows the reference.
@@ -97,10 +96,7 @@ def fly_aboard(scenario: Scenario) -> Rows:
     terms, vehicle = scenario.terms(), scenario.vehicle
     model, u_max = terms.model, terms.u_max
     flies, known = simulated(scenario, 1), Navigation(scenario)
-    desired = _due(scenario)
-    forward = (desired[1:, :, 1] - model.a11 * desired[:-1, :, 1]) / model.b1
-    along = regulator(scenario)
-    gain, lag, bound = along[:, :2], along[:, 2], np.array(u_max)
+    desired, along = _due(scenario), regulator(scenario).tolist()
     change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
     rows = np.zeros(scenario.steps, client_columns(terms.axes))
     rows["step"] = np.arange(scenario.steps)
@@ -110,11 +106,15 @@ def fly_aboard(scenario: Scenario) -> Rows:
     for k, row in enumerate(rows):
         now_ns = k * terms.dt_ns
         known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
-        back = (gain * (desired[k] - known.predicted)).sum(axis=1)
-        told, w = forward[k].tolist(), np.array(known.disturbance[: terms.axes])
-        wanted = np.clip(forward[k] + back - w, -bound, bound)
-        wanted = lag * u + (1.0 - lag) * wanted
-        flown = clamped(wanted.tolist(), u.tolist(), u_max, change_max, told=told)
+        wanted, told = [], []
+        for axis, each in enumerate(model.axes()):
+            knots = desired[k : k + 2, axis].ravel().tolist()
+            guide = Guide(each, knots, 1, terms.dt_s, 1, 0.0, 0.0, 0.0, u_max[axis], *along[axis])
+            (p, v), w = known.predicted[axis], known.disturbance[axis]
+            chosen, part = follow(guide, 0, knots[0], knots[1], p, v, w, float(u[axis]))
+            wanted.append(chosen)
+            told.append(part)
+        flown = clamped(wanted, u.tolist(), u_max, change_max, told=told)
         assert flown is not None
         u = np.array(flown)
         row["state"], row["measured"] = flies.truth(), known.measured

@@ -189,7 +189,7 @@ class WatchedLife(Recorder):
         self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
         """Largest change of the input from step to step [m/s]."""
         self._regulator = regulator(scenario)
-        """K of the vehicle's own regulator."""
+        """K and λ of the vehicle's own regulator; shape (axes, 3)."""
         self._extent = _extent(scenario)
         self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
 

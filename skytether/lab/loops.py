@@ -36,8 +36,9 @@ def make_loops(scenario: Scenario, steps: int) -> list[Loop]:
     plans, before = np.zeros((terms.axes, 1, 3)), np.zeros((terms.axes, 0, 0))
     if not terms.splines:
         plans, before = _plans(terms.model, make_mpc(terms, control))
-    told = regulator(scenario) if terms.splines else feedback_gain(scenario)
-    back = told.astype("f4").astype("f8")
+    # K is sent as float32 with inputs; along a trajectory the vehicle computes its own.
+    sent = feedback_gain(scenario).astype("f4").astype("f8")
+    back = regulator(scenario) if terms.splines else sent
     delay, corrections = _corrections(scenario, steps)
     pushes = white_acceleration(tau, dt)
     return [

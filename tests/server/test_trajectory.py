@@ -509,7 +509,7 @@ def test_bounds_shape_what_is_told() -> None:
 
 @pytest.mark.parametrize("horizon", [1, 3, 8])
 def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon: int) -> None:
-    """The trajectory itself is sent: with plans along it, errors would be 0.3 to 2.7 m."""
+    """The server then sends the trajectory itself; with planned motions errors are 0.3 to 2.7 m."""
     flown = skytether.fly("demo", **{"control.horizon": horizon, "duration": 30.0})
     assert flown.summary.error_max < 0.28
 

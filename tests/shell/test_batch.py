@@ -96,7 +96,7 @@ def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
 
 
 def test_sending_stops_at_the_first_that_fails() -> None:
-    """What went is counted from the first on: port 0 is none that anybody can have."""
+    """Datagrams that went are counted from the first on; nobody can have port 0."""
     with open_socket(("127.0.0.1", 0)) as here, open_socket(("127.0.0.1", 0)) as there:
         batch, good, bad = Batch(socket.AF_INET), raw_of(there), pack_address(("127.0.0.1", 0))
         assert batch.send(here, [b"1", b"2", b"3", b"4"], [good, good, bad, good]) == 2
