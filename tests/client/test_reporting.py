@@ -1,12 +1,13 @@
 """Observations by event: what the server believes of a vehicle, and when it is told more."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
 import skytether
+from skytether.client import reporting
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import BelievedState, Reporter
 from skytether.shared.scenario import policies
@@ -92,6 +93,22 @@ def test_what_is_news_is_told_at_once() -> None:
     assert [due(step, 8, Mode.TRACK, 5) for step in range(11, 17)] == [False, False, True] * 2
 
 
+def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
+    """At once, after about a round trip, and then after as long again as it has waited."""
+    told, compensator = reporter("periodic(80)")
+
+    def sent(steps: range, mode: Mode) -> Iterator[int]:
+        for step in steps:
+            compensator.choose(step, STILL)
+            if told.is_due(7, step, mode, STILL, [0.0, 0.0], 0):
+                yield step
+
+    assert list(sent(range(10), Mode.SYNC)) == [0]
+    assert list(sent(range(10, 100), Mode.READY)) == [10, 14, 18, 26, 42, 74]
+    assert list(sent(range(100, 150), Mode.TRACK)) == []
+    assert list(sent(range(150, 160), Mode.READY)) == [150, 154, 158]
+
+
 def test_the_belief_is_the_rule_of_flight() -> None:
     """From what was told, along the horizon that is held, with its feedback and disturbance."""
     terms = load("demo").terms()
@@ -140,6 +157,24 @@ PUSH = {"vehicle.gust_mps2": 3.0, "vehicle.gust_every_s": 3.0, "vehicle.gust_s":
 """Keys of gusts."""
 QUIET = {"vehicle.report": "deviation(0.05)", "link.timeout_s": 20.0, "link.heartbeat_s": 4.0}
 """Keys of a vehicle that is asked for few heartbeats."""
+
+
+def waited_s(flight: Record) -> float:
+    """Time until the vehicle flies a horizon [s]."""
+    return float(flight.client["step"][flight.client["mode"] == Mode.TRACK][0]) * 0.05
+
+
+def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where half of its packets are lost; without the repetition it waits for its next report.
+
+    Each flight reports every 4 s.
+    """
+    keys = QUIET | {"vehicle.report": "periodic(80)", "network.downlink.loss": 0.5, "duration": 20}
+    soon = [waited_s(fly(skytether.load("target", seed=seed, **keys))) for seed in range(5)]
+    monkeypatch.setattr(reporting, "RETRY_STEPS", 10**6)
+    late = [waited_s(fly(skytether.load("target", seed=seed, **keys))) for seed in range(5)]
+    assert max(soon) < 4.0
+    assert max(late) > 4.0
 
 
 def misjudged_m(flight: Record) -> float:
