@@ -102,10 +102,10 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
-    scheme: Term[Literal["committed", "predictive", "trajectory", "none"]] = "committed"
-    """Delay compensation: committed inputs; the paper's, eq. (11) and (13); the desired trajectory,
-    which the server sends as a spline and the vehicle follows by itself, with the regulator that
-    the weights in its own scenario ask for; or none."""
+    scheme: Term[Literal["committed", "predictive", "trajectory", "none"]] = "trajectory"
+    """Delay compensation: the desired trajectory, which the server sends as a spline and the
+    vehicle follows by itself, with the regulator that the weights in its own scenario ask for;
+    plans of inputs, committed ones first; the paper's, eq. (11) and (13); or none."""
     feedback: Term[bool] = True
     """Whether a horizon carries the state that it starts from and a feedback gain, with which the
     vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
@@ -115,7 +115,9 @@ class ControlConfig(Section, frozen=True):
     observer_s: OfServer[Duration] = 4.0
     """Time constant of the disturbance observer, which learns steady wind and a wrong gain [s]; it
     is longer where observations are old. 0, and the scheme "none": no observer."""
-    trigger: OfTrigger[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "cost_gap | silence(1)"
+    trigger: OfTrigger[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = (
+        "expected_gap | heartbeat"
+    )
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
     """Bytes a second that the server sends to all its vehicles together, headers of IP and UDP
@@ -129,9 +131,9 @@ class ControlConfig(Section, frozen=True):
     """Tolerance ε of eq. (16)."""
     decay_rate: OfTrigger[Amount] = 1.5
     """Decay rate λ of eq. (16) [1/s]."""
-    cost_gap: OfTrigger[Amount] = 1.0
-    """Extra cost of flying on with the horizon sent last, above which the policy `cost_gap` sends
-    a new one."""
+    cost_gap: OfTrigger[Amount] = 0.05
+    """Extra cost of flying on with what the vehicle holds, above which the policies `cost_gap` and
+    `expected_gap` send a new horizon."""
     deviation_m: OfTrigger[Amount] = 0.05
     """Distance from the plan above which the policy `deviation` sends [m]."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
@@ -206,7 +208,9 @@ class VehicleConfig(Section, frozen=True):
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""
-    report: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "always"
+    report: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = (
+        "deviation(0.05) | silence(1)"
+    )
     """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
     """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""

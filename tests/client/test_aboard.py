@@ -38,8 +38,8 @@ ARM, TAKE_OFF, SET_MODE = 400, 22, 176
 
 @pytest.fixture(scope="module", params=BOTH)
 def flown(request: pytest.FixtureRequest) -> Air:
-    """A flight of 12 s to its end, with a client whose clock drifts."""
-    air = Air(request.param, duration=12.0, drift_ppm=50.0)
+    """A flight of 12 s to its end; the client knows the dead time, and its clock drifts."""
+    air = Air(request.param, duration=12.0, drift_ppm=50.0, model={"dead_time_s": [0.27]})
     air.fly()
     air.end()
     return air

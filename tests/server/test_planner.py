@@ -32,6 +32,8 @@ SCENARIO = check(
         "model": {"tau_s": [0.81, 0.3], "u_max": [1.8, 1.0]},
         "control": {
             "horizon": H,
+            "scheme": "committed",
+            "trigger": "cost_gap | silence(1)",
             "state_weight": [7.1, 14.0],
             "terminal_weight": [73.0, 555.0],
             "input_weight": 1.8,

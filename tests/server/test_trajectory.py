@@ -664,6 +664,7 @@ def test_the_server_knows_what_the_vehicle_follows(shape: str) -> None:
         reference={"shape": shape, "preview": "all"},
         network={"uplink": POISSON, "downlink": POISSON},
         control={"trigger": "expected_gap(0.01) | silence(2)", "horizon": 40},
+        vehicle={"report": "always"},
     )
     flight, kept = flown_and_kept(flown)
     server = {int(row["step"]): row for row in flight.server}

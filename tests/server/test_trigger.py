@@ -29,7 +29,13 @@ from skytether.shared.scenario.triggers import (
 quick = settings(max_examples=60, deadline=None)
 
 CONTROL = ControlConfig(
-    trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
+    scheme="committed",
+    trigger="state_gap",
+    dt=0.1,
+    epsilon=3.0,
+    decay_rate=2.0,
+    cost_gap=1.0,
+    terminal_weight=(50.0, 8.0),
 )
 ROW = np.array([0])
 

@@ -71,7 +71,7 @@ def test_a_row_tells_unit_values_default_and_owner() -> None:
     assert told["vehicle.wind"] == ["m/s per √s", "0 to 1000", "`0.0`", "vehicle", "yes"]
     assert told["reference.points_m"][1] == "list of lists of numbers, -1e6 to 1e6"
     assert told["armed"][1:4] == ["`true`, `false`", "`true`", "vehicle"]
-    assert told["control.trigger"][2] == r'`"cost_gap \| silence(1)"`'
+    assert told["control.trigger"][2] == r'`"expected_gap \| heartbeat"`'
 
 
 def test_help_has_the_sentences_of_the_page(

@@ -11,6 +11,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
+COMMITTED = 'control.scheme = "committed"\n'
+"""First line of scenarios whose plans of inputs have a delay bound."""
+
 WRONG = {
     # Not the form of a scenario.
     "velocities never measured, and no filter": (
@@ -258,7 +261,7 @@ WRONG = {
         ),
     ),
     "a delay bound below the delay": (
-        "control.delay_bound = 0.3",
+        COMMITTED + "control.delay_bound = 0.3",
         (
             "control.delay_bound: got 0.3, expected at least the delay of "
             "0.44 s (half of the smallest round trip, and the uplink's jitter)"
@@ -266,7 +269,7 @@ WRONG = {
     ),
     "a delay bound below half of the round trip, a fast uplink notwithstanding": (
         (
-            "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
+            COMMITTED + "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
             "network.downlink.minimum_s = 1.5"
         ),
         (
@@ -275,7 +278,7 @@ WRONG = {
         ),
     ),
     "a delay of more steps than fit a datagram": (
-        "control.dt = 0.002\ncontrol.horizon = 1",
+        COMMITTED + "control.dt = 0.002\ncontrol.horizon = 1",
         (
             "control.dt: got 0.002, expected more, for the delay of 0.44 s (half of the smallest "
             "round trip, and the uplink's jitter) to take fewer than 220 steps"
@@ -294,7 +297,7 @@ WRONG = {
         "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
     ),
     "a delay bound beyond the age bound": (
-        "control.delay_bound = 6.0\ncontrol.dt = 0.1\ncontrol.horizon = 40",
+        COMMITTED + "control.delay_bound = 6.0\ncontrol.dt = 0.1\ncontrol.horizon = 40",
         "link.age_max_s: got 5.0, expected at least 6.64 s, a round trip and two steps",
     ),
     "an age bound of none": (
@@ -306,14 +309,14 @@ WRONG = {
         "control.horizon: got 91, expected at most 90 with 3 axes, to fit one datagram",
     ),
     "a horizon that leaves no room for committed steps": (
-        "control.horizon = 130",
+        COMMITTED + "control.horizon = 130",
         (
             "control.horizon: got 130, expected at most 126 beside 9 committed steps with 2 axes, "
             "to fit one datagram"
         ),
     ),
     "a delay bound that leaves no room for the horizon": (
-        "control.horizon = 80\ncontrol.delay_bound = 3.0",
+        COMMITTED + "control.horizon = 80\ncontrol.delay_bound = 3.0",
         (
             "control.horizon: got 80, expected at most 75 beside 60 committed steps with 2 axes, "
             "to fit one datagram"
@@ -713,7 +716,7 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     terms = Scenario().terms()
     assert terms[:5] == (50_000_000, 80, 2, (0.84, 0.84), (1.0, 1.0))
     assert terms[5:7] == ((0.0, 0.0), (1.6, 1.6))
-    assert terms[7:11] == ("committed", True, "brake", 2.0)
+    assert terms[7:11] == ("trajectory", True, "brake", 2.0)
     assert terms[11:] == (5.0, 0.0, "circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
 
 

@@ -109,7 +109,8 @@ def refusal(text: str) -> str:
 def test_what_is_written_is_read(text: str, read: policies.Expression) -> None:
     """Names, numbers, &, | and parentheses, as Python reads them."""
     assert policies.parse(text) == read
-    assert reading.check({"control": {"trigger": text}}, "mine").control.trigger == text
+    control = {"scheme": "committed", "trigger": text}
+    assert reading.check({"control": control}, "mine").control.trigger == text
 
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.items(), ids=REFUSED)

@@ -199,6 +199,7 @@ def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
         "control": {
             "dt": 0.1,
             "horizon": H,
+            "scheme": "committed",
             "delay_bound": 0.1 * BOUND,
             "feedback": feedback,
             "trigger": "always",

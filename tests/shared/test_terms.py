@@ -25,7 +25,7 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 HERE = reading.check(
     {
         "model": {"axes": 2},
-        "control": {"horizon": 50, "trigger": "state_gap | silence(1)"},
+        "control": {"horizon": 50, "scheme": "committed", "trigger": "state_gap | silence(1)"},
         "reference": {"points_m": [[0.0, 0.0], [1.0, 0.0]]},
     },
     "here",
