@@ -20,7 +20,7 @@ import daqp
 import numpy as np
 
 from skytether.server.control.law import advance, axis_at
-from skytether.server.control.mpc import MPC, Problem, shifted
+from skytether.server.control.mpc import MPC, Inputs, Problem, shifted
 from skytether.server.control.solver import NEAR, SolverFailed
 from skytether.shared.base.kernel import F1, F2, F3, F5, I2, inline, kernel, part
 from skytether.shared.law.model import Array, Axis, Flags
@@ -124,7 +124,7 @@ def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and wh
     which: int,
     work: Workspace,
     g: F1,
-    previous: F1,
+    previous: Inputs,
     gap: int,
     fresh: bool,
     u: F1,

@@ -48,6 +48,12 @@ class Lanes(NamedTuple):
     """Velocity of that [m/s]; shape (LANES,)."""
     w: F1
     """Disturbance ŵ [m/s]; shape (LANES,)."""
+    p00: F1
+    """Cost-to-go matrix of the backward pass, on position twice; shape (LANES,)."""
+    p01: F1
+    """The same on position and velocity; shape (LANES,)."""
+    p11: F1
+    """The same on velocity twice; shape (LANES,)."""
     total: F1
     """Sum of a gradient, which is not finite where one of its numbers is not; shape (LANES,)."""
     changed: F1
@@ -58,10 +64,8 @@ class Lanes(NamedTuple):
     """Desired positions at the stages 0 … H [m]; shape (H + 1, LANES)."""
     target_v: F2
     """Desired velocities [m/s]; shape (H + 1, LANES)."""
-    states_p: F2
-    """Positions of the generator's plan [m]; shape (H + 1, LANES)."""
     states_v: F2
-    """Velocities of it [m/s]; shape (H + 1, LANES)."""
+    """Velocities of the generator's plan [m/s]; shape (H + 1, LANES)."""
     drift_p: F2
     """See `mpc.lead`, on position; shape (H, LANES)."""
     drift_v: F2
@@ -71,21 +75,15 @@ class Lanes(NamedTuple):
     gradient: F2
     """Gradient g; shape (H, LANES)."""
     inputs: F2
-    """Optimal inputs [m/s]; shape (H, LANES)."""
+    """Optimal inputs, not rounded yet [m/s]; shape (H, LANES)."""
     side: F2
     """-1 or 1 where the input is at that bound, 0 where it is free; shape (H, LANES)."""
     own: F2
     """See `exact.Workspace.own`; shape (H, LANES)."""
-    s0: F2
-    """Backward passes for the active sets under way, column S0 of `exact`; shape (H, LANES)."""
-    s1: F2
-    """Column S1."""
     k0: F2
-    """Column K0."""
+    """Backward pass for the active sets under way, column K0 of `exact`; shape (H, LANES)."""
     k1: F2
     """Column K1."""
-    inverse: F2
-    """Column INVERSE."""
     f00: F2
     """Column F00."""
     f01: F2
@@ -111,29 +109,28 @@ def lanes_in(room: F3) -> Lanes:
         led_p=room[2, 0],
         led_v=room[3, 0],
         w=room[4, 0],
-        total=room[5, 0],
-        changed=room[6, 0],
-        held=room[7, 0],
-        target_p=room[8],
-        target_v=room[9],
-        states_p=room[10],
-        states_v=room[11],
-        drift_p=room[12, :H],
-        drift_v=room[13, :H],
-        previous=room[14, :H],
-        gradient=room[15, :H],
-        inputs=room[16, :H],
-        side=room[17, :H],
-        own=room[18, :H],
-        s0=room[19, :H],
-        s1=room[20, :H],
+        p00=room[5, 0],
+        p01=room[6, 0],
+        p11=room[7, 0],
+        total=room[8, 0],
+        changed=room[9, 0],
+        held=room[10, 0],
+        target_p=room[11],
+        target_v=room[12],
+        states_v=room[13],
+        drift_p=room[14, :H],
+        drift_v=room[15, :H],
+        previous=room[16, :H],
+        gradient=room[17, :H],
+        inputs=room[18, :H],
+        side=room[19, :H],
+        own=room[20, :H],
         k0=room[21, :H],
         k1=room[22, :H],
-        inverse=room[23, :H],
-        f00=room[24, :H],
-        f01=room[25, :H],
-        f10=room[26, :H],
-        f11=room[27, :H],
+        f00=room[23, :H],
+        f01=room[24, :H],
+        f10=room[25, :H],
+        f11=room[26, :H],
     )
 
 
@@ -153,24 +150,30 @@ def lead(mpc: MPC, axis: int, to: Lanes) -> None:
             drift_v[i, lane] = weight_v * (v_ - target_v[i + 1, lane])
 
 
+@inline
+def rounded(u: float) -> float:
+    """The input as it is sent, in float32, see `planner`."""
+    return np.float64(np.float32(u))
+
+
 @lanes
 def follow(mpc: MPC, axis: int, to: Lanes) -> None:
-    """Fill in the drift and the states from p, v, w, led_p, led_v and the inputs: `mpc.follow`.
+    """Fill in the drift and the velocities from p, v, w, led_p, led_v and inputs: `mpc.follow`.
 
     Source: eq. (7).
     """
     model, W = axis_at(mpc.model, axis), mpc.weights.states
     p, v, led_p, led_v, w = to.p, to.v, to.led_p, to.led_v, to.w
-    states_p, states_v, u = to.states_p, to.states_v, to.inputs
+    states_v, u = to.states_v, to.inputs
     drift_p, drift_v = to.drift_p, to.drift_v
     for lane in range(LANES):
-        states_p[0, lane], states_v[0, lane] = led_p[lane], led_v[lane]
+        states_v[0, lane] = led_v[lane]
     for i in range(len(u)):
         weight_p, weight_v = W[i, 0], W[i, 1]
         for lane in range(LANES):
-            led_p_, led_v_ = advance(model, led_p[lane], led_v[lane], u[i, lane])
+            led_p_, led_v_ = advance(model, led_p[lane], led_v[lane], rounded(u[i, lane]))
             led_p[lane], led_v[lane] = led_p_, led_v_
-            states_p[i + 1, lane], states_v[i + 1, lane] = led_p_, led_v_
+            states_v[i + 1, lane] = led_v_
             p_, v_ = advance(model, p[lane], v[lane], w[lane])
             p[lane], v[lane] = p_, v_
             drift_p[i, lane] = weight_p * (p_ - led_p_)
@@ -181,21 +184,29 @@ def follow(mpc: MPC, axis: int, to: Lanes) -> None:
 def gradient(mpc: MPC, axis: int, to: Lanes, target_v: F2) -> None:
     """Fill in the gradient from drift, w, horizon before, desired velocities: `mpc.gradient`.
 
+    The first active set, which is that of the horizon before, is filled in by the way.
+
     Source: eqs. (5), (9).
     """
-    model, weights = axis_at(mpc.model, axis), mpc.weights
+    model, weights, near = axis_at(mpc.model, axis), mpc.weights, NEAR * mpc.bounds[axis]
     R, T = weights.input, weights.target[axis]
+    side, held, total = to.side, to.held, to.total
     p, v, w, g, previous = to.p, to.v, to.w, to.gradient, to.previous
     drift_p, drift_v = to.drift_p, to.drift_v
     for lane in range(LANES):
-        p[lane], v[lane] = 0.0, 0.0
+        p[lane], v[lane], held[lane], total[lane] = 0.0, 0.0, 0.0, 0.0
     for i in range(len(g) - 1, -1, -1):
         S = weights.changes[LATER, i]
         for lane in range(LANES):
             co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
             p[lane], v[lane] = co
-            toward = pulled(S, previous[i, lane], T, target_v[i, lane], R, w[lane])
-            g[i, lane] = model.b0 * co[0] + model.b1 * co[1] - toward
+            before = previous[i, lane]
+            toward = pulled(S, before, T, target_v[i, lane], R, w[lane])
+            slant = model.b0 * co[0] + model.b1 * co[1] - toward
+            at = 1.0 if before >= near else -1.0 if before <= -near else 0.0
+            g[i, lane], side[i, lane] = slant, at
+            held[lane] += abs(at)
+            total[lane] += slant
 
 
 @lanes
@@ -209,7 +220,7 @@ def slope(mpc: MPC, axis: int, to: Lanes) -> None:
     for i in range(len(u)):
         weight_p, weight_v = W[i, 0], W[i, 1]
         for lane in range(LANES):
-            p_, v_ = advance(model, p[lane], v[lane], u[i, lane])
+            p_, v_ = advance(model, p[lane], v[lane], rounded(u[i, lane]))
             p[lane], v[lane] = p_, v_
             drift_p[i, lane], drift_v[i, lane] = weight_p * p_, weight_v * v_
     for lane in range(LANES):
@@ -219,39 +230,7 @@ def slope(mpc: MPC, axis: int, to: Lanes) -> None:
         for lane in range(LANES):
             co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
             p[lane], v[lane] = co
-            g[i, lane] += model.b0 * co[0] + model.b1 * co[1] + weight * u[i, lane]
-
-
-@lanes
-def rounded(u: F2) -> None:
-    """Round inputs to float32, see `planner`."""
-    for i in range(len(u)):
-        for lane in range(LANES):
-            u[i, lane] = np.float64(np.float32(u[i, lane]))
-
-
-@lanes
-def _backward(mpc: MPC, axis: int, to: Lanes) -> None:
-    """Fill in `stages` for the active sets: `exact._backward`, from the last stage on."""
-    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs[LATER]
-    side, p00, p01, p11 = to.side, to.p, to.v, to.led_p
-    s0, s1, k0, k1, inverse = to.s0, to.s1, to.k0, to.k1, to.inverse
-    f00, f01, f10, f11 = to.f00, to.f01, to.f10, to.f11
-    H = len(side)
-    for lane in range(LANES):
-        p00[lane], p01[lane], p11[lane] = W[H - 1, 0], 0.0, W[H - 1, 1]
-    for i in range(H - 1, -1, -1):
-        weight = rho[i]
-        add_p, add_v = (W[i - 1, 0], W[i - 1, 1]) if i > 0 else (0.0, 0.0)
-        for lane in range(LANES):
-            found, after = stage_of(
-                model, weight, (p00[lane], p01[lane], p11[lane]), side[i, lane] == 0.0
-            )
-            s0[i, lane], s1[i, lane] = found[0], found[1]
-            k0[i, lane], k1[i, lane], inverse[i, lane] = found[2], found[3], found[4]
-            f00[i, lane], f01[i, lane] = found[5], found[6]
-            f10[i, lane], f11[i, lane] = found[7], found[8]
-            p00[lane], p01[lane], p11[lane] = after[0] + add_p, after[1], after[2] + add_v
+            g[i, lane] += model.b0 * co[0] + model.b1 * co[1] + weight * rounded(u[i, lane])
 
 
 @lanes
@@ -298,27 +277,38 @@ def _round_free(mpc: MPC, axis: int, to: Lanes, stages: F2) -> None:
 def _round(mpc: MPC, axis: int, to: Lanes) -> None:
     """Make a round of `exact.active_set` with an active set in each lane."""
     model, bound = axis_at(mpc.model, axis), mpc.bounds[axis]
+    W, rho = mpc.weights.states, mpc.weights.inputs[LATER]
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
-    _backward(mpc, axis, to)
-    q0, q1, x0, x1 = to.p, to.v, to.led_p, to.led_v
+    p00, p01, p11, q0, q1, x0, x1 = to.p00, to.p01, to.p11, to.p, to.v, to.led_p, to.led_v
     g, u, side, own = to.gradient, to.inputs, to.side, to.own
     changed, held = to.changed, to.held
-    s0, s1, k0, k1, inverse = to.s0, to.s1, to.k0, to.k1, to.inverse
-    f00, f01, f10, f11 = to.f00, to.f01, to.f10, to.f11
+    k0, k1, f00, f01, f10, f11 = to.k0, to.k1, to.f00, to.f01, to.f10, to.f11
+    H = len(g)
     for lane in range(LANES):
+        p00[lane], p01[lane], p11[lane] = W[H - 1, 0], 0.0, W[H - 1, 1]
         q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
         changed[lane], held[lane] = 0.0, 0.0
-    for i in range(len(g) - 1, -1, -1):
+    # The pass for the matrices and the one for the vectors go backward together: what only the
+    # latter needs of a stage is then never stored.
+    for i in range(H - 1, -1, -1):
+        weight = rho[i]
+        add_p, add_v = (W[i - 1, 0], W[i - 1, 1]) if i > 0 else (0.0, 0.0)
         for lane in range(LANES):
             g_, p_, v_, at = g[i, lane], q0[lane], q1[lane], side[i, lane]
-            own[i, lane] = own_input(model, p_, v_, g_, inverse[i, lane])
-            free_p = f00[i, lane] * p_ + f10[i, lane] * v_ - k0[i, lane] * g_
-            free_v = f01[i, lane] * p_ + f11[i, lane] * v_ - k1[i, lane] * g_
-            held_p = p_ + s0[i, lane] * (at * bound)
-            held_v = a01 * p_ + a11 * v_ + s1[i, lane] * (at * bound)
+            matrix = (p00[lane], p01[lane], p11[lane])
+            stage, after = stage_of(model, weight, matrix, at == 0.0)
+            s0, s1, k0_, k1_, inverse, f00_, f01_, f10_, f11_ = stage
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            free_p = f00_ * p_ + f10_ * v_ - k0_ * g_
+            free_v = f01_ * p_ + f11_ * v_ - k1_ * g_
+            held_p = p_ + s0 * (at * bound)
+            held_v = a01 * p_ + a11 * v_ + s1 * (at * bound)
             q0[lane] = free_p if at == 0.0 else held_p
             q1[lane] = free_v if at == 0.0 else held_v
-    for i in range(len(g)):
+            k0[i, lane], k1[i, lane] = k0_, k1_
+            f00[i, lane], f01[i, lane], f10[i, lane], f11[i, lane] = f00_, f01_, f10_, f11_
+            p00[lane], p01[lane], p11[lane] = after[0] + add_p, after[1], after[2] + add_v
+    for i in range(H):
         for lane in range(LANES):
             own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
             chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
@@ -351,23 +341,14 @@ def active_sets(mpc: MPC, axis: int, to: Lanes, stages: F2, settled: B1) -> None
 
     Args:
         mpc, axis: the problem.
-        lanes: gradient and horizon before; the inputs are filled in [m/s].
+        to: gradient and first active set, as `gradient` fills them in; the inputs are filled in
+            [m/s].
         stages: those of the FREE set; shape (H, 12).
         settled: set to False where a lane has no answer; shape (LANES,).
 
     Source: eqs. (6), (8), (10).
     """
-    bound, g, side, previous = mpc.bounds[axis], to.gradient, to.side, to.previous
     total, changed, held, x0, x1 = to.total, to.changed, to.held, to.led_p, to.led_v
-    for lane in range(LANES):
-        total[lane], held[lane] = 0.0, 0.0
-    for i in range(len(g)):
-        for lane in range(LANES):
-            v = previous[i, lane]
-            at = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
-            side[i, lane] = at
-            held[lane] += abs(at)
-            total[lane] += g[i, lane]
     for _ in range(ROUNDS_MAX):
         # Where no lane has an input at its bound, one table of FREE stages serves all of them.
         if _any(held):

@@ -19,10 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.control.law import Axes, advance, axes_of, axis_at
-from skytether.shared.base.kernel import F1, F2, inline, part
+from skytether.shared.base.kernel import F1, F2, S1, inline, part
 from skytether.shared.law.model import Array, Axis, Model
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
+
+Inputs = F1 | S1
+"""Inputs of a horizon, as they are computed or as they are sent [m/s]; shape (H,)."""
 
 
 class Weights(NamedTuple):
@@ -115,7 +118,7 @@ def pose(model: Model, mpc: MPC, which: int) -> Problem:
 
 
 @inline
-def shifted(inputs: F1, gap: int, fresh: bool, i: int) -> float:
+def shifted(inputs: Inputs, gap: int, fresh: bool, i: int) -> float:
     """Input `i` of a horizon as seen `gap` steps later, its last repeated; 0 if it is fresh."""
     return 0.0 if fresh else inputs[min(i + gap, len(inputs) - 1)]
 
@@ -144,7 +147,7 @@ def follow(
     x: tuple[float, float],
     w: float,
     led: tuple[float, float],
-    u: F1,
+    u: Inputs,
     states: F2,
     drift: F2,
 ) -> None:
@@ -202,7 +205,7 @@ def gradient(
     which: int,
     w: float,
     target: F2,
-    previous: F1,
+    previous: Inputs,
     gap: int,
     fresh: bool,
     drift: F2,
@@ -230,7 +233,7 @@ def gradient(
 
 
 @part
-def slope(mpc: MPC, axis: int, which: int, u: F1, g: F1, drift: F2) -> None:
+def slope(mpc: MPC, axis: int, which: int, u: Inputs, g: F1, drift: F2) -> None:
     """Turn g into 𝓗 U + g of one axis: 0 where U is optimal and within its bounds.
 
     Args:

@@ -25,6 +25,7 @@ from skytether.server.control.mpc import (
     FIRST,
     LATER,
     MPC,
+    Inputs,
     Problem,
     add_cost,
     follow,
@@ -42,10 +43,11 @@ from skytether.shared.base.kernel import (
     F1,
     F2,
     F3,
-    F4,
     I1,
+    S4,
     inline,
     kernel,
+    lanes,
     part,
     record,
     records,
@@ -92,13 +94,17 @@ Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
 class PlanMemory(NamedTuple):
     """Memory of both MPCs for every vehicle."""
 
-    inputs: F4
-    """U(k-1), the horizon computed last [m/s]; shape (2, capacity, axes, H)."""
-    states: F4
-    """X(k-1) of the generator, behind where it was computed from [m, m/s]; shape
-    (capacity, axes, H + 1, 2)."""
+    # A thousand vehicles' memory is 0.8 MB like this. With float64, and with the states X(k-1) that
+    # the inputs lead to, it was four times as large, and no core's own cache held it.
+    inputs: S4
+    """U(k-1), the horizon computed last [m/s], rounded as it is sent; shape
+    (2, capacity, axes, H)."""
+    start: F3
+    """State that the generator's horizon begins at [m, m/s]; shape (capacity, axes, 2)."""
     step: I1
     """Step that they were computed for, or -1; shape (capacity,)."""
+    bounded: B1
+    """Whether an input was at its bound, of plans made side by side; shape (capacity,)."""
 
 
 class Draft(NamedTuple):
@@ -110,10 +116,13 @@ class Draft(NamedTuple):
     """Gradient g of the problem to be solved; shape (block, axes, H)."""
     guess: F3
     """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
-    inputs: F4
-    """U(k) of both MPCs [m/s]; shape (2, block, axes, H)."""
-    states: F4
-    """X(k) of the generator [m, m/s]; shape (block, axes, H + 1, 2)."""
+    answer: F1
+    """Scratch: U(k) of one problem, not rounded yet [m/s]; shape (H,)."""
+    inputs: S4
+    """U(k) of both MPCs, rounded: planning goes on with what the vehicle will really be told
+    [m/s]; shape (2, block, axes, H)."""
+    states: F2
+    """Scratch: X(k) of the generator on one axis [m, m/s]; shape (H + 1, 2)."""
     drift: F2
     """Scratch of `gradient`; shape (H, 2)."""
     distance: F1
@@ -142,7 +151,8 @@ class Batch(NamedTuple):
     room: F3
     """Scratch of vehicles side by side, see `lanes.make_room`."""
     picked: I1
-    """Scratch: vehicle in each lane, by its place in the block; shape (LANES,)."""
+    """Scratch: vehicles by their places in the block, in the order in which they are planned for;
+    shape (block,)."""
     settled: B1
     """Scratch: whether the plan of each lane is found; shape (LANES,)."""
 
@@ -181,21 +191,23 @@ class Planner:
         """Solvers of a vehicle's first plan, and of later ones; others may take their places."""
         self._stopwatch = stopwatch
         self._memory = PlanMemory(
-            inputs=np.zeros((2, capacity, axes, H)),
-            states=np.zeros((capacity, axes, H + 1, 2)),
+            inputs=np.zeros((2, capacity, axes, H), dtype=np.float32),
+            start=np.zeros((capacity, axes, 2)),
             step=np.full(capacity, -1, dtype=np.int64),
+            bounded=np.zeros(capacity, dtype=np.bool_),
         )
         self._draft = Draft(
             planned=np.zeros((block, axes, 2)),
             gradient=np.zeros((block, axes, H)),
             guess=np.zeros((block, axes, H)),
-            inputs=np.zeros((2, block, axes, H)),
-            states=np.zeros((block, axes, H + 1, 2)),
+            answer=np.zeros(H),
+            inputs=np.zeros((2, block, axes, H), dtype=np.float32),
+            states=np.zeros((H + 1, 2)),
             drift=np.zeros((H, 2)),
             distance=np.zeros(H + 1),
         )
         self._room = make_room(H)
-        self._picked = np.zeros(LANES, dtype=np.int64)
+        self._picked = np.zeros(block, dtype=np.int64)
         self._settled = np.zeros(LANES, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         """Costs of the last plans; those of a block come first."""
@@ -273,13 +285,6 @@ class Planner:
                 self.figures["solved"][some] &= solved
 
 
-@part
-def _rounded(u: F1) -> None:
-    """Round inputs to float32: planning goes on with what the vehicle will really be told."""
-    for i in range(len(u)):
-        u[i] = np.float64(np.float32(u[i]))
-
-
 @inline
 def _begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
     """Note what a plan starts from, in its record of FIGURES, and whether it begins anew."""
@@ -288,6 +293,19 @@ def _begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) 
     plan.solved = True
     # Behind a gap longer than H nothing of the last plan is left to go on from (E17).
     plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
+
+
+@inline
+def _planned(mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int) -> tuple[float, float]:
+    """Planned state x_p(k|k-1) on one axis: where the generator's last plan leads at `plan.gap`.
+
+    Source: eq. (14).
+    """
+    model, u = axis_at(mpc.model, axis), memory.inputs[GENERATOR, plan.row, axis]
+    p, v = memory.start[plan.row, axis, 0], memory.start[plan.row, axis, 1]
+    for stage in range(plan.gap):
+        p, v = advance(model, p, v, u[stage])
+    return p, v
 
 
 @inline
@@ -310,7 +328,7 @@ def _pose_generator(
     if fresh:
         x = (found.start[i, axis, 0], found.start[i, axis, 1])
     else:
-        x = (memory.states[row, axis, gap, 0], memory.states[row, axis, gap, 1])
+        x = _planned(mpc, memory, plan, axis)
     draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
     place, first = desired.place[i], desired.first[i]
     target = desired.states[place, axis, first : first + H + 1]
@@ -336,8 +354,7 @@ def _pose_tracker(
 
     Source: eq. (15).
     """
-    u, states = draft.inputs[GENERATOR, at, axis], draft.states[at, axis]
-    _rounded(u)
+    u, states = draft.inputs[GENERATOR, at, axis], draft.states
     x = (found.start[i, axis, 0], found.start[i, axis, 1])
     planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
     previous, g = memory.inputs[TRACKER, plan.row, axis], draft.gradient[at, axis]
@@ -364,12 +381,17 @@ def _deviate(
     """
     held, flown = found.held[i, axis], found.flown[i]
     model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
+    planned = memory.inputs[GENERATOR, plan.row, axis]
     p, v = found.start[i, axis, 0], found.start[i, axis, 1]
+    planned_p, planned_v = _planned(mpc, memory, plan, axis)
     for stage in range(min(H - plan.gap, flown) + 1):
-        away = p - memory.states[plan.row, axis, stage + plan.gap, 0]
+        away = p - planned_p
         distance[stage] += away * away
         if stage < flown:
             p, v = advance(model, p, v, held[stage] + w)
+        if stage + plan.gap < H:
+            u = planned[stage + plan.gap]
+            planned_p, planned_v = advance(model, planned_p, planned_v, u)
 
 
 @inline
@@ -378,7 +400,7 @@ def _add_gap(
     axis: int,
     x: tuple[float, float],
     held: F1,
-    u: F1,
+    u: Inputs,
     steep: F1,
     change: F1,
     cost: float,
@@ -403,15 +425,21 @@ def _add_gap(
 
 @inline
 def _finish(mpc: MPC, draft: Draft, plan: PlanFigures, compares: bool, at: int, axis: int) -> None:
-    """Round the tracker's answer on one axis, and find its slope where plans are compared."""
-    u, which = draft.inputs[TRACKER, at, axis], FIRST if plan.fresh else LATER
-    _rounded(u)
+    """Find the slope at the tracker's answer on one axis, where plans are compared."""
     if compares:
+        u, which = draft.inputs[TRACKER, at, axis], FIRST if plan.fresh else LATER
         slope(mpc, axis, which, u, draft.gradient[at, axis], draft.drift)
 
 
+@lanes
+def _copy(numbers: Inputs, to: Inputs) -> None:
+    """Put numbers into the beginning of an array."""
+    for i in range(len(numbers)):
+        to[i] = numbers[i]
+
+
 @inline
-def _conclude(  # noqa: PLR0912 - each comparison on each axis
+def _conclude(
     mpc: MPC,
     terminal_weight: F1,
     compares: bool,
@@ -455,10 +483,8 @@ def _conclude(  # noqa: PLR0912 - each comparison on each axis
                     doubted += share * _add_gap(mpc, axis, x, held, u, steep, change, 0.0)
             if not plan.fresh:
                 _deviate(mpc, memory, found, plan, i, axis, distance)
-        for stage in range(d):
-            found.horizons[i, axis, stage] = found.committed[i, axis, stage]
-        for stage in range(H):
-            found.horizons[i, axis, d + stage] = u[stage]
+        _copy(found.committed[i, axis, :d], found.horizons[i, axis])
+        _copy(u, found.horizons[i, axis, d:])
     if compares:
         for stage in range(H + 1):
             furthest = max(furthest, distance[stage])
@@ -468,12 +494,10 @@ def _conclude(  # noqa: PLR0912 - each comparison on each axis
     plan.state_gap, plan.cost_gap, plan.deviation_m = state_gap, cost, furthest
     plan.expected_gap = sure * cost + doubted
     for axis in range(axes):
-        for stage in range(H):
-            memory.inputs[GENERATOR, row, axis, stage] = draft.inputs[GENERATOR, at, axis, stage]
-            memory.inputs[TRACKER, row, axis, stage] = draft.inputs[TRACKER, at, axis, stage]
-        for stage in range(H + 1):
-            memory.states[row, axis, stage, 0] = draft.states[at, axis, stage, 0]
-            memory.states[row, axis, stage, 1] = draft.states[at, axis, stage, 1]
+        for which in (GENERATOR, TRACKER):
+            _copy(draft.inputs[which, at, axis], memory.inputs[which, row, axis])
+        memory.start[row, axis, 0] = draft.planned[i, axis, 0]
+        memory.start[row, axis, 1] = draft.planned[i, axis, 1]
     # A first plan that failed is no plan to go on from.
     memory.step[row] = plan.start if plan.solved or not plan.fresh else -1
 
@@ -489,10 +513,12 @@ def _solve_exactly(
     work: Workspace,
 ) -> bool:
     """Solve a problem posed at draft 0; whether that came to an end."""
-    previous, u = memory.inputs[which, plan.row, axis], draft.inputs[which, 0, axis]
+    previous, u = memory.inputs[which, plan.row, axis], draft.answer
     weights, gap, fresh = FIRST if plan.fresh else LATER, plan.gap, plan.fresh
     g = draft.gradient[0, axis]
-    return active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
+    solved = active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
+    _copy(u, draft.inputs[which, 0, axis])
+    return solved
 
 
 @part
@@ -518,67 +544,75 @@ def _plan_one(batch: Batch, i: int, work: Workspace) -> bool:
 
 
 @part
-def _gather(
-    memory: PlanMemory, lanes: Lanes, plan: PlanFigures, which: int, axis: int, lane: int
+def _put_in(
+    memory: PlanMemory, to: Lanes, plan: PlanFigures, which: int, axis: int, lane: int
 ) -> None:
     """Put the horizon of the step before into a lane."""
-    previous = memory.inputs[which, plan.row, axis]
-    for stage in range(len(previous)):
-        lanes.previous[stage, lane] = shifted(previous, plan.gap, False, stage)
+    previous, gap = memory.inputs[which, plan.row, axis], plan.gap
+    # As `shifted` does, without asking at each stage where the horizon ends.
+    H = len(previous)
+    for stage in range(H - gap):
+        to.previous[stage, lane] = previous[stage + gap]
+    for stage in range(H - gap, H):
+        to.previous[stage, lane] = previous[H - 1]
 
 
 @part
-def _plan_lanes(batch: Batch, work: Workspace) -> None:
+def _take_out(numbers: F2, lane: int, to: Inputs) -> None:
+    """Take one number for each stage out of a lane."""
+    for stage in range(len(to)):
+        to[stage] = numbers[stage, lane]
+
+
+@part
+def _plan_lanes(batch: Batch, picked: I1, work: Workspace) -> None:
     """Plan for as many vehicles as there are lanes, none of them at its first plan.
 
     Args:
-        batch: the block; `picked` says which vehicles, and `settled` is filled in.
+        batch: the block; `settled` is filled in.
+        picked: vehicle in each lane, by its place in the block; shape (LANES,).
         work: of the exact solver.
     """
     mpc, terminal_weight, compares, memory = batch[:4]
-    draft, desired, found, figures, room, picked, settled = batch[4:]
-    lanes, H = lanes_in(room), memory.inputs.shape[3]
+    draft, desired, found, figures, room, _, settled = batch[4:]
+    to, H = lanes_in(room), memory.inputs.shape[3]
     for lane in range(LANES):
-        settled[lane] = True
+        settled[lane], memory.bounded[figures[picked[lane]].row] = True, False
     for axis in range(len(mpc.model)):
         free = work.stages[LATER, axis, FREE]
         for lane in range(LANES):
             i = picked[lane]
             plan, place, first = figures[i], desired.place[i], desired.first[i]
-            x = memory.states[plan.row, axis, plan.gap]
+            x = _planned(mpc, memory, plan, axis)
             draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x[0], x[1]
-            lanes.p[lane], lanes.v[lane], lanes.w[lane] = x[0], x[1], 0.0
+            to.p[lane], to.v[lane], to.w[lane] = x[0], x[1], 0.0
             for stage in range(H + 1):
-                lanes.target_p[stage, lane] = desired.states[place, axis, first + stage, 0]
-                lanes.target_v[stage, lane] = desired.states[place, axis, first + stage, 1]
-            _gather(memory, lanes, plan, GENERATOR, axis, lane)
-        side_by_side.lead(mpc, axis, lanes)
-        side_by_side.gradient(mpc, axis, lanes, lanes.target_v)
-        side_by_side.active_sets(mpc, axis, lanes, free, settled)
-        side_by_side.rounded(lanes.inputs)
+                to.target_p[stage, lane] = desired.states[place, axis, first + stage, 0]
+                to.target_v[stage, lane] = desired.states[place, axis, first + stage, 1]
+            _put_in(memory, to, plan, GENERATOR, axis, lane)
+        side_by_side.lead(mpc, axis, to)
+        side_by_side.gradient(mpc, axis, to, to.target_v)
+        side_by_side.active_sets(mpc, axis, to, free, settled)
         for lane in range(LANES):
             i = picked[lane]
-            lanes.p[lane], lanes.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
+            to.p[lane], to.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
             planned = draft.planned[i, axis]
-            lanes.led_p[lane], lanes.led_v[lane] = planned[0], planned[1]
-            lanes.w[lane] = found.disturbance[i, axis]
-            for stage in range(H):
-                draft.inputs[GENERATOR, i, axis, stage] = lanes.inputs[stage, lane]
-            _gather(memory, lanes, figures[i], TRACKER, axis, lane)
-        side_by_side.follow(mpc, axis, lanes)
-        side_by_side.gradient(mpc, axis, lanes, lanes.states_v)
-        side_by_side.active_sets(mpc, axis, lanes, free, settled)
-        side_by_side.rounded(lanes.inputs)
+            to.led_p[lane], to.led_v[lane] = planned[0], planned[1]
+            to.w[lane] = found.disturbance[i, axis]
+            memory.bounded[figures[i].row] |= to.held[lane] > 0.0
+            _take_out(to.inputs, lane, draft.inputs[GENERATOR, i, axis])
+            _put_in(memory, to, figures[i], TRACKER, axis, lane)
+        side_by_side.follow(mpc, axis, to)
+        side_by_side.gradient(mpc, axis, to, to.states_v)
+        side_by_side.active_sets(mpc, axis, to, free, settled)
         if compares:
-            side_by_side.slope(mpc, axis, lanes)
+            side_by_side.slope(mpc, axis, to)
         for lane in range(LANES):
             i = picked[lane]
-            for stage in range(H):
-                draft.inputs[TRACKER, i, axis, stage] = lanes.inputs[stage, lane]
-                draft.gradient[i, axis, stage] = lanes.gradient[stage, lane]
-            for stage in range(H + 1):
-                draft.states[i, axis, stage, 0] = lanes.states_p[stage, lane]
-                draft.states[i, axis, stage, 1] = lanes.states_v[stage, lane]
+            memory.bounded[figures[i].row] |= to.held[lane] > 0.0
+            _take_out(to.inputs, lane, draft.inputs[TRACKER, i, axis])
+            if compares:
+                _take_out(to.gradient, lane, draft.gradient[i, axis])
     for lane in range(LANES):
         i = picked[lane]
         if settled[lane]:
@@ -593,25 +627,37 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     Those have no `solved` in their figures, and are as they were.
     """
     memory, found, figures = batch.memory, batch.found, batch.figures
-    picked, settled, waiting, undone = batch.picked, batch.settled, 0, 0
+    picked, settled, undone = batch.picked, batch.settled, 0
+    # A round of lanes without a bound takes a third of the time of one with a bound in any lane, so
+    # those that were at a bound share theirs: the others are picked from the front, these from the
+    # back.
+    waiting, last = 0, len(rows)
     for i in range(len(rows)):
         _begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
             # Lanes have the LATER weights in common; a first plan has others (E8), and is rare.
             undone += not _plan_one(batch, i, work)
-            continue
-        picked[waiting] = i
+        elif memory.bounded[rows[i]]:
+            last -= 1
+            picked[last] = i
+        else:
+            picked[waiting] = i
+            waiting += 1
+    for at in range(last, len(rows)):
+        picked[waiting] = picked[at]
         waiting += 1
-        if waiting == LANES:
-            _plan_lanes(batch, work)
-            for lane in range(LANES):
-                if not settled[lane]:
-                    undone += not _plan_one(batch, picked[lane], work)
-            waiting = 0
+    first = 0
+    while waiting - first >= LANES:
+        group = picked[first : first + LANES]
+        _plan_lanes(batch, group, work)
+        for lane in range(LANES):
+            if not settled[lane]:
+                undone += not _plan_one(batch, group[lane], work)
+        first += LANES
     # Too few are left for a group of lanes; alone each gets the same bits
     # (tests/server/test_planner.py).
-    for lane in range(waiting):
-        undone += not _plan_one(batch, picked[lane], work)
+    for at in range(first, waiting):
+        undone += not _plan_one(batch, picked[at], work)
     return undone
 
 

@@ -93,15 +93,15 @@ class Plan(NamedTuple):
 def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Plan:
     """The plans of vehicles."""
     planner.plan(rows, step, found)
-    inputs, states, steps = planner._memory
-    n = len(rows)
+    memory, n = planner._memory, len(rows)
+    inputs = memory.inputs[:, rows].astype(float)
     figures = planner.figures[:n].copy()
     figures["row"] = 0  # where a vehicle lies is nothing that its plan should know
     figures["gap"][figures["fresh"]] = 0
     return Plan(
-        inputs[:, rows].copy(),
-        states[rows].copy(),
-        steps[rows].copy(),
+        inputs,
+        np.stack([fly(*led) for led in zip(memory.start[rows], inputs[GENERATOR], strict=True)]),
+        memory.step[rows].copy(),
         planner.planned[:n].copy(),
         figures,
         found.horizons[:n].copy(),
@@ -268,10 +268,10 @@ def test_vehicle_starts_anew_after_a_long_gap_or_when_forgotten(anew: str) -> No
 
 def test_plan_is_exactly_what_can_be_sent() -> None:
     """Inputs are float32 numbers, and X_p is predicted with those and no others."""
-    made = run(make(), 0, START)
-    np.testing.assert_array_equal(made.inputs, made.inputs.astype(np.float32))
-    np.testing.assert_array_equal(made.states[0], fly(START, made.led[0]))
+    planner = make()
+    made, then = run(planner, 0, START), run(planner, H, START)
     np.testing.assert_array_equal(made.horizons[:, :, :H], made.tracked)
+    np.testing.assert_array_equal(then.planned[0], fly(START, made.led[0])[:, H])
 
 
 @pytest.mark.parametrize("solver", ["exact", "osqp"])
@@ -412,9 +412,9 @@ compiled_pass = skytether.server.control.planner._plan
 def leaving(batch: Batch, rows: Indices, steps: Indices, work: Workspace) -> int:
     """Plan as the compiled pass does, but leave every third vehicle unsolved, with its memory."""
     left, memory = rows[::3], batch.memory
-    before = memory.inputs[:, left], memory.states[left], memory.step[left]
+    before = memory.inputs[:, left], memory.start[left], memory.step[left]
     compiled_pass(batch, rows, steps, work)
-    memory.inputs[:, left], memory.states[left], memory.step[left] = before
+    memory.inputs[:, left], memory.start[left], memory.step[left] = before
     batch.figures["solved"][: len(rows) : 3] = False
     return len(left)
 
@@ -460,7 +460,8 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
         same(one, plan(around, rows, starts[rows] - ahead, other))
         unsolved += np.count_nonzero(~one.figures["solved"])
         fresh += np.count_nonzero(one.figures["fresh"])
-    same(*(Plan(*planner._memory, *(np.zeros(0),) * 3) for planner in (compiled, around)))
+    for mine, yours in zip(compiled._memory[:3], around._memory[:3], strict=True):
+        np.testing.assert_array_equal(mine, yours)
     assert min(unsolved, fresh) > 0
     assert all(len(listener.heard()[0][0]) > 0 for listener in listeners)
 
