@@ -49,11 +49,11 @@ class Lanes(NamedTuple):
     w: F1
     """Disturbance ŵ [m/s]; shape (LANES,)."""
     p00: F1
-    """Cost-to-go matrix of the backward pass, on position twice; shape (LANES,)."""
+    """Entry for position of the matrix P of the backward pass; shape (LANES,)."""
     p01: F1
-    """The same on position and velocity; shape (LANES,)."""
+    """Its entry for position and velocity; shape (LANES,)."""
     p11: F1
-    """The same on velocity twice; shape (LANES,)."""
+    """Its entry for velocity; shape (LANES,)."""
     total: F1
     """Sum of a gradient, which is not finite where one of its numbers is not; shape (LANES,)."""
     changed: F1
