@@ -51,9 +51,9 @@ class Lanes(NamedTuple):
     p00: F1
     """Entry for position of the matrix P of the backward pass; shape (LANES,)."""
     p01: F1
-    """Its entry for position and velocity; shape (LANES,)."""
+    """Entry for position and velocity; shape (LANES,)."""
     p11: F1
-    """Its entry for velocity; shape (LANES,)."""
+    """Entry for velocity; shape (LANES,)."""
     total: F1
     """Sum of a gradient, which is not finite where one of its numbers is not; shape (LANES,)."""
     changed: F1
