@@ -71,6 +71,16 @@ class AxisAboard:
     """Largest change of position in a step that noise explains [m]."""
     noise_mps: float
     """Largest change of velocity in a step that noise explains [m/s]."""
+    is_exact: bool
+    """Whether the state is measured as it is."""
+    bias_p: float
+    """Bias of a measured position [m]."""
+    bias_v: float
+    """Bias of a measured velocity [m/s]."""
+    sigma_p: float
+    """Standard deviation of a measured position's noise [m]."""
+    sigma_v: float
+    """Standard deviation of a measured velocity's noise [m/s]."""
     filters: bool
     """Whether there is a Kalman filter."""
     variance_p: float
@@ -94,6 +104,10 @@ class AxisState:
     """True position [m]."""
     v: float
     """True velocity [m/s]."""
+    z_p: float
+    """Measured position [m]."""
+    z_v: float
+    """Measured velocity [m/s]."""
     x_p: float
     """Position estimate that the vehicle flies by [m]."""
     x_v: float
@@ -159,7 +173,9 @@ Plans = Annotated[NDArray[np.void], records(AXIS_PLAN, 1)]
 
 
 @part
-def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F2) -> bool:
+def measured_on(
+    constants: Constants, now: StatesNow, after: StatesNow, drawn: F2, sensed: F2
+) -> bool:
     """Move the vehicle to the next step, measure and filter; see `fly_step`."""
     usual = True
     for i in range(len(constants)):
@@ -169,24 +185,28 @@ def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F
         if axis.windy:
             n, m = drawn[i, 0], drawn[i, 1]
             p, v = p + axis.shove_p * n, v + (axis.shove_vp * n + axis.shove_v * m)
-        usual &= not velocity_leaps(was.v, v, axis.dt_s, axis.noise_mps)
-        usual &= not position_leaps(was.p, was.v, p, v, axis.dt_s, axis.noise_m)
-        x_p, x_v, w = p, v, 0.0
+        z_p, z_v = p, v
+        if not axis.is_exact:
+            z_p = p + axis.bias_p + axis.sigma_p * sensed[0, i]
+            z_v = v + axis.bias_v + axis.sigma_v * sensed[1, i]
+        usual &= not velocity_leaps(was.z_v, z_v, axis.dt_s, axis.noise_mps)
+        usual &= not position_leaps(was.z_p, was.z_v, z_p, z_v, axis.dt_s, axis.noise_m)
+        x_p, x_v, w = z_p, z_v, 0.0
         if axis.filters:
             known = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
             x_p, x_v = advance(known, was.x_p, was.x_v, was.u + was.x_w)
             noise = Spread(axis.noise_pp, axis.noise_pv, 0.0, axis.noise_vv, 0.0, axis.noise_ww)
             spread = Spread(was.pp, was.pv, was.pw, was.vv, was.vw, was.ww)
             (kp, kv, kw), spread = by_position(widened(known, spread, noise), axis.variance_p)
-            off = p - x_p
+            off = z_p - x_p
             x_p, x_v, w = x_p + kp * off, x_v + kv * off, was.x_w + kw * off
             (kp, kv, kw), spread = by_velocity(spread, axis.variance_v)
-            off = v - x_v
+            off = z_v - x_v
             x_p, x_v, w = x_p + kp * off, x_v + kv * off, w + kw * off
             now_is.pp, now_is.pv, now_is.pw = spread.pp, spread.pv, spread.pw
             now_is.vv, now_is.vw, now_is.ww = spread.vv, spread.vw, spread.ww
         usual &= -FLOAT_MAX <= x_p <= FLOAT_MAX and -FLOAT_MAX <= x_v <= FLOAT_MAX
-        now_is.p, now_is.v = p, v
+        now_is.p, now_is.v, now_is.z_p, now_is.z_v = p, v, z_p, z_v
         now_is.x_p, now_is.x_v, now_is.x_w = x_p, x_v, w
     return usual
 
@@ -234,6 +254,7 @@ def fly_step(
     now: StatesNow,
     after: StatesNow,
     drawn: F2,
+    sensed: F2,
     plans: Plans,
     numbers: F2,
     stage: int,
@@ -247,6 +268,7 @@ def fly_step(
         now: its state at the previous step.
         after: output: its state at the step.
         drawn: normal numbers of white acceleration; shape (axes, 2).
+        sensed: numbers of the sensor's noise, of positions and of velocities; shape (2, axes).
         plans: horizon or spline in force.
         numbers: the plan's inputs [m/s] or knots [m, m/s]; shape (axes, n).
         stage: stage of the plan at the step.
@@ -258,7 +280,7 @@ def fly_step(
     Returns:
         whether the step was regular; if not, the outputs must not be used.
     """
-    usual, axes = measured_on(constants, now, after, drawn), len(constants)
+    usual, axes = measured_on(constants, now, after, drawn, sensed), len(constants)
     for i in range(axes):
         axis, was, now_is, plan = constants[i], now[i], after[i], plans[i]
         lead_p, lead_v, x_p, x_v = was.lead_p, was.lead_v, now_is.x_p, now_is.x_v
@@ -276,7 +298,7 @@ def fly_step(
         u = limited(u, part_flown, 0.0, was.u, axis.change_max, axis.bound)
         now_is.u, now_is.lead_p, now_is.lead_v = u, lead_p, lead_v
         told[2 * i], told[2 * i + 1] = now_is.p, now_is.v
-        told[2 * (axes + i)], told[2 * (axes + i) + 1] = now_is.p, now_is.v
+        told[2 * (axes + i)], told[2 * (axes + i) + 1] = now_is.z_p, now_is.z_v
         told[2 * (2 * axes + i)], told[2 * (2 * axes + i) + 1] = x_p, x_v
         told[6 * axes + i], told[7 * axes + i] = u, part_told
     return usual

@@ -2,7 +2,7 @@
 
 All other steps run in `client.pilot`: a first step, a landing, a fault, a scripted pilot takeover,
 a state that has jumped or is not finite, braking that has to be bounded; and every step of a
-vehicle with a dead time, a fence, a mission, or a sensor that is not exact.
+vehicle with a dead time, a fence, or a sensor that does not measure its whole state at each step.
 """
 
 import math
@@ -72,10 +72,11 @@ class _Flying:
         self._constants, self._plans = np.zeros(axes, AXIS_ABOARD), np.zeros(axes, AXIS_PLAN)
         self._numbers, self._told = np.zeros((axes, 1)), np.zeros(8 * axes)
         self._states = slice(0, 2 * axes)
+        self._measured = slice(2 * axes, 4 * axes)
         self._known = slice(4 * axes, 6 * axes)
         self._inputs = slice(6 * axes, 7 * axes)
         self._parts = slice(7 * axes, 8 * axes)
-        """Four slices of `_told`: true state, state flown by, input, input without feedback."""
+        """Five slices of `_told`: true state, measured, flown by, input, input without feedback."""
         self.row: list[float] = []
         """Last output of `fly_step`."""
         self.step: int | None = None
@@ -103,6 +104,10 @@ class _Flying:
         to["true_gain"], to["bound"] = self._plant.gain, terms.u_max
         to["change_max"], to["dt_s"] = change_max, terms.dt_ns / SECOND_NS
         to["noise_m"], to["noise_mps"] = leaps.noise_m, leaps.noise_mps
+        sensor = self._vehicle.sensor
+        to["is_exact"] = sensor.is_exact
+        to["sigma_p"], to["sigma_v"] = sensor.noise
+        to["bias_p"], to["bias_v"] = sensor.bias
         if self._kalman is not None:
             to["filters"] = True
             to["variance_p"], to["variance_v"] = self._kalman.variances
@@ -121,7 +126,7 @@ class _Flying:
         Returns:
             input of each axis [m/s]; None if the step is not regular: then nothing was changed.
         """
-        compensator, weather = self._compensator, self._plant.weather
+        compensator, weather, sensor = self._compensator, self._plant.weather, self._vehicle.sensor
         if not self._is_loaded:
             self._load(before)
         if compensator.held is not self._held or compensator.guides is not self._guides:
@@ -134,7 +139,8 @@ class _Flying:
             self._constants,
             self._now,
             self._after,
-            drawn,
+            drawn[0],
+            sensor.draw()[0],
             self._plans,
             self._numbers,
             stage,
@@ -145,7 +151,8 @@ class _Flying:
         row = self._told.tolist()
         if speed_max < math.inf and math.hypot(*row[self._parts]) > speed_max + ROUNDING:
             return None
-        weather.drawn = None
+        weather.pass_by()
+        sensor.pass_by()
         self._now, self._after = self._after, self._now
         self._lead_stage = max(stage, self._lead_stage)
         self.step, self._is_ahead = step, True
@@ -175,6 +182,7 @@ class _Flying:
         """Copy the objects' state into the arrays."""
         now, self._is_loaded = self._now, True
         now["p"], now["v"] = zip(*self._plant.x, strict=True)
+        now["z_p"], now["z_v"] = zip(*self._navigation.measured, strict=True)
         now["x_p"], now["x_v"] = zip(*self._navigation.estimate, strict=True)
         now["u"] = before
         self._held = None
@@ -251,8 +259,9 @@ class _Flying:
         self._is_ahead = False
         compensator, now = self._compensator, self._now
         self._vehicle.flown_to(self.step)
-        states = self._plant.x = self._navigation.measured = pairs(self.row[self._states])
-        position, velocity = [p for p, _ in states], [v for _, v in states]
+        self._plant.x = pairs(self.row[self._states])
+        self._navigation.measured = pairs(self.row[self._measured])
+        position, velocity = map(list, zip(*self._navigation.measured, strict=True))
         measured = Measurement(self._vehicle.starts_ns(self.step), position, velocity)
         self._navigation.leaps.took(measured)
         if compensator.held is self._held and compensator.guides is self._guides:
@@ -348,7 +357,7 @@ class CompiledPilot(Pilot):
         super().__init__(scenario, number, vehicle, failsafe, recorder)
         self._flying: _Flying | None = None
         """Compiled flight of regular steps; None where they are not compiled."""
-        if self._fence is None and not self._terms.join and self._navigation.is_simple:
+        if self._fence is None and self._navigation.is_simple:
             body = SimpleBody.of(vehicle)
             if body is not None:
                 self._flying = _Flying(
@@ -405,4 +414,5 @@ class CompiledPilot(Pilot):
     def _is_usual(self) -> bool:
         """Whether the vehicle flies the plan's input, and its state is known."""
         mode = self._failsafe.mode
-        return mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known
+        usual = mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known
+        return usual and not self._is_to_rest()

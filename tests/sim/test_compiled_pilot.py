@@ -102,21 +102,63 @@ def test_most_steps_of_a_flight_are_compiled(name: str) -> None:
 @pytest.mark.parametrize(
     "sections",
     [
-        {"sensor": NOISY},
+        {"sensor": {"delay_s": 0.1}},
+        {"sensor": {"velocity_every_s": 0.2}},
         {"model": {"dead_time_s": [0.12]}},
         {"fence": {"radius_m": 6.0}},
     ],
 )
 def test_what_is_not_simple_is_left_to_the_pilot(sections: dict[str, Any]) -> None:
-    """A sensor with noise, a dead time, a fence."""
+    """A sensor that tells late or now and then, a dead time, a fence."""
     _, usual = assert_as_by_pilot(packaged("demo", SHORT, **sections))
     assert not usual
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        NOISY,
+        {"position_noise_m": 0.05},
+        {"velocity_noise_mps": 0.1, "filter": "none"},
+        {"position_bias_m": [0.2, -0.1], "velocity_bias_mps": [0.0, 0.05]},
+        {"position_noise_m": 0.05, "position_bias_m": [0.2, 0.0], "velocity_noise_mps": 0.01},
+    ],
+)
+@pytest.mark.parametrize("name", ["paper", "demo"])
+def test_noisy_measurements_are_compiled(name: str, sensor: dict[str, Any]) -> None:
+    """Noise and bias of positions, of velocities and of both, with the filter and without."""
+    record, usual = assert_as_by_pilot(packaged(name, SHORT, duration=8.0, sensor=sensor))
+    assert all(usual)
+    assert len(usual) > 0.7 * len(record.client)
+
+
+@pytest.mark.parametrize("name", ["swap", "sphere", "corridor"])
+def test_missions_are_compiled(name: str) -> None:
+    """Vehicles that hold their places, fly motions and come to rest, over a network that loses."""
+    lossy = {"uplink": {"loss": 0.3}, "downlink": {"loss": 0.3}}
+    flown = packaged(name, {"duration": 12.0, "settle": 0.0}, network=lossy)
+    record, usual = assert_as_by_pilot(flown, vehicles=len(flown.make_reference().vehicles))
+    assert all(usual)
+    assert len(usual) > 0.9 * len(record.client)
 
 
 def test_wind_may_change_in_flight() -> None:
     """The arrays take on other air, and a step is flown in what was drawn for it."""
     changes = [(1.5, {"vehicle.wind": 0.3}), (2.5, {"vehicle.gust_mps2": 2.0})]
     _, usual = assert_as_by_pilot(packaged("paper", SHORT), changes=changes)
+    assert all(usual)
+
+
+def test_wind_and_gusts_of_a_noisy_vehicle_may_come_and_go() -> None:
+    """Numbers that were drawn in advance are given back where gusts begin to draw theirs."""
+    changes = [
+        (1.0, {"vehicle.wind": 0.0}),
+        (1.5, {"vehicle.wind": 0.3}),
+        (2.0, {"vehicle.gust_mps2": 2.0}),
+        (3.0, {"vehicle.gust_mps2": 0.0}),
+    ]
+    flown = packaged("target", SHORT, vehicle={"gust_every_s": 0.2, "gust_s": 0.1})
+    _, usual = assert_as_by_pilot(flown, changes=changes)
     assert all(usual)
 
 
