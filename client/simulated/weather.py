@@ -96,6 +96,11 @@ class Weather:
             self._drawn = drawn[None]
         return self._drawn
 
+    @property
+    def has_gusts(self) -> bool:
+        """Whether gusts begin and end by chance."""
+        return self._gust_mps2 != 0.0
+
     def pass_by(self, steps: int = 1) -> None:
         """Let the air of the next steps, which `draw` has told, pass by."""
         if self._gust_mps2 == 0.0 and self.white:
