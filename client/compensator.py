@@ -284,6 +284,12 @@ class Compensator:
         """Whether the horizon has an input for a step."""
         return self.in_force != NO_HORIZON and step - self.begins < self._length
 
+    def alike_until(self, step: int) -> int:
+        """Last step up to which `covered` stays as it is at a step, and nothing is braked."""
+        if self.in_force != NO_HORIZON:
+            return self.begins + self._length - 1 if self.covered else step
+        return FOREVER if self.rests else step
+
     def _go_on(self, step: int) -> int:
         """Advance to a step; returns its stage in the horizon."""
         if self._new:

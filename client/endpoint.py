@@ -119,6 +119,11 @@ class Client(Endpoint):
         return self._pilot.missed
 
     @property
+    def began_ns(self) -> int:
+        """Time at which step 0 began [ns], or 0 before any."""
+        return self._pilot.began_ns
+
+    @property
     def disturbance(self) -> Sequence[float]:
         """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
         return self._pilot.disturbance
@@ -196,7 +201,7 @@ class Client(Endpoint):
         self._events += port.events()
 
     def _fly(self, now_ns: int) -> None:
-        """Fly a step, and tell the server."""
+        """Fly the step that is due, and tell the server."""
         session, pilot = self._session, self._pilot
         pilot.fly(now_ns=now_ns)
         if pilot.is_held and now_ns >= self._held_ns:

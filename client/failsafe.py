@@ -53,6 +53,9 @@ CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
 """Causes for which the horizon held is dropped."""
 
+CALM = frozenset({Mode.TRACK, Mode.COAST, Mode.HOVER})
+"""Modes in which a vehicle may fly for many steps without a cause for another one."""
+
 Table = Mapping[tuple[Mode, Reason], Mode]
 
 _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not Mode.FAULT}
@@ -188,6 +191,22 @@ class Failsafe:
     def _is_good(self, now_ns: int) -> bool:
         """Whether something of the session has come within half of the time-out."""
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns // 2
+
+    def calm_until_ns(self, now_ns: int) -> int:
+        """Time up to which `step` changes nothing as long as nothing comes [ns].
+
+        Args:
+            now_ns: time of a step that has just been handled; also returned where the next one may
+                change something.
+        """
+        waits = self.mode not in CALM or self.reason in LOCKING or self.reason is Reason.UNARMED
+        if waits or not self.armed or self._has_leapt or self.is_lost(now_ns):
+            return now_ns
+        assert self._heard_ns is not None
+        lost_ns = self._heard_ns + self._timeout_ns
+        if (self.mode, Reason.OLD) not in self._table:
+            return lost_ns
+        return max(now_ns, min(lost_ns, self._horizon_ns + self._timeout_ns))
 
     # -- what arrives ------------------------------------------------------------------------
 

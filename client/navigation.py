@@ -33,6 +33,8 @@ class Sensing(NamedTuple):
     """Time from measuring to having the measurement, D [steps]."""
     every_ns: tuple[int, int]
     """Time from one position, and one velocity, to the next [ns]; 0: never."""
+    prompt: bool
+    """Whether it measures the whole state at every step, and tells it at once."""
     exact: bool
     """Whether it measures the whole state as it is, at every step."""
 
@@ -48,8 +50,8 @@ def sensing(scenario: Scenario) -> Sensing:
     )
     noise = sensor.position_noise_m, sensor.velocity_noise_mps
     wrong = any((*noise, *sensor.position_bias_m, *sensor.velocity_bias_mps))
-    late = delay > 0 or (position_ns, velocity_ns) != (dt_ns, dt_ns)
-    return Sensing(delay, (position_ns, velocity_ns), not (wrong or late))
+    prompt = delay == 0 and (position_ns, velocity_ns) == (dt_ns, dt_ns)
+    return Sensing(delay, (position_ns, velocity_ns), prompt, prompt and not wrong)
 
 
 def filters(scenario: Scenario) -> bool:
@@ -76,7 +78,7 @@ class Navigation:
         self._begun = False
         self.leaps = Leaps(scenario)
         """Check of each measurement against the one before."""
-        self.is_simple = known.exact and self._inputs is None
+        self.is_simple = known.prompt and self._inputs is None
         """Whether the whole state is measured at each step, and each input acts at once."""
         self.leapt = False
         """Whether what was measured since the last step is what no vehicle can have come to."""

@@ -275,10 +275,14 @@ class Pilot:
 
     def _rest(self) -> None:
         """Hold the place where a vehicle on a mission hovers: others keep away from there."""
-        compensator, known = self.compensator, self._navigation
-        hovers = self._terms.join and self._failsafe.mode in HOVERING and known.is_known
-        if hovers and compensator.in_force == NO_HORIZON and not compensator.rests:
-            compensator.rest(self.step, known.predicted)
+        if self._is_to_rest() and self._navigation.is_known:
+            self.compensator.rest(self.step, self._navigation.predicted)
+
+    def _is_to_rest(self) -> bool:
+        """Whether the vehicle hovers on a mission, and holds no place yet."""
+        hovers = self._terms.join and self._failsafe.mode in HOVERING
+        compensator = self.compensator
+        return bool(hovers) and compensator.in_force == NO_HORIZON and not compensator.rests
 
     def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
         """Input that the fence lets pass; down to the ground it lets a vehicle that lands."""

@@ -5,7 +5,7 @@ vehicle, from the observation that it sent last and by the horizon that it holds
 to about the same, the server knows what it needs, and the vehicle may be silent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import hypot
 
 from skytether.client.compensator import Compensator
@@ -66,7 +66,8 @@ class Reporter:
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
         self._dt_s = terms.dt_s
         self._compensator = compensator
-        self._always = is_always(report)
+        self.always = is_always(report)
+        """Whether there is an observation of every step."""
         self._wants = make_report(report)
         self.belief = BelievedState(terms, compensator)
         """State that the server must take the vehicle to be in."""
@@ -98,7 +99,7 @@ class Reporter:
             flown: input that is flown from here on, of each axis [m/s].
             silence: longest silence that the server asks for [half steps]; 0 for none.
         """
-        if self._always:  # nothing need be known of what the server believes
+        if self.always:  # nothing need be known of what the server believes
             return True
         known = self._compensator.in_force, mode, self._compensator.repeated
         slept = step > self._step + 1
@@ -115,6 +116,27 @@ class Reporter:
         else:
             self.belief.silent()
         return due
+
+    def silent_for(self, session: int, mode: Mode, silence: int, off_m: Iterable[float]) -> int:
+        """Number of next steps of which no observation is due, if nothing comes.
+
+        Args:
+            session, mode, silence: see `is_due`.
+            off_m: distance from the believed state at each of these steps [m].
+        """
+        if mode is Mode.READY or session != self._session:
+            return 0
+        is_news = (self._compensator.in_force, mode, self._compensator.repeated) != self._known
+        wants, dt_s, count = self._wants, self._dt_s, 0
+        for steps, off in enumerate(off_m, start=self._step + 1 - self._told):
+            if 0 < silence <= 2 * steps or wants(Unreported(off, is_news, steps, dt_s)):
+                break
+            count += 1
+        return count
+
+    def was_silent(self, step: int) -> None:
+        """Note that no observation was due at any step up to this one; `belief` is there."""
+        self._step = step
 
     def _waits(self, step: int, mode: Mode) -> bool:
         """Whether a vehicle that waits for a horizon says so, at once or once more.

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from skytether.__main__ import main
-from skytether.client.pilot import Pilot
+from skytether.client.endpoint import Client
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 from skytether.shared.scenario import reading
@@ -76,12 +76,23 @@ def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
 
 
 def uncompile(patch: pytest.MonkeyPatch) -> None:
-    """Have vehicles in virtual time fly each step by the methods of `client`.
+    """Have vehicles in virtual time fly each step by the methods of `client`, woken for each.
 
-    Usual steps are one compiled call otherwise (`sim.pilot`), in which a method that a test
-    replaces is never called: the test would fly as if it had replaced nothing.
+    Usual steps are compiled calls otherwise (`sim.pilot`), in which a method that a test replaces
+    is never called: the test would fly as if it had replaced nothing.
     """
-    patch.setattr(flight, "CompiledPilot", Pilot)
+    patch.setattr(flight, "AheadClient", PlainClient)
+
+
+class PlainClient(Client):
+    """Client in place of an `AheadClient`."""
+
+    def __init__(self, scenario: Scenario, *args: Any, **keys: Any) -> None:
+        del keys["clock"], keys["world_ns"]
+        super().__init__(scenario, *args, **keys)
+
+    def catch_up(self) -> None:
+        """Do nothing: it flies no step ahead or later."""
 
 
 @asynccontextmanager

@@ -49,7 +49,7 @@ class SimulatedVehicle(Vehicle):
 
     def __init__(self, dt_ns: int, plant: Plant, sensor: Sensor) -> None:
         self._dt_ns = dt_ns
-        self.plant, self._sensor = plant, sensor
+        self.plant, self.sensor = plant, sensor
         self._began_ns = 0
         self._step = -1
         """Step at whose begin the plant's state is; -1 before the flight."""
@@ -75,8 +75,8 @@ class SimulatedVehicle(Vehicle):
 
     @property
     def is_simple(self) -> bool:
-        """Whether the whole state is measured at each step as it is."""
-        return self._sensor.is_exact
+        """Whether the whole state is measured at each step, and told at once."""
+        return self.sensor.is_prompt
 
     def starts_ns(self, step: int) -> int:
         """Begin of a step of its flight [ns; the client's clock]."""
@@ -85,11 +85,11 @@ class SimulatedVehicle(Vehicle):
     def flown_to(self, step: int) -> None:
         """Note that its plant was flown to a step elsewhere, and measured at each step."""
         self._step = step
-        self._sensor.measured_at(step)
+        self.sensor.measured_at(step)
 
     def _measure(self, told: list[Measurement]) -> None:
         """Add the measurement that is available at the step, if there is one."""
-        measured = self._sensor.measure(self.plant.x, began_ns=self._began_ns)
+        measured = self.sensor.measure(self.plant.x, began_ns=self._began_ns)
         if measured.position or measured.velocity:
             told.append(measured)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.client.simulated.normals import Normals
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
@@ -40,12 +41,14 @@ class Weather:
         self._gust: Array | None = None
         """Way that the gust blows, of any length; shape (axes,). None between gusts."""
         self._still = np.zeros((len(self._tau), 2))
-        self.drawn: Array | None = None
-        """Wind drawn for the next step and not used yet."""
+        self._normals = Normals(rng, self._still.shape)
+        self._drawn: Array | None = None
+        """Wind drawn for the next step and not used yet, where there are gusts."""
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:
         """Change the winds from the next step on."""
+        self._normals.give_back()
         white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self.white = white.tolist() if vehicle.wind else []
         self._gust_mps2 = vehicle.gust_mps2
@@ -61,7 +64,8 @@ class Weather:
 
     def blow(self) -> AirStep:
         """The air over the next step."""
-        drawn, self.drawn = self.draw(), None
+        (drawn,) = self.draw()
+        self.pass_by()
         if not self.white:
             return self.calm
         shoves = [
@@ -70,22 +74,41 @@ class Weather:
         ]
         return AirStep(self.calm.push, shoves)
 
-    def draw(self) -> Array:
-        """Normal numbers of the white acceleration over the next step; shape (axes, 2).
+    def draw(self, steps: int = 1) -> Array:
+        """Normal numbers of the white acceleration over the next steps.
 
-        They are the same until `drawn` is None again: until then the air stays as it is.
+        They are the same until `pass_by`: until then the air stays as it is.
+
+        Args:
+            steps: number of steps, at least 1.
+
+        Returns:
+            numbers of 1 to so many steps, with gusts of one alone; shape (n, axes, 2).
         """
-        if self.drawn is None:
-            self._gusts()
-            self.drawn = self._still
+        if self._gust_mps2 == 0.0:
             if self.white:
-                self.drawn = self._rng.standard_normal(self._still.shape)
-        return self.drawn
+                return self._normals.ahead(steps)
+            return np.broadcast_to(self._still, (steps, *self._still.shape)).copy()
+        if self._drawn is None:
+            # What gusts draw lies between the numbers of two steps.
+            self._gusts()
+            drawn = self._rng.standard_normal(self._still.shape) if self.white else self._still
+            self._drawn = drawn[None]
+        return self._drawn
+
+    @property
+    def has_gusts(self) -> bool:
+        """Whether gusts begin and end by chance."""
+        return self._gust_mps2 != 0.0
+
+    def pass_by(self, steps: int = 1) -> None:
+        """Let the air of the next steps, which `draw` has told, pass by."""
+        if self._gust_mps2 == 0.0 and self.white:
+            self._normals.use(steps)
+        self._drawn = None
 
     def _gusts(self) -> None:
         """Gusts begin and end by chance, each blowing one way all along."""
-        if self._gust_mps2 == 0.0:
-            return
         # Drawn at every step, so that the times of gusts do not depend on their strength.
         chance = self._rng.random()
         if self._gust is not None:

@@ -17,7 +17,7 @@ from skytether.client import filter as kalman
 from skytether.client.filter import Spread
 from skytether.server.control.law import advance, lead_to, step
 from skytether.server.control.trajectory import follow, guided_to, regulated
-from skytether.shared.base.kernel import F1, F2, R1, kernel, part, record, records, shared
+from skytether.shared.base.kernel import F1, F2, F3, R1, kernel, part, record, records, shared
 from skytether.shared.law import leap
 from skytether.shared.law.model import Axis
 from skytether.shared.law.rule import Held
@@ -71,6 +71,16 @@ class AxisAboard:
     """Largest change of position in a step that noise explains [m]."""
     noise_mps: float
     """Largest change of velocity in a step that noise explains [m/s]."""
+    is_exact: bool
+    """Whether the state is measured as it is."""
+    bias_p: float
+    """Bias of a measured position [m]."""
+    bias_v: float
+    """Bias of a measured velocity [m/s]."""
+    sigma_p: float
+    """Standard deviation of a measured position's noise [m]."""
+    sigma_v: float
+    """Standard deviation of a measured velocity's noise [m/s]."""
     filters: bool
     """Whether there is a Kalman filter."""
     variance_p: float
@@ -94,6 +104,10 @@ class AxisState:
     """True position [m]."""
     v: float
     """True velocity [m/s]."""
+    z_p: float
+    """Measured position [m]."""
+    z_v: float
+    """Measured velocity [m/s]."""
     x_p: float
     """Position estimate that the vehicle flies by [m]."""
     x_v: float
@@ -154,12 +168,16 @@ Constants = Annotated[NDArray[np.void], records(AXIS_ABOARD, 1)]
 """Constants of a vehicle; shape (axes,)."""
 StatesNow = Annotated[NDArray[np.void], records(AXIS_STATE, 1)]
 """State of a vehicle; shape (axes,)."""
+StatesAhead = Annotated[NDArray[np.void], records(AXIS_STATE, 2)]
+"""State of a vehicle at one step after the other; shape (n, axes)."""
 Plans = Annotated[NDArray[np.void], records(AXIS_PLAN, 1)]
 """Plan of a vehicle; shape (axes,)."""
 
 
 @part
-def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F2) -> bool:
+def measured_on(
+    constants: Constants, now: StatesNow, after: StatesNow, drawn: F2, sensed: F2
+) -> bool:
     """Move the vehicle to the next step, measure and filter; see `fly_step`."""
     usual = True
     for i in range(len(constants)):
@@ -169,24 +187,28 @@ def measured_on(constants: Constants, now: StatesNow, after: StatesNow, drawn: F
         if axis.windy:
             n, m = drawn[i, 0], drawn[i, 1]
             p, v = p + axis.shove_p * n, v + (axis.shove_vp * n + axis.shove_v * m)
-        usual &= not velocity_leaps(was.v, v, axis.dt_s, axis.noise_mps)
-        usual &= not position_leaps(was.p, was.v, p, v, axis.dt_s, axis.noise_m)
-        x_p, x_v, w = p, v, 0.0
+        z_p, z_v = p, v
+        if not axis.is_exact:
+            z_p = p + axis.bias_p + axis.sigma_p * sensed[0, i]
+            z_v = v + axis.bias_v + axis.sigma_v * sensed[1, i]
+        usual &= not velocity_leaps(was.z_v, z_v, axis.dt_s, axis.noise_mps)
+        usual &= not position_leaps(was.z_p, was.z_v, z_p, z_v, axis.dt_s, axis.noise_m)
+        x_p, x_v, w = z_p, z_v, 0.0
         if axis.filters:
             known = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
             x_p, x_v = advance(known, was.x_p, was.x_v, was.u + was.x_w)
             noise = Spread(axis.noise_pp, axis.noise_pv, 0.0, axis.noise_vv, 0.0, axis.noise_ww)
             spread = Spread(was.pp, was.pv, was.pw, was.vv, was.vw, was.ww)
             (kp, kv, kw), spread = by_position(widened(known, spread, noise), axis.variance_p)
-            off = p - x_p
+            off = z_p - x_p
             x_p, x_v, w = x_p + kp * off, x_v + kv * off, was.x_w + kw * off
             (kp, kv, kw), spread = by_velocity(spread, axis.variance_v)
-            off = v - x_v
+            off = z_v - x_v
             x_p, x_v, w = x_p + kp * off, x_v + kv * off, w + kw * off
             now_is.pp, now_is.pv, now_is.pw = spread.pp, spread.pv, spread.pw
             now_is.vv, now_is.vw, now_is.ww = spread.vv, spread.vw, spread.ww
         usual &= -FLOAT_MAX <= x_p <= FLOAT_MAX and -FLOAT_MAX <= x_v <= FLOAT_MAX
-        now_is.p, now_is.v = p, v
+        now_is.p, now_is.v, now_is.z_p, now_is.z_v = p, v, z_p, z_v
         now_is.x_p, now_is.x_v, now_is.x_w = x_p, x_v, w
     return usual
 
@@ -228,37 +250,21 @@ def held_of(axis: AxisAboard, plan: AxisPlan, inputs: R1) -> Held:
     )
 
 
-@kernel
-def fly_step(
+@part
+def flown_on(
     constants: Constants,
     now: StatesNow,
     after: StatesNow,
     drawn: F2,
+    sensed: F2,
     plans: Plans,
     numbers: F2,
     stage: int,
     lead_stage: int,
     told: F1,
 ) -> bool:
-    """Fly a vehicle to its next step, and choose the input from there on.
-
-    Args:
-        constants: constants of the vehicle.
-        now: its state at the previous step.
-        after: output: its state at the step.
-        drawn: normal numbers of white acceleration; shape (axes, 2).
-        plans: horizon or spline in force.
-        numbers: the plan's inputs [m/s] or knots [m, m/s]; shape (axes, n).
-        stage: stage of the plan at the step.
-        lead_stage: stage to which the predicted state in `now` belongs.
-        told: output, for all axes one after the other: true position [m] and velocity [m/s], those
-            measured, those flown by, the input [m/s], and its part without feedback [m/s]; shape (8
-            axes,).
-
-    Returns:
-        whether the step was regular; if not, the outputs must not be used.
-    """
-    usual, axes = measured_on(constants, now, after, drawn), len(constants)
+    """Fly a vehicle to its next step; see `fly_step`."""
+    usual, axes = measured_on(constants, now, after, drawn, sensed), len(constants)
     for i in range(axes):
         axis, was, now_is, plan = constants[i], now[i], after[i], plans[i]
         lead_p, lead_v, x_p, x_v = was.lead_p, was.lead_v, now_is.x_p, now_is.x_v
@@ -276,10 +282,75 @@ def fly_step(
         u = limited(u, part_flown, 0.0, was.u, axis.change_max, axis.bound)
         now_is.u, now_is.lead_p, now_is.lead_v = u, lead_p, lead_v
         told[2 * i], told[2 * i + 1] = now_is.p, now_is.v
-        told[2 * (axes + i)], told[2 * (axes + i) + 1] = now_is.p, now_is.v
+        told[2 * (axes + i)], told[2 * (axes + i) + 1] = now_is.z_p, now_is.z_v
         told[2 * (2 * axes + i)], told[2 * (2 * axes + i) + 1] = x_p, x_v
         told[6 * axes + i], told[7 * axes + i] = u, part_told
     return usual
+
+
+@kernel
+def fly_step(
+    constants: Constants,
+    now: StatesNow,
+    after: StatesNow,
+    drawn: F2,
+    sensed: F2,
+    plans: Plans,
+    numbers: F2,
+    stage: int,
+    lead_stage: int,
+    told: F1,
+) -> bool:
+    """Fly a vehicle to its next step, and choose the input from there on.
+
+    Args:
+        constants: constants of the vehicle.
+        now: its state at the previous step.
+        after: output: its state at the step.
+        drawn: normal numbers of white acceleration; shape (axes, 2).
+        sensed: numbers of the sensor's noise, of positions and of velocities; shape (2, axes).
+        plans: horizon or spline in force.
+        numbers: the plan's inputs [m/s] or knots [m, m/s]; shape (axes, n).
+        stage: stage of the plan at the step.
+        lead_stage: stage to which the predicted state in `now` belongs.
+        told: output, for all axes one after the other: true position [m] and velocity [m/s], those
+            measured, those flown by, the input [m/s], and its part without feedback [m/s]; shape (8
+            axes,).
+
+    Returns:
+        whether the step was regular; if not, the outputs must not be used.
+    """
+    return flown_on(constants, now, after, drawn, sensed, plans, numbers, stage, lead_stage, told)
+
+
+@part
+def silent_on(
+    constants: Constants,
+    now: StatesNow,
+    plans: Plans,
+    numbers: F2,
+    stage: int,
+    believed: F2,
+    silent: F2,
+    apart: F2,
+) -> None:
+    """Predict the state at the next step from the one that the server must assume.
+
+    The arguments are those of `believe_step`.
+    """
+    for i in range(len(constants)):
+        axis, at, plan = constants[i], now[i], plans[i]
+        model = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
+        p, v = believed[i, 0], believed[i, 1]
+        apart[i, 0], apart[i, 1] = p - at.x_p, v - at.x_v
+        if plan.is_spline:
+            guide = guide_of(axis, plan, numbers[i])
+            u, _ = regulated(guide, stage, at.lead_p, at.lead_v, p, v, 0.0)
+            silent[i, 0], silent[i, 1] = advance(model, p, v, u)
+        else:
+            held = held_of(axis, plan, numbers[i])
+            u, _, _, _ = step(held, stage, at.lead_p, at.lead_v, p, v)
+            silent[i, 0], silent[i, 1] = advance(model, p, v, u + plan.disturbance)
 
 
 @kernel
@@ -307,19 +378,75 @@ def believe_step(
         told: output: prediction from the state that is flown by [m, m/s]; shape (axes, 2).
         apart: output: distance of the vehicle from `believed` [m, m/s]; shape (axes, 2).
     """
+    silent_on(constants, now, plans, numbers, stage, believed, silent, apart)
     for i in range(len(constants)):
         axis, at, plan = constants[i], now[i], plans[i]
         model = Axis(axis.a01, axis.a11, axis.b0, axis.b1)
-        p, v, x_p, x_v = believed[i, 0], believed[i, 1], at.x_p, at.x_v
-        apart[i, 0], apart[i, 1] = p - x_p, v - x_v
+        x_p, x_v = at.x_p, at.x_v
         if plan.is_spline:
             guide = guide_of(axis, plan, numbers[i])
-            u, _ = regulated(guide, stage, at.lead_p, at.lead_v, p, v, 0.0)
-            silent[i, 0], silent[i, 1] = advance(model, p, v, u)
             u, _ = regulated(guide, stage, at.lead_p, at.lead_v, x_p, x_v, 0.0)
             told[i, 0], told[i, 1] = advance(model, x_p, x_v, u)
         else:
-            held = held_of(axis, plan, numbers[i])
-            u, _, _, _ = step(held, stage, at.lead_p, at.lead_v, p, v)
-            silent[i, 0], silent[i, 1] = advance(model, p, v, u + plan.disturbance)
             told[i, 0], told[i, 1] = advance(model, x_p, x_v, at.u + plan.disturbance)
+
+
+@kernel
+def fly_ahead(
+    constants: Constants,
+    states: StatesAhead,
+    drawn: F3,
+    sensed: F3,
+    plans: Plans,
+    numbers: F2,
+    stage: int,
+    lead_stage: int,
+    told: F2,
+    believed: F3,
+    apart: F3,
+) -> int:
+    """Fly a vehicle over steps at which it sends nothing, as `fly_step` and `believe_step` do.
+
+    Args:
+        constants: constants of the vehicle.
+        states: its states, one step after the other; that at the previous step comes first and is
+            given, the others are output; shape (n + 1, axes).
+        drawn, sensed: see `fly_step`; shape (n, axes, 2) and (n, 2, axes).
+        plans, numbers: see `fly_step`.
+        stage: stage of the plan at the first of the steps.
+        lead_stage: stage to which the predicted state in `states[0]` belongs.
+        told: output: see `fly_step`; shape (n, 8 axes).
+        believed: states that the server must assume, one step after the other; that at the first
+            step is given, the others are output [m, m/s]; shape (n + 1, axes, 2).
+        apart: output: distances of the vehicle from these [m, m/s]; shape (n, axes, 2).
+
+    Returns:
+        number of steps before the first that is not regular; the outputs of others must not be
+        used.
+    """
+    for i in range(len(told)):
+        if not flown_on(
+            constants,
+            states[i],
+            states[i + 1],
+            drawn[i],
+            sensed[i],
+            plans,
+            numbers,
+            stage + i,
+            lead_stage,
+            told[i],
+        ):
+            return i
+        lead_stage = max(stage + i, lead_stage)
+        silent_on(
+            constants,
+            states[i + 1],
+            plans,
+            numbers,
+            stage + i,
+            believed[i],
+            believed[i + 1],
+            apart[i],
+        )
+    return len(told)

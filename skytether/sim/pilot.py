@@ -2,14 +2,15 @@
 
 All other steps run in `client.pilot`: a first step, a landing, a fault, a scripted pilot takeover,
 a state that has jumped or is not finite, braking that has to be bounded; and every step of a
-vehicle with a dead time, a fence, a mission, or a sensor that is not exact.
+vehicle with a dead time, a fence, or a sensor that does not measure its whole state at each step.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.client.clamp import ROUNDING
 from skytether.client.compensator import Compensator
@@ -27,7 +28,17 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.aboard import AXIS_ABOARD, AXIS_PLAN, AXIS_STATE, believe_step, fly_step
+from skytether.sim.aboard import (
+    AXIS_ABOARD,
+    AXIS_PLAN,
+    AXIS_STATE,
+    believe_step,
+    fly_ahead,
+    fly_step,
+)
+
+AHEAD = 32
+"""Most steps that are flown ahead at a time."""
 
 
 class SimpleBody(NamedTuple):
@@ -43,6 +54,18 @@ class SimpleBody(NamedTuple):
             return None
         simple = vehicle.is_simple and vehicle.plant.is_simple
         return cls(vehicle, vehicle.plant) if simple else None
+
+
+class Ahead(NamedTuple):
+    """Steps that were flown ahead, one after the other; all arrays have them first."""
+
+    states: NDArray[np.void]
+    """State of the vehicle, that before the first step included; shape (n + 1, axes)."""
+    told: Array
+    """Output of `fly_step`; shape (n, 8 axes)."""
+    believed: Array
+    """State that the server must assume, that after the last step included; shape (n + 1, axes,
+    2)."""
 
 
 class _Flying:
@@ -72,10 +95,11 @@ class _Flying:
         self._constants, self._plans = np.zeros(axes, AXIS_ABOARD), np.zeros(axes, AXIS_PLAN)
         self._numbers, self._told = np.zeros((axes, 1)), np.zeros(8 * axes)
         self._states = slice(0, 2 * axes)
+        self._measured = slice(2 * axes, 4 * axes)
         self._known = slice(4 * axes, 6 * axes)
         self._inputs = slice(6 * axes, 7 * axes)
         self._parts = slice(7 * axes, 8 * axes)
-        """Four slices of `_told`: true state, state flown by, input, input without feedback."""
+        """Five slices of `_told`: true state, measured, flown by, input, input without feedback."""
         self.row: list[float] = []
         """Last output of `fly_step`."""
         self.step: int | None = None
@@ -103,6 +127,10 @@ class _Flying:
         to["true_gain"], to["bound"] = self._plant.gain, terms.u_max
         to["change_max"], to["dt_s"] = change_max, terms.dt_ns / SECOND_NS
         to["noise_m"], to["noise_mps"] = leaps.noise_m, leaps.noise_mps
+        sensor = self._vehicle.sensor
+        to["is_exact"] = sensor.is_exact
+        to["sigma_p"], to["sigma_v"] = sensor.noise
+        to["bias_p"], to["bias_v"] = sensor.bias
         if self._kalman is not None:
             to["filters"] = True
             to["variance_p"], to["variance_v"] = self._kalman.variances
@@ -121,7 +149,7 @@ class _Flying:
         Returns:
             input of each axis [m/s]; None if the step is not regular: then nothing was changed.
         """
-        compensator, weather = self._compensator, self._plant.weather
+        compensator, weather, sensor = self._compensator, self._plant.weather, self._vehicle.sensor
         if not self._is_loaded:
             self._load(before)
         if compensator.held is not self._held or compensator.guides is not self._guides:
@@ -134,7 +162,8 @@ class _Flying:
             self._constants,
             self._now,
             self._after,
-            drawn,
+            drawn[0],
+            sensor.draw()[0],
             self._plans,
             self._numbers,
             stage,
@@ -145,7 +174,8 @@ class _Flying:
         row = self._told.tolist()
         if speed_max < math.inf and math.hypot(*row[self._parts]) > speed_max + ROUNDING:
             return None
-        weather.drawn = None
+        weather.pass_by()
+        sensor.pass_by()
         self._now, self._after = self._after, self._now
         self._lead_stage = max(stage, self._lead_stage)
         self.step, self._is_ahead = step, True
@@ -153,6 +183,65 @@ class _Flying:
         self._navigation.note(pairs(row[self._known]))
         compensator.note(step, row[self._parts])
         return row[self._inputs]
+
+    def look_ahead(self, steps: int, believed: Array) -> tuple[Ahead, Array]:
+        """Steps after the one that the arrays are at, flown as if nothing happened.
+
+        Nothing is changed; `go_on` goes there.
+
+        Args:
+            steps: most steps, at least 1.
+            believed: state that the server must assume at the first of them [m, m/s]; shape (axes,
+                2).
+
+        Returns:
+            those steps that are regular; and how far the vehicle is from the state that the server
+            must assume [m, m/s], shape (n, axes, 2).
+        """
+        drawn = self._plant.weather.draw(steps)
+        sensed = self._vehicle.sensor.draw(len(drawn))
+        count, axes = len(sensed), len(self._now)
+        states, told = np.empty((count + 1, axes), AXIS_STATE), np.empty((count, 8 * axes))
+        assumed, apart = np.empty((count + 1, axes, 2)), np.empty((count, axes, 2))
+        states[0], assumed[0] = self._now, believed
+        flown = fly_ahead(
+            self._constants,
+            states,
+            drawn[:count],
+            sensed,
+            self._plans,
+            self._numbers,
+            self._stage + 1,
+            self._lead_stage,
+            told,
+            assumed,
+            apart,
+        )
+        return Ahead(states, told[:flown], assumed), apart[:flown]
+
+    def go_on(self, ahead: Ahead, count: int) -> list[float]:
+        """Go on by so many steps that were flown ahead.
+
+        Returns:
+            input of each axis from there on [m/s].
+        """
+        assert self.step is not None
+        weather, sensor = self._plant.weather, self._vehicle.sensor
+        weather.pass_by(count)
+        sensor.pass_by(count)
+        self._now[:] = ahead.states[count]
+        self._stage += count
+        self._lead_stage = max(self._stage, self._lead_stage)
+        self.step, self._is_ahead = self.step + count, True
+        row = self.row = ahead.told[count - 1].tolist()
+        self._navigation.note(pairs(row[self._known]))
+        self._compensator.note(self.step, row[self._parts])
+        return row[self._inputs]
+
+    @property
+    def can_look_ahead(self) -> bool:
+        """Whether the arrays can fly ahead: the air that comes does not depend on chance twice."""
+        return not self._plant.weather.has_gusts
 
     def foresee(self, believed: Array, silent: Array, told: Array, apart: Array) -> None:
         """Predict the state at the next step from the one that the arrays are at.
@@ -175,6 +264,7 @@ class _Flying:
         """Copy the objects' state into the arrays."""
         now, self._is_loaded = self._now, True
         now["p"], now["v"] = zip(*self._plant.x, strict=True)
+        now["z_p"], now["z_v"] = zip(*self._navigation.measured, strict=True)
         now["x_p"], now["x_v"] = zip(*self._navigation.estimate, strict=True)
         now["u"] = before
         self._held = None
@@ -251,8 +341,9 @@ class _Flying:
         self._is_ahead = False
         compensator, now = self._compensator, self._now
         self._vehicle.flown_to(self.step)
-        states = self._plant.x = self._navigation.measured = pairs(self.row[self._states])
-        position, velocity = [p for p, _ in states], [v for _, v in states]
+        self._plant.x = pairs(self.row[self._states])
+        self._navigation.measured = pairs(self.row[self._measured])
+        position, velocity = map(list, zip(*self._navigation.measured, strict=True))
         measured = Measurement(self._vehicle.starts_ns(self.step), position, velocity)
         self._navigation.leaps.took(measured)
         if compensator.held is self._held and compensator.guides is self._guides:
@@ -290,6 +381,16 @@ class _Belief(BelievedState):
         self._foreseen: int | None = None
         """Step from which the arrays have predicted the next state."""
 
+    @property
+    def next(self) -> Array | None:
+        """State at the next step [m, m/s], shape (axes, 2); None while it is in no array."""
+        return self._believed if self._is_array else None
+
+    def go_on(self, believed: Array) -> None:
+        """Go on to a state at another step, that was predicted from `next`."""
+        self._believed[:] = believed
+        self._foreseen = None
+
     def off_m(self, states: States) -> float:
         """See `BelievedState`."""
         if self._flying.step is None:
@@ -301,6 +402,12 @@ class _Belief(BelievedState):
         self._foreseen = self._flying.step
         axes = zip(self._tau_s, self._apart.tolist(), strict=True)
         return math.hypot(*(dp + tau * dv for tau, (dp, dv) in axes))
+
+    def lengths(self, apart: Array) -> Iterator[float]:
+        """Distance of each step, see `off_m`, of what `fly_ahead` tells."""
+        for each in apart.tolist():
+            axes = zip(self._tau_s, each, strict=True)
+            yield math.hypot(*(dp + tau * dv for tau, (dp, dv) in axes))
 
     def told(self, states: States, flown: Sequence[float]) -> None:
         """See `BelievedState`."""
@@ -348,13 +455,16 @@ class CompiledPilot(Pilot):
         super().__init__(scenario, number, vehicle, failsafe, recorder)
         self._flying: _Flying | None = None
         """Compiled flight of regular steps; None where they are not compiled."""
-        if self._fence is None and not self._terms.join and self._navigation.is_simple:
+        if self._fence is None and self._navigation.is_simple:
             body = SimpleBody.of(vehicle)
             if body is not None:
                 self._flying = _Flying(
                     scenario, self._navigation, self.compensator, body, self._change_max
                 )
-                self._reporter.belief = _Belief(self._terms, self.compensator, self._flying)
+                self._belief = _Belief(self._terms, self.compensator, self._flying)
+                self._reporter.belief = self._belief
+        self._ahead: Ahead | None = None
+        """Steps after `flown` that were flown ahead."""
         self._due: int | None = None
         """Step up to whose beginning the vehicle is still to be moved and measured."""
 
@@ -402,7 +512,105 @@ class CompiledPilot(Pilot):
         self._catch_up()
         return super()._choose(now_ns)
 
+    # -- steps that are flown ahead -----------------------------------------------------------
+
+    def look_ahead(self, session: int, asked: int, *, now_ns: int) -> None:
+        """Fly ahead over the steps after the one just flown at which nothing is sent or changed.
+
+        Args:
+            session, asked: see `observation`.
+            now_ns: time of the step just flown.
+        """
+        flying = self._flying
+        if flying is None or flying.step != self.flown or self._reporter.always:
+            return
+        believed, failsafe, compensator = self._belief.next, self._failsafe, self.compensator
+        # The bound of a braking vehicle's speed changes from step to step.
+        brakes = failsafe.brakes and not compensator.covered and self._speed != 0.0
+        if believed is None or brakes or not flying.can_look_ahead:
+            return
+        calm_ns = failsafe.calm_until_ns(now_ns)
+        last = min(
+            (calm_ns - self.starts_ns(0)) // self._dt_ns - 1,
+            compensator.alike_until(self.flown),
+            self.steps - 2,
+        )
+        steps = min(last - self.flown, AHEAD)
+        if steps < 1:
+            return
+        ahead, apart = flying.look_ahead(steps, believed)
+        off_m = self._belief.lengths(apart)
+        silent = self._reporter.silent_for(session, failsafe.mode, asked, off_m)
+        if silent:
+            self._ahead = Ahead(ahead.states, ahead.told[:silent], ahead.believed)
+
+    @property
+    def steps_ahead(self) -> int:
+        """Number of steps that were flown ahead."""
+        return len(self._ahead.told) if self._ahead is not None else 0
+
+    def go_on(self, count: int, *, now_ns: int) -> None:
+        """Go on by some of the steps that were flown ahead; all others of them are forgotten.
+
+        Args:
+            count: number of these steps.
+            now_ns: begin of the last of them.
+        """
+        ahead, self._ahead = self._ahead, None
+        if not count:
+            return
+        assert ahead is not None
+        assert self._flying is not None
+        first, self.flown = self.flown + 1, self.flown + count
+        self.step = self.flown
+        inputs = self._flying.go_on(ahead, count)
+        self._belief.go_on(ahead.believed[count])
+        self._reporter.was_silent(self.flown)
+        self._flown_ns = self.starts_ns(self.flown)
+        # Between the first and the last of them it changes nothing either.
+        self._failsafe.step(late_ns=0, hindrance=None, now_ns=now_ns)
+        compensator = self.compensator
+        told = compensator.told if compensator.feeds_back else inputs
+        self._input = self._settled(inputs, told, math.inf, now_ns)
+        self._vehicle.fly(self._input)
+        self.step, self.next_ns = self.flown + 1, self._flown_ns + self._dt_ns
+        if compensator.covered:
+            self.covered += count
+            self._covered_last = self.step
+        self._record_many(first, ahead.told[:count])
+
+    def _record_many(self, first: int, told: Array) -> None:
+        """Record steps that were flown ahead.
+
+        Args:
+            first: number of the first of them.
+            told: output of `fly_step` at each; shape (n, 8 axes).
+        """
+        if self._recorder is None:
+            return
+        compensator, axes, count = self.compensator, self._terms.axes, len(told)
+        steps = np.arange(first, first + count)
+        states = told[:, : 6 * axes].reshape(count, 3, axes, 2)
+        observed = compensator.observed
+        self._recorder.append(
+            count,
+            vehicle=self._number,
+            step=steps,
+            state=states[:, 0],
+            measured=states[:, 1],
+            estimate=states[:, 2],
+            input=told[:, 6 * axes : 7 * axes],
+            covered=compensator.covered,
+            in_force=compensator.in_force,
+            age_ns=-1 if observed < 0 else (steps - observed) * self._dt_ns,
+            stale=compensator.stale,
+            missed=self.missed,
+            mode=self._failsafe.mode,
+            reason=self._failsafe.reason,
+        )
+
     def _is_usual(self) -> bool:
         """Whether the vehicle flies the plan's input, and its state is known."""
         mode = self._failsafe.mode
-        return mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known
+        usual = mode is not Mode.LAND and mode not in STOPPED and self._navigation.is_known
+        return usual and not self._is_to_rest()
