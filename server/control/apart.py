@@ -84,12 +84,16 @@ class FlownMotions:
             ahead: number of steps by which that is ahead of those in common.
             wide_m: distance to be kept from it beyond that from others [m].
         """
-        if self.count == len(self.arrays.of):
+        self.make_room(1)
+        _add(self.arrays, self.count, row, motion, ahead, wide_m, self.scale, self.dt_s)
+        self.count += 1
+
+    def make_room(self, more: int) -> None:
+        """Make room for so many more motions."""
+        while self.count + more > len(self.arrays.of):
             self.arrays = Flown._make(
                 np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
             )
-        _add(self.arrays, self.count, row, motion, ahead, wide_m, self.scale, self.dt_s)
-        self.count += 1
 
     @property
     def of(self) -> Indices:
@@ -193,7 +197,7 @@ def half_planes(
 
 
 @part
-def _state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
+def state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
     """Position and velocity of a motion on an axis at a step; see `Motion.at`."""
     position, velocity = motion.position, motion.velocity
     along = (step - motion.first) / SPACING
@@ -212,7 +216,7 @@ def _state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, 
 @part
 def _place(motion: Motion, axis: int, step: float, dt_s: float) -> float:
     """Position of a motion on an axis at a step."""
-    return _state(motion, axis, step, dt_s)[0]
+    return state(motion, axis, step, dt_s)[0]
 
 
 @kernel
@@ -221,18 +225,18 @@ def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2)
     for i in range(len(position)):
         for x in range(position.shape[1]):
             step = float(begin + i * SPACING)
-            position[i, x], velocity[i, x] = _state(motion, x, step, dt_s)
+            position[i, x], velocity[i, x] = state(motion, x, step, dt_s)
 
 
 @making_part  # numba counts references to what it returns
-def _flown_one(flown: Flown, m: int) -> Motion:
+def flown_one(flown: Flown, m: int) -> Motion:
     """The motion at a place of those that may be flown."""
     n = flown.knots[m]
     return Motion(flown.first[m], flown.position[m, :n], flown.velocity[m, :n])
 
 
 @part
-def _bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
+def bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
     """Fill in two corners of a box around a motion, scaled [m]."""
     position, velocity = motion.position, motion.velocity
     for x in range(len(scale)):
@@ -297,9 +301,24 @@ def _add(
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
+    write_down(flown, m, row, motion, ahead, wide, scale, dt_s)
+
+
+@part
+def write_down(
+    flown: Flown,
+    m: int,
+    row: int,
+    motion: Motion,
+    ahead: int,
+    wide: float,
+    scale: F1,
+    dt_s: float,
+) -> None:
+    """Write a motion down at a place, see `FlownMotions.add`."""
     first, position, velocity = motion.first - ahead, motion.position, motion.velocity
     _write(flown, m, row, first, position, velocity, wide)
-    _bound(motion, scale, dt_s, flown.low[m], flown.high[m])
+    bound(motion, scale, dt_s, flown.low[m], flown.high[m])
 
 
 @part
@@ -348,17 +367,40 @@ def _too_near(
     hit: B1,
 ) -> None:
     """Fill in `too_near`."""
-    here, there, low, high = np.empty((4, len(scale)))
-    _bound(motion, scale, dt_s, low, high)
+    scratch = np.empty((4, len(scale)))
+    bound(motion, scale, dt_s, scratch[2], scratch[3])
     for m in range(len(hit) - 1):
-        keep_m = keep + flown.wide[m]
-        if flown.of[m] == row or _is_far(flown, m, low, high, keep_m):
-            continue
-        other = _flown_one(flown, m)
-        least = _least_apart(motion, other, begin, scale, dt_s, here, there)
-        if least < keep_m:
-            nearer = _least_apart(base, other, begin, scale, dt_s, here, there) - NEARER_M
-            hit[m] = least < nearer
+        if flown.of[m] != row:
+            hit[m] = is_hit(motion, base, begin, flown, m, scale, dt_s, keep, scratch)
+
+
+@making_part
+def is_hit(
+    motion: Motion,
+    base: Motion,
+    begin: int,
+    flown: Flown,
+    m: int,
+    scale: F1,
+    dt_s: float,
+    keep: float,
+    scratch: F2,
+) -> bool:
+    """Whether a motion comes too near to one that may be flown; see `too_near`.
+
+    Args:
+        m: place of the latter.
+        scratch: its last two rows are the corners of a box around the motion [m]; shape (4, axes).
+    """
+    here, there, low, high = scratch[0], scratch[1], scratch[2], scratch[3]
+    keep_m = keep + flown.wide[m]
+    if _is_far(flown, m, low, high, keep_m):
+        return False
+    other = flown_one(flown, m)
+    least = _least_apart(motion, other, begin, scale, dt_s, here, there)
+    if least >= keep_m:
+        return False
+    return least < _least_apart(base, other, begin, scale, dt_s, here, there) - NEARER_M
 
 
 @making_kernel
@@ -383,7 +425,7 @@ def _half_planes(
         keep = apart + flown.wide[m]
         if flown.of[m] == row or _is_far(flown, m, low, high, keep + reach.max()):
             continue
-        other = _flown_one(flown, m)
+        other = flown_one(flown, m)
         for i in range(len(times)):
             square = 0.0
             for x in range(axes):

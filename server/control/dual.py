@@ -33,7 +33,7 @@ class DualSolver:
     """
 
     def __init__(self, hessian: NDArray[Any]) -> None:
-        self._root = np.linalg.inv(np.linalg.cholesky(hessian))
+        self.root = np.linalg.inv(np.linalg.cholesky(hessian))
         """Jᵀ with J Jᵀ = G⁻¹."""
         n = len(hessian)
         self._basis, self._triangle = np.zeros((n, n)), np.zeros((n, n))
@@ -51,7 +51,7 @@ class DualSolver:
         """
         x = np.empty(len(linear))
         scratch = np.empty(len(least)), self._basis, self._triangle, self._work, self._active
-        done = _solve(self._root, linear, x, columns, least, equal, *scratch)
+        done = _solve(self.root, linear, x, columns, least, equal, *scratch)
         return x if done == SOLVED else None
 
 
@@ -61,6 +61,24 @@ class DualSolver:
 
 @making_kernel
 def _solve(
+    root: F2,
+    linear: F1,
+    x: F1,
+    columns: R2,
+    least: F1,
+    equal: int,
+    slack: F1,
+    J: F2,
+    R: F2,
+    work: F2,
+    active: I1,
+) -> int:
+    """Fill in x; see `solved`."""
+    return solved(root, linear, x, columns, least, equal, slack, J, R, work, active)
+
+
+@making_part
+def solved(
     root: F2,
     linear: F1,
     x: F1,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from skytether.server.control.aside import Aside
 from skytether.server.control.routes import Routes
+from skytether.shared.base.kernel import shared
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Motion
 
@@ -108,8 +109,25 @@ class Known:
 
     def owed(self, step: int) -> Sent | None:
         """Motion that is to be sent once more at a step; None where there is none."""
+        sent_step, repeats_for = self.repeats
+        return self.sent[-1] if repeats_after(step - sent_step, repeats_for) else None
+
+    @property
+    def repeats(self) -> tuple[int, int]:
+        """Step of the motion that was sent last, and number of steps after it up to which it is
+        sent once more, every COPY_STEPS; 0 where there is none.
+        """
         if not self.sent:
-            return None
-        since = step - self.sent[-1].step
-        is_due = 0 < since <= (self.copies - 1) * COPY_STEPS and since % COPY_STEPS == 0
-        return self.sent[-1] if is_due else None
+            return 0, 0
+        return self.sent[-1].step, (self.copies - 1) * COPY_STEPS
+
+
+@shared
+def repeats_after(since: int, repeats_for: int) -> bool:
+    """Whether a motion is sent once more.
+
+    Args:
+        since: steps since it was sent first.
+        repeats_for: steps after that up to which it is, see `Known.repeats`.
+    """
+    return 0 < since <= repeats_for and since % COPY_STEPS == 0

@@ -11,6 +11,10 @@ with g what it aims at, and a half-plane for each motion and each zone that is n
 
 where q is that motion, or the zone's nearest point, and p̃ the motion in force. It fulfils all of
 them, so there is always a solution.
+
+A vehicle that is far from all others has no half-planes, and then no constraint joins two axes:
+`alone` solves one after the other. Its numbers are those of `solve`, to the last bit: there a term
+of another axis only ever adds 0.
 """
 
 from typing import NamedTuple
@@ -18,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.control.apart import HalfPlanes
-from skytether.server.control.dual import DualSolver
-from skytether.shared.base.kernel import F1, F2, kernel
+from skytether.server.control.dual import SOLVED, DualSolver, solved
+from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, making_kernel, making_part, part
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING
 from skytether.shared.law.terms import Terms
@@ -53,6 +57,23 @@ class Posing(NamedTuple):
     """Positions at these times by accelerations [s²]; shape (times, N)."""
 
 
+class AxisProblem(NamedTuple):
+    """QPs of single axes, and scratch to solve them."""
+
+    root: F3
+    """Jᵀ of each axis, see `DualSolver`; shape (axes, N, N)."""
+    columns: F3
+    """Constraints of each axis; shape (axes, N, 6 N + 1)."""
+    linear: F1
+    least: F1
+    x: F1
+    slack: F1
+    J: F2
+    R: F2
+    work: F2
+    active: I1
+
+
 class MotionPlan:
     """Solver of the QP of one motion.
 
@@ -79,11 +100,13 @@ class MotionPlan:
         weights = np.ones(n)
         weights[-1] = LAST
         hessian = to_position.T @ (weights[:, None] * to_position)
-        self._solver = DualSolver(np.kron(np.eye(axes), hessian + SMOOTH * np.eye(n)))
+        self.solver = solver = DualSolver(np.kron(np.eye(axes), hessian + SMOOTH * np.eye(n)))
+        """Solver of QPs with half-planes."""
         to_sample = _positions(self.times, place, T)
-        self._posing = Posing(
+        self.posing = Posing(
             T, acceleration_mps2, most, weights, to_position, self.times, to_sample
         )
+        """Numbers that all QPs have in common."""
         # The input at the end of each interval, and at its begin: v ± within what it can do.
         ends = [to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
         before = np.vstack([np.zeros(n), to_velocity[:-1]])
@@ -93,6 +116,26 @@ class MotionPlan:
         self._fixed = np.ascontiguousarray(fixed.T)
         """Columns of the constraints that are always there."""
         self._axes = axes
+        of_axis = [range(x * n, (x + 1) * n) for x in range(axes)]
+        # In the order of `_pose_axis`.
+        rows = [
+            [x, *(axes + group * n * axes + i for group in range(6) for i in of_axis[x])]
+            for x in range(axes)
+        ]
+        m = 6 * n + 1
+        self.alone = AxisProblem(
+            np.stack([solver.root[np.ix_(of, of)] for of in of_axis]),
+            np.stack([self._fixed[np.ix_(of, row)] for of, row in zip(of_axis, rows, strict=True)]),
+            linear=np.zeros(n),
+            least=np.zeros(m),
+            x=np.zeros(n),
+            slack=np.zeros(m),
+            J=np.zeros((n, n)),
+            R=np.zeros((n, n)),
+            work=np.zeros((5, n + 1)),
+            active=np.zeros(n + 1, dtype=np.int64),
+        )
+        """QPs of single axes."""
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
@@ -109,30 +152,45 @@ class MotionPlan:
             goal: what it aims at, g [m]; shape (axes,).
             planes: constraints on positions at `times`.
         """
+        kept = len(kept_p)
+        position, velocity = np.empty((2, kept + INTERVALS, self._axes))
+        position[:kept], velocity[:kept] = kept_p, kept_v
+        if not planes or not len(planes.at):
+            alone = _fly_alone(self.posing, self.alone, kept, goal, position, velocity)
+            return (position, velocity) if alone else None
+        x = self.solver.solve(*self.posed(kept_p[-1], kept_v[-1], goal, planes), self._axes)
+        if x is None:
+            return None
+        _fly(self.posing, x, kept, position, velocity)
+        return position, velocity
+
+    def posed(
+        self, p0: Array, v0: Array, goal: Array, planes: HalfPlanes | None
+    ) -> tuple[Array, Array, Array]:
+        """The QP of `DualSolver`: linear term, columns of the constraints, and their bounds.
+
+        Args:
+            p0, v0: state where the plan begins [m, m/s]; shape (axes,).
+            goal, planes: see `solve`.
+        """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
         least = np.empty(fixed + (len(planes.at) if planes else 0))
-        p0, v0 = kept_p[-1], kept_v[-1]
-        _pose(self._posing, p0, v0, goal, linear, least)
+        _pose(self.posing, p0, v0, goal, linear, least)
         # The constraints that are always there are kept as columns, and half-planes are put behind
         # them.
         if planes and len(planes.at):
             columns = np.empty((variables, len(least)))
             columns[:, :fixed] = self._fixed
-            _keep_apart(self._posing, p0, v0, planes, columns, least)
-        x = self._solver.solve(linear, columns, least, self._axes)
-        if x is None:
-            return None
-        position, velocity = np.empty((2, len(kept_p) + INTERVALS, self._axes))
-        _fly(self._posing, x, kept_p, kept_v, position, velocity)
-        return position, velocity
+            _keep_apart(self.posing, p0, v0, planes, columns, least)
+        return linear, columns, least
 
     def at_times(self, position: Array, velocity: Array) -> Array:
         """Positions at `times` of knots that `solve` has found [m]; shape (times, axes)."""
         position, velocity = position[-INTERVALS - 1 :], velocity[-INTERVALS - 1 :]
-        accelerations = np.diff(velocity, axis=0) / self._posing.T
-        drifting = position[0] + self.times[:, None] * self._posing.T * velocity[0]
-        placed: Array = drifting + self._posing.to_sample @ accelerations
+        accelerations = np.diff(velocity, axis=0) / self.posing.T
+        drifting = position[0] + self.times[:, None] * self.posing.T * velocity[0]
+        placed: Array = drifting + self.posing.to_sample @ accelerations
         return placed
 
 
@@ -148,13 +206,92 @@ def _pose(posing: Posing, p0: F1, v0: F1, goal: F1, linear: F1, least: F1) -> No
             linear[x * n + i] = 0.0
             # In the order of `_fixed`: accelerations, inputs at the ends and at the begins of
             # intervals, each from below and then from above.
-            for part, bound in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
-                least[axes + part * N + x * n + i] = bound
+            for group, bound in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
+                least[axes + group * N + x * n + i] = bound
         for j in range(n):
             free = p0[x] + (j + 1) * posing.T * v
             for i in range(n):
                 weighed = posing.weights[j] * (free - goal[x])
                 linear[x * n + i] -= posing.to_position[j, i] * weighed
+
+
+@part
+def _pose_axis(posing: Posing, x: int, p0: float, v: float, goal: float, one: AxisProblem) -> None:
+    """Fill in linear term and bounds of the QP of an axis; see `_pose`."""
+    n, a, most = len(posing.weights), posing.acceleration, posing.most[x]
+    one.least[0] = -v
+    for i in range(n):
+        one.linear[i] = 0.0
+        for group, bound in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
+            one.least[1 + group * n + i] = bound
+    for j in range(n):
+        free = p0 + (j + 1) * posing.T * v
+        for i in range(n):
+            weighed = posing.weights[j] * (free - goal)
+            one.linear[i] -= posing.to_position[j, i] * weighed
+
+
+@making_kernel
+def _fly_alone(
+    posing: Posing, one: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
+) -> bool:
+    """Fill in the knots of a motion that nothing is near; see `flown_alone`."""
+    return flown_alone(posing, one, kept, goal, position, velocity)
+
+
+@making_part
+def flown_alone(
+    posing: Posing, one: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
+) -> bool:
+    """Fill in the knots of a motion that nothing is near; whether there is one.
+
+    Args:
+        posing, one: of the plan.
+        kept: number of knots that are given, those of the motion in force.
+        goal: what it aims at, g [m]; shape (axes,).
+        position, velocity: the knots, those that are given first [m, m/s]; shape (kept + N, axes).
+    """
+    for x in range(len(goal)):
+        p0, v0 = position[kept - 1, x], velocity[kept - 1, x]
+        _pose_axis(posing, x, p0, v0, goal[x], one)
+        if (
+            solved(
+                one.root[x],
+                one.linear,
+                one.x,
+                one.columns[x],
+                one.least,
+                1,
+                one.slack,
+                one.J,
+                one.R,
+                one.work,
+                one.active,
+            )
+            != SOLVED
+        ):
+            return False
+        _fly_axis(posing, one.x, 0, x, kept, position, velocity)
+    return True
+
+
+@part
+def _fly_axis(
+    posing: Posing, found: F1, first: int, x: int, kept: int, position: F2, velocity: F2
+) -> None:
+    """Fill in the knots of an axis by its accelerations, which begin at `first`."""
+    n = len(posing.weights)
+    p0, v0 = position[kept - 1, x], velocity[kept - 1, x]
+    gained, moved = 0.0, 0.0
+    for i in range(n):
+        knot = kept + i
+        gained += posing.T * found[first + i]
+        # The last velocity is 0 to within the tolerance of the solver, and a motion has to end at
+        # rest.
+        velocity[knot, x] = v0 + gained if i < n - 1 else 0.0
+        # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
+        moved += 0.5 * posing.T * (velocity[knot, x] + velocity[knot - 1, x])
+        position[knot, x] = p0 + moved
 
 
 @kernel
@@ -173,23 +310,11 @@ def _keep_apart(posing: Posing, p0: F1, v0: F1, planes: HalfPlanes, columns: F2,
 
 
 @kernel
-def _fly(posing: Posing, found: F1, kept_p: F2, kept_v: F2, position: F2, velocity: F2) -> None:
-    """Fill in the knots: those that are kept, and others by the accelerations that were found."""
-    n, kept = len(posing.weights), len(kept_p)
+def _fly(posing: Posing, found: F1, kept: int, position: F2, velocity: F2) -> None:
+    """Fill in the knots behind those that are kept, by the accelerations that were found."""
+    n = len(posing.weights)
     for x in range(position.shape[1]):
-        for knot in range(kept):
-            position[knot, x], velocity[knot, x] = kept_p[knot, x], kept_v[knot, x]
-        p0, v0 = kept_p[kept - 1, x], kept_v[kept - 1, x]
-        gained, moved = 0.0, 0.0
-        for i in range(n):
-            knot = kept + i
-            gained += posing.T * found[x * n + i]
-            # The last velocity is 0 to within the tolerance of the solver, and a motion has to end
-            # at rest.
-            velocity[knot, x] = v0 + gained if i < n - 1 else 0.0
-            # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
-            moved += 0.5 * posing.T * (velocity[knot, x] + velocity[knot - 1, x])
-            position[knot, x] = p0 + moved
+        _fly_axis(posing, found, x * n, x, kept, position, velocity)
 
 
 def _positions(times: Array, place: Indices, T: float) -> Array:

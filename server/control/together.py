@@ -28,6 +28,8 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from operator import sub
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -35,11 +37,13 @@ from skytether.server.control import apart, aside
 from skytether.server.control.aims import DETOUR_S, TURN_BACK, Aims
 from skytether.server.control.apart import FlownMotions, HalfPlanes
 from skytether.server.control.aside import ASIDE_S, Aside
-from skytether.server.control.known import Known, Sent
+from skytether.server.control.direct import Direct
+from skytether.server.control.known import Known, Sent, repeats_after
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.planner import FIGURES, Figures
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
+from skytether.shared.base.kernel import B1, I1, making_kernel
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
@@ -62,12 +66,54 @@ ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
+DECIDES, REPEATS = 1, 2
+"""Bits: it is a vehicle's turn to be decided on; it is sent a motion once more."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
 SILENT = np.zeros((), dtype=FIGURES)
 """Figures of a vehicle to which nothing is sent."""
 SILENT["gap"], SILENT["solved"] = 1, True
+
+
+class VehicleRows(NamedTuple):
+    """Numbers of all rows; each of shape (capacity,)."""
+
+    ahead: I1
+    """Steps by which the vehicle is ahead of one on no grid of its own."""
+    met: B1
+    """Whether that is known."""
+    heard: B1
+    """Whether an observation has come in this session."""
+    number: I1
+    """Number of the vehicle that was observed last."""
+    observed_step: I1
+    """Step of its newest observation; -1 before any."""
+    unknown_until: I1
+    """Step from which on a motion is over that another server has sent."""
+    sent_step: I1
+    """Step of the motion that was sent last and is not acknowledged."""
+    repeats_for: I1
+    """Steps after that up to which it is sent once more, see `Known.repeats`."""
+
+    @classmethod
+    def of(cls, capacity: int) -> Self:
+        """Numbers of rows of which nothing is known."""
+        ahead, number, sent_step, repeats_for = np.zeros((4, capacity), dtype=np.int64)
+        met, heard = np.zeros((2, capacity), dtype=np.bool_)
+        observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
+        return cls(ahead, met, heard, number, observed_step, unknown_until, sent_step, repeats_for)
+
+
+class Straight(NamedTuple):
+    """Vehicle that may fly straight to its goal."""
+
+    row: int
+    known: Known
+    k: int
+    """Present step of the vehicle."""
+    goal: Array
+    """Shape (axes,) [m]."""
 
 
 class Together:
@@ -97,7 +143,6 @@ class Together:
         self.left: list[tuple[int, float]] = []
         """Vehicles that have left their tube since this was emptied, and how far outside they were
         [m]."""
-        self.observed_step: Indices = np.full(capacity, -1, dtype=np.int64)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
         self._state = np.zeros((capacity, terms.axes, 2))
@@ -130,17 +175,20 @@ class Together:
             round(DETOUR_S / terms.dt_s),
             stream(scenario.seed, "together"),
         )
-        self._now, self._ahead = 0, np.zeros(capacity, dtype=np.int64)
-        """Step of a vehicle on no grid of its own, and how far ahead of it each row's is."""
-        self._met, self._heard, self._asks = np.zeros((3, capacity), dtype=np.bool_)
-        """Flags of each row: its place on the grid in `_ahead` is known; an observation has come in
-        this session; a motion may have to be sent once more. Each of shape (capacity,)."""
-        self._number = np.zeros(capacity, dtype=np.int64)
-        """Number of the vehicle that was observed in a row last."""
-        self._unknown_until = np.full(capacity, -1, dtype=np.int64)
-        """Step from which on a motion is over that another server has sent, by row."""
+        self._now = 0
+        """Step of a vehicle on no grid of its own."""
+        self._vehicles = VehicleRows.of(capacity)
+        """Numbers of all rows."""
+        self.observed_step: Indices = self._vehicles.observed_step
+        self._repeating: list[Known] = []
+        """Vehicles that are sent a motion once more at this step."""
+        self._looks, self._found, self._places = np.zeros((3, block), dtype=np.int64)
+        """Scratch of `_meet`: what is to be done for each vehicle, DECIDES and REPEATS; steps by
+        which it is ahead; and the step of each that is known to be on the grid."""
         self._flown = FlownMotions(self._scale, terms.dt_s)
         """All motions that may be flown, but for those of rows in `_changed`."""
+        kept, keep_m = self._lead // SPACING + 1, self._apart_m + 2.0 * bend_m
+        self._direct = Direct(self._plan, self._flown, kept, keep_m, STUCK)
         self._changed: set[int] = set()
         """Rows to gather anew: their motions that may be flown have changed, or the distance kept
         from these, or their place on the grid."""
@@ -152,7 +200,7 @@ class Together:
     def forget(self, row: int) -> None:
         """See `Scheme`; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
-        self._heard[row] = False
+        self._vehicles.heard[row] = False
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -162,7 +210,7 @@ class Together:
         self.observed_step[row] = k
         self._state[row] = observation.state
         known = self._rows.setdefault(row, Known())
-        self._number[row] = self._number_of(row)
+        self._vehicles.number[row] = self._number_of(row)
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
@@ -171,10 +219,10 @@ class Together:
         elif known.in_force is None or known.in_force.step != observation.in_force:
             found = next((each for each in known.sent if each.step == observation.in_force), None)
             if found is None:  # of another server, or of a vehicle that was in this row before
-                self._unknown_until[row] = observation.in_force + LONGEST
+                self._vehicles.unknown_until[row] = observation.in_force + LONGEST
                 found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
             known.in_force = found
-        if k <= self._unknown_until[row]:
+        if k <= self._vehicles.unknown_until[row]:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         newest, motion = known.in_force
         self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
@@ -182,14 +230,15 @@ class Together:
             gone = known.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
             known.learn(gone.step == newest and k <= observation.since + 1)
-        self._heard[row] = True
+        self._vehicles.heard[row] = True
         self._note(row, known)
         return True
 
     def _note(self, row: int, known: Known) -> None:
         """Mark a row whose motions that may be flown, or be sent again, have changed."""
         self._changed.add(row)
-        self._asks[row], known.again = bool(known.sent) and known.copies > 1, None
+        known.again = None
+        self._vehicles.sent_step[row], self._vehicles.repeats_for[row] = known.repeats
 
     def _measure(self, row: int, known: Known, expected: Array) -> None:
         """Take note of how far a vehicle may be from where its motion has it."""
@@ -228,16 +277,27 @@ class Together:
         figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
         # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
         # before it.
-        turn = self._heard[rows] & ((step - self._number[rows]) % SPACING == 0)
-        for i in (turn | self._asks[rows]).nonzero()[0].tolist():
+        for each in self._repeating:
+            each.again = None
+        self._repeating.clear()
+        straight: list[Straight] = []
+        looked_at = self._looks[:n].nonzero()[0].tolist()
+        for i in looked_at:
             row, k = int(rows[i]), int(step[i])
             known = self._rows[row]
-            known.again = known.owed(k)
-            if turn[i]:
-                self._decide(row, known, k)
+            if self._looks[i] & REPEATS:
+                known.again = known.owed(k)
+                self._repeating.append(known)
+            if self._looks[i] & DECIDES:
+                self._decide(row, known, k, straight)
+        self._fly_straight(straight)
+        for i in looked_at:
+            known = self._rows[int(rows[i])]
             # A figure above any threshold: a motion that was found has to be sent.
             if known.next or known.again:
                 figures["expected_gap"][i] = 1e9
+            if known.next:
+                self._decided.add(int(rows[i]))
         self.planned[:n] = self._state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
@@ -276,7 +336,7 @@ class Together:
                 return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._rows.items():
             for motion in known.motions():
-                k = self._now + int(self._ahead[row])
+                k = self._now + int(self._vehicles.ahead[row])
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
                 if zone := zones.in_the_way(points, self._tube_m + self._bend_m):
                     left_s = max(motion.last - k, 0) * self._dt_s
@@ -292,36 +352,38 @@ class Together:
 
     def _meet(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
-        # The median, for one vehicle that begins anew must not move the grid of all others.
-        ahead = self._ahead[rows]
-        known = (step - ahead)[self._met[rows]]
-        known.sort()
-        self._now = int(known[len(known) // 2]) if len(known) else self._now + 1
-        found = step - self._now
-        self._changed.update(rows[found != ahead].tolist())
-        self._ahead[rows], self._met[rows] = found, True
-        for row in self._decided.intersection(rows.tolist()):
-            self._rows[row].next = None
-            self._changed.add(row)
-            self._decided.remove(row)
-        foreign = self._heard & (self.observed_step <= self._unknown_until)
-        self._foreign = int(foreign.argmax()) if foreign.any() else None
+        n = len(rows)
+        self._now, moved, foreign = _meet(
+            rows, step, self._now, self._vehicles, self._looks, self._found, self._places
+        )
+        if moved:
+            self._changed.update(rows[self._found[:n] != 0].tolist())
+        if self._decided:
+            for row in self._decided.intersection(rows.tolist()):
+                self._rows[row].next = None
+                self._changed.add(row)
+                self._decided.remove(row)
+        self._foreign = None if foreign < 0 else foreign
 
     def _gather(self) -> None:
         """Bring all motions that may be flown side by side, those that are others since then."""
         for row in self._changed & self._rows.keys():
             each = self._rows[row]
             # All that may be flown, also those whose acknowledgement is still under way.
-            self._flown.replace(row, each.motions(), int(self._ahead[row]), each.off_m)
+            self._flown.replace(row, each.motions(), int(self._vehicles.ahead[row]), each.off_m)
         self._changed.clear()
 
-    def _decide(self, row: int, known: Known, k: int) -> None:
-        """Find the motion to be sent to a vehicle now, if any."""
+    def _decide(self, row: int, known: Known, k: int, straight: list[Straight]) -> None:
+        """Find the motion to be sent to a vehicle now, if any.
+
+        Args:
+            row, known: the vehicle.
+            k: its step.
+            straight: takes the vehicles that may fly straight, to be planned for together.
+        """
         known.waits = ""
         if self._plans(known, k):
-            self._fly_on(row, known, k)
-        if known.next:
-            self._decided.add(row)
+            self._fly_on(row, known, k, straight)
 
     def _plans(self, known: Known, k: int) -> bool:
         """Whether a vehicle may be given another motion; what it waits for, if not."""
@@ -348,31 +410,55 @@ class Together:
             return False
         return True
 
-    def _fly_on(self, row: int, known: Known, k: int) -> None:
-        """Find a motion towards a vehicle's goal, or towards where it steps aside."""
+    def _fly_on(self, row: int, known: Known, k: int, straight: list[Straight]) -> None:
+        """Find a motion to a vehicle's goal, or to where it steps aside; see `_decide`."""
         assert known.in_force is not None
         home = self._goal(row)
         if known.aside and (self._now > known.aside.until or not self._to_pass(known.aside, home)):
             known.aside = None
         goal = known.aside.place if known.aside else home
-        if abs(known.in_force.motion.position[-1] - goal).max() < ARRIVED_M:
+        place = known.in_force.motion.position[-1]
+        if max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M:
             known.turned = 0.0
             if known.aside:
                 known.waits = f"vehicle {self._number_of(known.aside.asker)} to pass"
             return
         self._gather()
-        way = self._way(row, goal)
-        if known.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:]))):
+        way = self._way(row, goal) if self._zones else np.array([place, goal])
+        is_stuck = known.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:])))
+        roams = known.turned or known.aside or (known.detour and k < known.detour_until)
+        if not (is_stuck or roams or self._zones):
+            straight.append(Straight(row, known, k, goal))
+            return
+        # A plan reckons with all that were decided before it.
+        self._fly_straight(straight)
+        if is_stuck:
             self._ask(row, way)
+        self._find(row, known, k, goal)
+
+    def _fly_straight(self, straight: list[Straight]) -> None:
+        """Find motions of vehicles that may fly straight, one after the other; none are left."""
+        while straight:
+            rows, steps = np.array([(each.row, each.k) for each in straight]).T.copy()
+            goals = np.array([each.goal for each in straight])
+            found = self._direct.motions(rows, steps, self._vehicles.ahead[rows], goals)
+            for (_, known, _, _), motion in zip(straight, found, strict=False):
+                known.next, known.waits = motion, ""
+            del straight[: len(found)]
+            if straight:  # the way of the first that is left is not straight
+                self._find(*straight.pop(0))
+
+    def _find(self, row: int, known: Known, k: int, goal: Array) -> None:
+        """Find a motion towards a goal, around others that are in the way."""
         known.next = self._toward(row, known, k, goal)
         if known.next is None:
             self.counts["stuck"] += 1
         else:
-            self._flown.add(row, known.next, int(self._ahead[row]), known.off_m)
+            self._flown.add(row, known.next, int(self._vehicles.ahead[row]), known.off_m)
 
     def _goal(self, row: int) -> Array:
         """Goal of a vehicle at the present step [m]; shape (axes,)."""
-        k = self._now + int(self._ahead[row])
+        k = self._now + int(self._vehicles.ahead[row])
         wanted = self._references(self._number_of(row))(np.array(k * self._dt_s))
         return np.ascontiguousarray(wanted[:, 0])  # kernels reckon with that
 
@@ -392,7 +478,7 @@ class Together:
         """Ask the first vehicle that rests at its goal in another vehicle's way to step aside."""
         keep_m, ends, homes = self._apart_m + MARGIN_M, list[tuple[int, Array]](), list[int]()
         for other, each in self._rows.items():
-            if other == row or each.in_force is None or not self._met[other]:
+            if other == row or each.in_force is None or not self._vehicles.met[other]:
                 continue
             flown = each.motions()
             ends += [(other, motion.position[-1]) for motion in flown]
@@ -458,14 +544,14 @@ class Together:
         """Resting places of all vehicles but one [m]."""
         found = []
         for other, each in self._rows.items():
-            motions, now = each.motions(), self._now + self._ahead[other]
+            motions, now = each.motions(), self._now + self._vehicles.ahead[other]
             if other != row and motions and all(motion.last <= now for motion in motions):
                 found.append(motions[0].position[-1])
         return found
 
     def _planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
         """Half-planes of the others' motions, and behind them those of zones."""
-        plan, ahead = self._plan, self._ahead[row]
+        plan, ahead = self._plan, self._vehicles.ahead[row]
         times = due + plan.times * SPACING
         held, _ = base.at(times, self._dt_s)
         found = apart.half_planes(
@@ -504,7 +590,7 @@ class Together:
 
     def _hit(self, row: int, motion: Motion, k: int) -> Flags:
         """Which motions of others one comes too near to, ever, and last whether it does a zone."""
-        known, ahead = self._rows[row], int(self._ahead[row])
+        known, ahead = self._rows[row], int(self._vehicles.ahead[row])
         assert known.in_force is not None
         common, base = (
             each._replace(first=each.first - ahead) for each in (motion, known.in_force.motion)
@@ -515,3 +601,55 @@ class Together:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             hit[-1] = (self._zones.along(points) < self._tube_m + self._bend_m).any()
         return hit
+
+
+@making_kernel
+def _meet(
+    rows: I1,
+    step: I1,
+    now: int,
+    vehicles: VehicleRows,
+    looks: I1,
+    found: I1,
+    places: I1,
+) -> tuple[int, int, int]:
+    """Bring vehicles onto one grid, and find what is to be done for each.
+
+    Args:
+        rows, step: the vehicles, and the step of each; shape (n,).
+        now: step on the grid before, of a vehicle on no grid of its own.
+        vehicles: numbers of all rows.
+        looks: output: DECIDES, REPEATS, both or 0; shape (n,) at least.
+        found: output: change of the place on the grid [steps]; shape (n,) at least.
+        places: scratch; shape (n,) at least.
+
+    Returns:
+        the step on the grid now, the number of vehicles whose place on it has changed, and the row
+        of a vehicle that may still fly a motion of another server, or -1.
+    """
+    known, moved, foreign = 0, 0, -1
+    for i in range(len(rows)):
+        row = rows[i]
+        if vehicles.met[row]:
+            places[known] = step[i] - vehicles.ahead[row]
+            known += 1
+    # The median, for one vehicle that begins anew must not move the grid of all others.
+    now = np.sort(places[:known])[known // 2] if known else now + 1
+    for i in range(len(rows)):
+        row = rows[i]
+        found[i] = step[i] - now - vehicles.ahead[row]
+        moved += found[i] != 0
+        vehicles.ahead[row], vehicles.met[row] = step[i] - now, True
+        looks[i] = 0
+        if vehicles.heard[row] and (step[i] - vehicles.number[row]) % SPACING == 0:
+            looks[i] |= DECIDES
+        if repeats_after(step[i] - vehicles.sent_step[row], vehicles.repeats_for[row]):
+            looks[i] |= REPEATS
+    for row in range(len(vehicles.heard)):
+        if (
+            foreign < 0
+            and vehicles.heard[row]
+            and vehicles.observed_step[row] <= vehicles.unknown_until[row]
+        ):
+            foreign = row
+    return now, moved, foreign

@@ -3,6 +3,7 @@
 A mission is the reference of each of its vehicles: the goal from each time on, at rest.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ class Mission:
     def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
         self._goals, self._axes = goals, axes
         self._times_s, self._points_m = goals.get(vehicle, (np.zeros(1), np.zeros((1, axes))))
+        self._times: list[float] = self._times_s.tolist()
 
     @property
     def vehicles(self) -> tuple[int, ...]:
@@ -70,6 +72,10 @@ class Mission:
     def __call__(self, t: NDArray[Any]) -> Array:
         """Goals at times [s]; see `Reference`."""
         t = np.asarray(t, dtype=np.float64)
+        if not t.ndim:  # of one vehicle at each step: no search in arrays
+            state = np.zeros((self._axes, 2))
+            state[:, 0] = self._points_m[max(bisect_right(self._times, float(t)) - 1, 0)]
+            return state
         state = np.zeros((*t.shape, self._axes, 2))
         at = self._times_s.searchsorted(t, side="right") - 1
         state[..., 0] = self._points_m[np.maximum(at, 0)]

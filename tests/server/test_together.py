@@ -18,11 +18,12 @@ from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks import published
 from skytether.lab.benchmarks.together import MortalServer
-from skytether.server.control import apart, aside
+from skytether.server.control import apart, aside, motionplan
 from skytether.server.control import known as known_vehicles
 from skytether.server.control.aims import Aims
 from skytether.server.control.apart import FlownMotions
 from skytether.server.control.clock import ClockMap
+from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.known import PROMPT, Known, Sent
 from skytether.server.control.motionplan import MotionPlan
@@ -168,6 +169,61 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
     assert nearer
 
 
+@given(
+    st.sampled_from(["swap", "sphere"]),
+    st.lists(st.floats(-1.4, 1.4), min_size=3, max_size=3),
+    st.lists(st.floats(-9, 9), min_size=3, max_size=3),
+    st.sampled_from([0.0, 1.0]),
+)
+def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
+    name: str, velocity: list[float], goal: list[float], speed_mps: float
+) -> None:
+    """The QP of all axes at once has the same knots."""
+    terms = reading.load(name).terms()
+    axes, plan = terms.axes, MotionPlan(terms, 0.6, speed_mps)
+    p, v = np.array([[0.3, -2.0, 1.0][:axes]]), np.array([velocity[:axes]])
+    found = plan.solve(p, v, np.array(goal[:axes]))
+    x = plan.solver.solve(*plan.posed(p[0], v[0], np.array(goal[:axes]), None), axes)
+    assert (found is None) == (x is None)
+    if found is None or x is None:
+        return
+    knots = np.empty((2, INTERVALS + 1, axes))
+    knots[:, :1] = p, v
+    motionplan._fly(plan.posing, x, 1, knots[0], knots[1])
+    assert np.array(found).tobytes() == knots.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "radius_m"), [("swap", 4.0), ("swap", 40.0), ("sphere", 4.0), ("corridor", 4.0)]
+)
+def test_planned_together_or_one_by_one_motions_are_the_same(
+    name: str, radius_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vehicles that fly straight reckon with all that were planned before them at the step."""
+    table = reading.to_table(reading.load(name)) | {"duration": 25.0}
+    table["reference"]["radius_m"] = radius_m
+    flown = reading.check(table, name)
+    vehicles = len(flown.make_reference().vehicles)  # type: ignore[attr-defined]
+    at_once = list[int]()
+    real = Direct.motions
+
+    def motions(self: Direct, *given: Any) -> list[Motion]:
+        found = real(self, *given)
+        at_once.append(len(found))
+        return found
+
+    monkeypatch.setattr(Direct, "motions", motions)
+    one = flight.fly(flown, vehicles=vehicles)
+    monkeypatch.setattr(Direct, "motions", lambda *_: [])
+    other = flight.fly(flown, vehicles=vehicles)
+    assert one.trace_hash() == other.trace_hash()
+    assert one.events == other.events
+    assert one.figures["server"]["counts"] == other.figures["server"]["counts"]
+    if not flown.zones:  # with zones, each is planned for by itself
+        assert sum(at_once) > (vehicles if radius_m > 4.0 else 0)
+        assert 0 in at_once or radius_m > 4.0
+
+
 # -- distances of motions --------------------------------------------------------------------------
 
 
@@ -218,7 +274,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     def gather(self: Together) -> None:
         real(self)
         expected = sorted(
-            (row, motion.first - int(self._ahead[row]), len(motion.position), known.off_m)
+            (row, motion.first - int(self._vehicles.ahead[row]), len(motion.position), known.off_m)
             for row, known in self._rows.items()
             for motion in known.motions()
         )

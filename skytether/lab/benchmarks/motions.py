@@ -20,11 +20,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import daqp
 import msgspec
@@ -34,7 +34,10 @@ import tyro
 from scipy import sparse
 
 from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.server.control.apart import HalfPlanes
+from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
+from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.together import Together
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
@@ -82,18 +85,24 @@ class MotionProblem(NamedTuple):
 
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
-    """Keep every QP that is solved."""
-    real = DualSolver.solve
+    """Keep every QP that is solved, of vehicles far from all others as well."""
+    real, straight = MotionPlan.solve, Direct.motions
 
-    def solve(self: DualSolver, linear: Array, columns: Array, least: Array, equal: int) -> Any:
-        problems.append(MotionProblem(self, linear.copy(), columns.copy(), least.copy(), equal))
-        return real(self, linear, columns, least, equal)
+    def solve(
+        self: MotionPlan, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
+    ) -> Any:
+        linear, columns, least = self.posed(p[-1], v[-1], goal, planes)
+        problems.append(MotionProblem(self.solver, linear, columns, least, p.shape[1]))
+        return real(self, p, v, goal, planes)
 
-    DualSolver.solve = solve  # type: ignore[method-assign]
+    plan, direct = cast(Any, MotionPlan), cast(Any, Direct)
+    plan.solve = solve
+    # Vehicles that could fly straight are planned for one by one, with the same result.
+    direct.motions = lambda *_: []
     try:
         yield
     finally:
-        DualSolver.solve = real  # type: ignore[method-assign]
+        plan.solve, direct.motions = real, straight
 
 
 class MotionOsqp:
@@ -192,7 +201,7 @@ def solvers(options: MotionsOptions) -> TextTable:
         flight.fly(swap(16, 4.0, options.duration), vehicles=16)
     step = max(1, len(problems) // options.problems)
     problems = problems[::step][: options.problems]
-    root = problems[0].solver._root
+    root = problems[0].solver.root
     hessian = np.linalg.inv(root.T @ root).astype(np.float64)
     solve: dict[str, Callable[[MotionProblem], Any]] = {
         "ours, dual active set": lambda problem: problem.solver.solve(*problem[1:]),
@@ -293,10 +302,9 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
         problems.append(list(of_tick))
 
     def last_of(self: Together, *given: Any) -> Any:
-        rounds: list[MotionProblem] = []
-        with kept(rounds):
-            found = toward(self, *given)
-        of_tick.extend(rounds[-1:])
+        before = len(of_tick)
+        found = toward(self, *given)
+        del of_tick[before:-1]
         return found
 
     own: Any = Together
@@ -305,7 +313,8 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
     else:
         own.plan, own._toward = collected, last_of
     try:
-        yield
+        with kept(of_tick) if problems is not None else nullcontext():
+            yield
     finally:
         own.plan, own._toward = plan, toward
 
@@ -339,7 +348,7 @@ def _beside_osqp(
     spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
 ) -> list[str]:
     """Cells of a row: planning of the ticks in which vehicles are planned for, and OSQP's time."""
-    root = problems[planned[0]][0].solver._root
+    root = problems[planned[0]][0].solver.root
     rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
     looked_at = planned[:: max(1, len(planned) // RIVALS)]
     for each in problems[looked_at[0]]:
