@@ -42,7 +42,7 @@ BLOCK = 128
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
 _PACKAGE = __name__.rpartition(".")[0]
-_MISSION = ("apart", "dual", "knots", "motionplan")
+_MISSION = ("apart", "direct", "dual", "knots", "motionplan", "together")
 _SCHEMES = {
     "predictive": ("predictive", "planner", "exact"),
     "none": ("predictive", "planner", "exact"),

@@ -20,7 +20,8 @@ import linecache
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from functools import partial
-from typing import Annotated, Any, TypeVar, get_type_hints
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numba
 import numpy as np
@@ -123,14 +124,54 @@ KERNELS: list[Any] = []
 """Kernels whose modules are imported, compiled or not."""
 
 
-def missing(without: Collection[str] = ()) -> list[Callable[[], None]]:
-    """Functions that compile the kernels without machine code in memory or on disk.
+class Missing(NamedTuple):
+    """A kernel without machine code in memory or on disk."""
+
+    name: str
+    """Its module and its own name, for `compile_named`."""
+    is_kept: bool
+    """Whether the machine code will be kept on disk."""
+    compile: Callable[[], None]
+    """Function that compiles it, or reads what another process has compiled since."""
+
+
+def missing(without: Collection[str] = ()) -> list[Missing]:
+    """Kernels without machine code in memory or on disk; those with the most to compile come first.
 
     Args:
         without: names of the modules whose kernels are not needed.
     """
-    needed = [each for each in KERNELS if each.__module__ not in without]
-    return [partial(_compile, each) for each in needed if not (each.overloads or _is_kept(each))]
+    found = [
+        each
+        for each in KERNELS
+        if each.__module__ not in without and not (each.overloads or _is_kept(each))
+    ]
+    return [
+        Missing(
+            _name(each), not isinstance(each._cache, caching.NullCache), partial(_compile, each)
+        )
+        for each in sorted(found, key=_extent, reverse=True)
+    ]
+
+
+def compile_named(name: str) -> None:
+    """Compile the kernel that `Missing` names so."""
+    import_module(name.partition(":")[0])
+    (dispatcher,) = (each for each in KERNELS if _name(each) == name)
+    _compile(dispatcher)
+
+
+def _name(dispatcher: Any) -> str:
+    return f"{dispatcher.__module__}:{dispatcher.py_func.__qualname__}"
+
+
+def _extent(dispatcher: Any) -> int:
+    """Number of arguments, with the parts of tuples, by which the time of compiling rises."""
+
+    def parts(kind: Any) -> int:
+        return sum(map(parts, kind)) if isinstance(kind, numba.types.BaseTuple) else 1
+
+    return sum(map(parts, _signature(dispatcher)))
 
 
 def load(without: Collection[str] = ()) -> None:

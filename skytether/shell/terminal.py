@@ -1,8 +1,9 @@
 """Output of commands on the terminal: progress bars, tables, and a flight's summary."""
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -14,6 +15,8 @@ from skytether.shell.command import write
 # for type checking alone: they are slow to import, and a process that flies does without
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from skytether.shared.base.kernel import Missing
 
 
 class Bar(Protocol):
@@ -53,20 +56,17 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
         yield show
 
 
-def prepare(kernels: Sequence[Callable[[], None]]) -> None:
-    """Compile the kernels that this machine has not compiled yet, with a note on stderr.
-
-    Args:
-        kernels: functions that compile one kernel each, from the server's `missing`.
-    """
+def prepare(kernels: Sequence["Missing"]) -> None:
+    """Compile the kernels that this machine has not compiled yet, with a note on stderr."""
     if not kernels:
         return
+    from skytether.shell.compiling import compile_kernels
+
     title = "compiling the control loops, once on this machine"
     print(f"{title}: it takes up to a minute", file=sys.stderr, flush=True)
     with progress(title, len(kernels), "kernels") as bar:
-        for done, compile_one in enumerate(kernels):
-            bar(done)
-            compile_one()
+        done = count(1)
+        compile_kernels(kernels, lambda: bar(next(done)))
 
 
 def show(table: "Table") -> None:

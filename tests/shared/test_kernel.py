@@ -3,9 +3,14 @@
 import resource
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from skytether.server.control.controller import other_schemes
+from skytether.shared.base import kernel
+from skytether.shared.scenario import reading
 
 HELPER = """
 from typing import NamedTuple
@@ -88,6 +93,24 @@ prepare(kernel.missing())
 """
 
 
+SIDE_BY_SIDE = """
+import os, sys
+import caller, second
+from skytether.shared.base import kernel
+from skytether.shell.compiling import compile_kernels
+
+os.sched_getaffinity = lambda _: {0, 1}
+if sys.argv[1:] == ["alone"]:
+    sys.executable = "/bin/false"
+done = []
+kernels = kernel.missing()
+compile_kernels(kernels, lambda: done.append(1))
+for each in (caller.double, second.double):
+    print(sum(each.dispatcher.stats.cache_hits.values()), len(each.dispatcher.overloads))
+print([each.name for each in kernels], len(done), kernel.missing())
+"""
+
+
 def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
     """Output of the caller: the result, and 1 if its machine code came from the disk.
 
@@ -152,6 +175,28 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     assert quiet(tmp_path, PREPARED) == ""
 
 
+@pytest.mark.parametrize("helpers", ["helped", "alone"])
+def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -> None:
+    """Their machine code is read from the disk; where no helper can be started, it is made here."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    for name in ("caller", "second"):
+        (tmp_path / f"{name}.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", SIDE_BY_SIDE, helpers],
+        cwd=tmp_path,
+        env={"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    read, told = ("1 1", 2) if helpers == "helped" else ("0 1", 0)
+    assert done.stdout.splitlines() == [
+        read,
+        read,
+        f"['caller:double', 'second:double'] {told} []",
+    ]
+
+
 def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:
     """The type has moved to another module, as it may between two versions."""
     (tmp_path / "helper.py").write_text(HELPER)
@@ -212,6 +257,21 @@ def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies(scenar
         [sys.executable, "-P", "-c", CALLED, scenario], capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == ["0"]
+
+
+ALWAYS = {"clock", "controller", "desired", "known", "plausibility", "scheme"}
+"""Modules of the server whose kernels are called with every scheme."""
+
+
+@pytest.mark.parametrize("scenario", ["demo", "demo-committed", "paper", "swap"])
+def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
+    """A module with kernels belongs to schemes that are named, or to all of them."""
+    import_module("skytether.server.endpoint")
+    own = other_schemes(reading.load("paper")) | other_schemes(reading.load("swap"))
+    own -= other_schemes(reading.load(scenario))
+    loaded = {each.__module__ for each in kernel.KERNELS} - other_schemes(reading.load(scenario))
+    server = {name for name in loaded if name.startswith("skytether.server.")}
+    assert {name.rpartition(".")[2] for name in server - own} <= ALWAYS
 
 
 def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
