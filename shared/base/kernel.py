@@ -128,7 +128,7 @@ class Missing(NamedTuple):
     """A kernel without machine code in memory or on disk."""
 
     name: str
-    """Its module and its own name, for `compile_named`."""
+    """Module and name of the kernel, for `compile_named`."""
     is_kept: bool
     """Whether the machine code will be kept on disk."""
     compile: Callable[[], None]
