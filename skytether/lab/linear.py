@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.committed import HOVERS, UNKNOWN
 from skytether.server.control.law import advance, lasting, lead_to
 from skytether.server.control.law import step as fly
+from skytether.server.control.memory import HOVERS, UNKNOWN
 from skytether.server.control.observer import learned
 from skytether.server.control.predictive import APART_NS
 from skytether.server.control.trajectory import follow
@@ -140,7 +140,7 @@ used; start of the previous plan; and the horizon and stage that x̄ belongs to.
 
 @making_part
 def _number(past: Past, made_for: int) -> int:
-    """Number of the horizon made for a step, see `server.control.committed`."""
+    """Number of the horizon made for a step, see `server.control.memory`."""
     room, sent = len(past.made), past.marks[SENT]
     if made_for < 0:
         return HOVERS

@@ -11,7 +11,7 @@ from skytether.client.filter import Kalman
 from skytether.client.navigation import filters, sensing
 from skytether.client.simulated.sensor import Sensor
 from skytether.lab.linear import NOISE, SCHEMES, WIND, Loop, Past, Timing, propagate
-from skytether.server.control.committed import HOVERS
+from skytether.server.control.memory import HOVERS
 from skytether.server.control.mpc import LATER, MPC, make_mpc, pose
 from skytether.server.control.observer import decay_of
 from skytether.shared.base.chance import stream

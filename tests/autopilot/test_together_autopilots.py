@@ -35,7 +35,7 @@ PX4 = {"tau_s": [0.5], "gain": [0.85], "dead_time_s": [0.1]}
 
 def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
     """The scenario of one of the three clients."""
-    table = reading.to_table(reading.load("swap-autopilot"))
+    table = reading.to_table(reading.load("swap-autopilot")) | {"duration": 55.0}
     table["vehicle"]["address"] = f"udpout:autopilot{number}:0"
     table["network"]["uplink"]["loss"] = table["network"]["downlink"]["loss"] = loss
     if flavour == "px4":
@@ -50,7 +50,9 @@ def apart_m(paths: list[Array]) -> float:
     return min(float(np.linalg.norm(one - other, axis=1).min()) for one, other in pairs)
 
 
-@pytest.mark.parametrize(("flavour", "loss"), [("ardupilot", 0.1), ("px4", 0.4)])
+@pytest.mark.parametrize(
+    ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
+)
 def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
     """From the ground where each begins, and back to it; by where they truly were."""
     world, clients, truths = World(lambda *_: None), [], []

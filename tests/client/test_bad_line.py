@@ -28,10 +28,12 @@ def compare(flavour: FlavourName, seed: int, duration: float) -> None:
     assert bad.foreign > 100 * duration
 
 
-@pytest.mark.parametrize(("flavour", "seed"), [("ardupilot", 1), ("px4", 5)])
+@pytest.mark.parametrize(
+    ("flavour", "seed"), [("ardupilot", 1), pytest.param("px4", 5, marks=pytest.mark.long)]
+)
 def test_a_bad_line_changes_little(flavour: FlavourName, seed: int) -> None:
     """No mode and no position of others is believed; it flies as it would, and a pilot wins."""
-    compare(flavour, seed, SETTLE_S + 20.0)
+    compare(flavour, seed, SETTLE_S + 10.0)
 
 
 def test_a_line_that_reorders_needs_what_was_overtaken_dropped(

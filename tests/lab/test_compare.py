@@ -1,6 +1,7 @@
 """The comparison: who flies in what, at which weights, what is said of it, and its files."""
 
 import csv
+import dataclasses
 import json
 import math
 import shutil
@@ -374,14 +375,22 @@ def test_what_is_claimed_is_what_was_asked_for() -> None:
 # -- the command ---------------------------------------------------------------------------------
 
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
+FLOWN_S = 8.0
+"""Duration of each flight of `--quick` here [s]."""
 
 
 @pytest.fixture(scope="module")
 def fewer() -> Iterator[None]:
-    """Thresholds of `--quick` without those below the found one; a long test of docs/ flies all."""
+    """`--quick` with two thresholds, the found one first, and short flights; docs/ fly all."""
+    real = contenders.quick
+
+    def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
+        return dataclasses.replace(real(scale), search_duration=FLOWN_S, duration=FLOWN_S)
+
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):
-            patch.setattr(contenders, name, getattr(contenders, name)[3:])
+            patch.setattr(contenders, name, getattr(contenders, name)[3:5])
+        patch.setattr(contenders, "quick", quick)
         yield
 
 
@@ -444,7 +453,9 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     )
     found = reading.load(f"{tuned / 'weights.toml'}/trajectory-expected-target")
     keys = {**REPORTS[row["report"]], "control.cost_gap": float(row["threshold"])}
-    runs = [each.summary for each in skytether.fly_batch(found, [1, 2, 3], duration=12.0, **keys)]
+    runs = [
+        each.summary for each in skytether.fly_batch(found, [1, 2, 3], duration=FLOWN_S, **keys)
+    ]
     for figure in ("rmse_xy", "packets_per_s", "bytes_per_s", "effort_mps"):
         assert float(row[figure]) == pytest.approx(np.mean([getattr(run, figure) for run in runs]))
     assert float(row["packets_per_s"]) <= 1.3 * float(row["budget"])
@@ -469,6 +480,7 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
     assert "floor" in page
 
 
+@pytest.mark.long
 def test_where_the_reference_is_known_it_is_flown_without_packets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,12 +2,13 @@
 
 import csv
 import importlib.util
+import io
 import json
 import re
 import signal
 import subprocess
 import sys
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, redirect_stdout
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 from msgspec.structs import replace
 
 from helpers import refusal, refused_before_writing, until
+from skytether.__main__ import main
 from skytether.lab import figures
 from skytether.lab.commands.pool import Crew, pinned, work
 from skytether.lab.journal import Journal, digests, sealed
@@ -317,8 +319,6 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With file, line, and an exit code of its own."""
-    from skytether.__main__ import main
-
     argv = ["sweep", "paper", "--duration", "2", "--settle", "0", "--runs", "1", "--workers", "1"]
     assert main([*argv, "--out", str(tmp_path)]) == 0
     file = tmp_path / "journal.jsonl"
@@ -388,8 +388,6 @@ def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before any table is written; the same command goes on with the file as it was."""
-    from skytether.__main__ import main
-
     path, out = tmp_path / "path.csv", tmp_path / "out"
     along(path)
     (tmp_path / "mine.toml").write_text(
@@ -468,9 +466,9 @@ def running(pid: str) -> bool:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the sweep, flown by two workers without any trouble."""
     out = tmp_path_factory.mktemp("sweep") / "deep" / "whole"
-    done = run(*SWEEP, "--out", str(out), "--workers", "2")
-    assert done.returncode == 0, done.stderr
-    assert "vehicle-steps" in done.stdout
+    with redirect_stdout(io.StringIO()) as said:
+        assert main([*SWEEP, "--out", str(out), "--workers", "2"]) == 0
+    assert "vehicle-steps" in said.getvalue()
     assert lines(out) == TASKS
     return out
 
@@ -599,8 +597,6 @@ def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line."""
-    from skytether.__main__ import main
-
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "nowhere"]
     assert main(argv) == 1
     said = "sweep: --scheduler: nowhere cannot be reached: missing port number in address 'nowhere'"
@@ -611,8 +607,6 @@ def test_without_dask_a_scheduler_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Saying what to install."""
-    from skytether.__main__ import main
-
     monkeypatch.setitem(sys.modules, "distributed", None)
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "tcp://h:1"]
     assert main(argv) == 2

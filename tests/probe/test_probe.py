@@ -251,7 +251,7 @@ def test_a_clock_that_drifts_is_found_out() -> None:
 )
 def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None) -> None:
     """Within three per cent and what is said of the doubt; and none where there is none."""
-    measured, _ = measure(text, text, seconds=300.0)
+    measured, _ = measure(text, text, seconds=150.0)
     told = outcome(measured, "x", secure=False).told
     for way in (told.uplink, told.downlink):
         assert (way.rate_bytes_per_s is None) == (rate is None)
@@ -276,21 +276,19 @@ def test_the_models_are_those_of_the_network_and_fly() -> None:
 
 @pytest.mark.parametrize("law", ["uniform", "normal", "gamma", "lognormal"])
 def test_the_law_of_delays_is_recognised(law: str) -> None:
-    """In nine of ten samples of a thousand."""
+    """In each of five samples of a thousand."""
     made = {
         "uniform": stats.uniform(0.02, 0.08),
         "normal": stats.norm(0.1, 0.01),
         "gamma": stats.gamma(2.0, loc=0.03, scale=0.02),
         "lognormal": stats.lognorm(0.8, loc=0.03, scale=0.03),
     }[law]
-    right = 0
-    for seed in range(10):
+    for seed in range(5):
         delay_s = made.rvs(1000, random_state=seed)
         best = fits.fit_delays(delay_s, 1000.0)[0]
-        right += best.name == law
+        assert best.name == law
         mean_s = best.numbers[0] if law == "normal" else best.numbers[1]
         assert law == "uniform" or mean_s == pytest.approx(made.mean(), rel=0.1)
-    assert right >= 9
 
 
 def test_an_interval_of_a_share_is_wilsons() -> None:

@@ -140,8 +140,15 @@ def growing_flights(dt: float, horizon: int, *, feedback: bool) -> dict[tuple[st
 
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("growing", GROWING)
-@pytest.mark.parametrize(("dt", "horizon"), [(0.02, 20), (0.05, 40)])
-@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize(
+    ("dt", "horizon", "feedback"),
+    [
+        (0.02, 20, False),
+        (0.05, 40, True),
+        pytest.param(0.02, 20, True, marks=pytest.mark.long),
+        pytest.param(0.05, 40, False, marks=pytest.mark.long),
+    ],
+)
 def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
     dt: float, horizon: int, growing: str, side: str, *, feedback: bool
 ) -> None:

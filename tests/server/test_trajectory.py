@@ -190,6 +190,7 @@ def test_input_moves_from_the_one_before_by_the_regulator_s_share() -> None:
     assert follow(held, 4, *state, wanted)[0] == pytest.approx(wanted)
 
 
+@pytest.mark.long
 def test_weight_of_changes_buys_a_smaller_error_at_the_same_effort() -> None:
     """After a target that only the server sees; without λ the same effort costs 0.05 m more."""
 
@@ -453,19 +454,19 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 
 @given(
     st.tuples(st.floats(-5, 5), st.floats(-1, 1)),
-    st.lists(st.floats(-9, 9), min_size=41, max_size=41),
+    st.lists(st.floats(-9, 9), min_size=21, max_size=21),
 )
 @settings(max_examples=20)
 def test_what_a_vehicle_is_told_can_be_flown(
     start: tuple[float, float], places: list[float]
 ) -> None:
     """Any desired trajectory gives motions that continue smoothly, by inputs within bounds."""
-    flown = scenario(control={"horizon": 40}, reference={"preview": "all"})
+    flown = scenario(control={"horizon": 20}, reference={"preview": "all"})
     terms = flown.terms()
     nominal = make_nominal(terms, flown.control, capacity=1)
-    desired = np.zeros((2, 41, 2))
+    desired = np.zeros((2, 21, 2))
     desired[:, :, 0] = places
-    states = np.zeros((2, 41, 2))
+    states = np.zeros((2, 21, 2))
     states[:, 0] = start
     assert plain(plan_nominal)(nominal, 0, 7, desired, states)
     assert states[:, 0].tolist() == [list(start)] * 2
