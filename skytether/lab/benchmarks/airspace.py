@@ -97,7 +97,7 @@ class PlannedFleet:
 
     def fly(self) -> None:
         """Fly one step as planned."""
-        self._vehicles.fly(self._planner.inputs[:, :, 0].astype(float))
+        self._vehicles.fly(self._planner.inputs[:, :, 0])
 
 
 class Airspace:
