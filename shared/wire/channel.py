@@ -177,7 +177,7 @@ class Channel:
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 
     def wants_successor(self, now_ns: int) -> bool:
-        """Whether it has been used for so long that another one is to follow."""
+        """Whether this channel needs a successor, because of its age or the packets behind it."""
         # Both directions count, for one handshake renews the keys of both.
         packets = max(self._sent, self._window.newest + 1)
         return now_ns >= self._fresh_until_ns or packets >= FRESH_PACKETS

@@ -155,7 +155,7 @@ def test_measurements_come_when_they_are_due(
 
 
 def test_a_vehicle_tells_what_it_has_measured_when_it_is_asked() -> None:
-    """Stamped by the clock of who asks; all steps that were slept through, and each once."""
+    """Measurements carry the asker's clock; those of missed steps are handed over, each once."""
     flown = scenario(sensor=POSITIONS | {"delay_s": 0.1})
     flies, began_ns = simulated(flown, 1), 10**12
     first = flies.measurements(now_ns=began_ns)

@@ -42,12 +42,13 @@ def terms(scheme: str, exhausted: str, rng: np.random.Generator) -> Terms:
 
 
 def mismatches(scheme: str, stages: int, seed: int) -> tuple[int, float]:
-    """Stages at which a vehicle flies another input than the compiled rule says, of so many.
+    """Compare a vehicle's inputs with those of the compiled rule, over a number of stages.
 
     Messages, states, wind, and the steps at which it is awake are drawn.
 
     Returns:
-        their number, and the largest difference from the equations written anew [m/s].
+        number of stages with another input, and the largest difference from the equations
+        written anew [m/s].
     """
     rng, differ, away, compared = np.random.default_rng(seed), 0, 0.0, 0
     while compared < stages:

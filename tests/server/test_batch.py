@@ -251,7 +251,7 @@ def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
 
 
 def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
-    """The last of 101 is as good as the first."""
+    """The 101st run, which no longer fits, has the same bits as when it is flown alone."""
     flown = scenario(duration=0.2)
     flights = fly_batch(flown, range(COMPANY_MAX + 1))
     assert len(flights) == COMPANY_MAX + 1

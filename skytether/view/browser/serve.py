@@ -23,7 +23,7 @@ TOKEN_BYTES = 16
 POLL_S = 0.1
 """Interval at which Ctrl-C is checked [s]."""
 PORTS, PORTS_TRIED = 65536, 100
-"""Number of ports, and most that are tried from the requested one on."""
+"""Number of ports that exist, and of those that are tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
 """Addresses that mean every interface, and cannot be connected to."""
 
