@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import F1, F2, I1, R2, making_kernel, making_part
+from skytether.shared.base.kernel import F1, F2, I1, R2, kernel, part
 from skytether.shared.law.model import Array
 
 SOLVED, INFEASIBLE, ENDLESS = 0, 1, 2
@@ -59,7 +59,7 @@ class DualSolver:
 # are kept transposed.
 
 
-@making_kernel
+@kernel
 def _solve(
     root: F2,
     linear: F1,
@@ -77,7 +77,7 @@ def _solve(
     return solved(root, linear, x, columns, least, equal, slack, J, R, work, active)
 
 
-@making_part
+@part
 def solved(
     root: F2,
     linear: F1,
@@ -106,8 +106,7 @@ def solved(
     """
     n, q = len(x), 0
     d, z, r, u, normal = work[0], work[1], work[2], work[3], work[4]
-    J[:] = root
-    _begin(root, linear, x)
+    _begin(root, linear, x, J)
     for _ in range(ROUNDS * n):
         # The equality that comes next, or else the constraint that is violated most.
         at = q if q < equal else _most_violated(columns, least, equal, x, slack)
@@ -120,7 +119,8 @@ def solved(
         # normal.
         sign = -1.0 if at < equal and room > 0.0 else 1.0
         room *= sign
-        normal[:n] = sign * columns[:, at]
+        for i in range(n):
+            normal[i] = sign * columns[i, at]
         price = 0.0
         while True:
             length, gain = _direction(J, R, normal, d, z, r, q)
@@ -135,15 +135,13 @@ def solved(
             # Neither a step nor a constraint that may leave: no x meets all of them.
             if step == np.inf:
                 return INFEASIBLE
-            u[:q] -= step * r[:q]
+            _add(u, -step, r, q)
             price += step
             if primal < np.inf:
-                x += step * z[:n]
+                _add(x, step, z, n)
                 room += step * gain
             if step == primal:
-                for j in range(n - 1, q, -1):
-                    _turn(d, J, j)
-                R[: q + 1, q] = d[: q + 1]
+                _bring_in(J, R, d, q)
                 active[q], u[q] = at, price
                 q += 1
                 break
@@ -152,10 +150,20 @@ def solved(
     return ENDLESS
 
 
-@making_part
-def _begin(root: F2, linear: F1, x: F1) -> None:
-    """Fill in x with the minimum of the QP without its constraints, J Jᵀ g."""
-    x[:] = 0.0
+@part
+def _add(to: F1, factor: float, numbers: F1, count: int) -> None:
+    """Add multiples of the first numbers, by a loop: numba takes a second to compile a slice."""
+    for i in range(count):
+        to[i] += factor * numbers[i]
+
+
+@part
+def _begin(root: F2, linear: F1, x: F1, J: F2) -> None:
+    """Fill in J, and x with the minimum of the QP without its constraints, J Jᵀ g."""
+    for i in range(len(x)):
+        x[i] = 0.0
+        for j in range(len(x)):
+            J[i, j] = root[i, j]
     for i in range(len(x)):
         along = 0.0
         for j in range(len(x)):
@@ -164,7 +172,7 @@ def _begin(root: F2, linear: F1, x: F1) -> None:
             x[j] += along * root[i, j]
 
 
-@making_part
+@part
 def _most_violated(columns: R2, least: F1, equal: int, x: F1, slack: F1) -> int:
     """The inequality that is violated most, or -1."""
     for i in range(len(least)):
@@ -180,7 +188,7 @@ def _most_violated(columns: R2, least: F1, equal: int, x: F1, slack: F1) -> int:
     return at
 
 
-@making_part
+@part
 def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[float, float]:
     """Fill in the step of x, z, and of the multipliers, r, that a constraint asks for.
 
@@ -207,12 +215,22 @@ def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[f
     return length, gain
 
 
-@making_part
+@part
+def _bring_in(J: F2, R: F2, d: F1, q: int) -> None:
+    """Put another constraint behind the q in force; d is its normal as Jᵀ sees it."""
+    for j in range(len(J) - 1, q, -1):
+        _turn(d, J, j)
+    for i in range(q + 1):
+        R[i, q] = d[i]
+
+
+@part
 def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
     """Remove one of the q constraints in force."""
     for i in range(leaves, q - 1):
         active[i], u[i] = active[i + 1], u[i + 1]
-        R[:q, i] = R[:q, i + 1]
+        for j in range(q):
+            R[j, i] = R[j, i + 1]
     for i in range(leaves, q - 1):
         # Givens rotations make R a triangle again after the column that left.
         one, other = R[i, i], R[i + 1, i]
@@ -228,7 +246,7 @@ def _let_go(J: F2, R: F2, u: F1, active: I1, leaves: int, q: int) -> None:
             J[i, j], J[i + 1, j] = c * one + s * other, c * other - s * one
 
 
-@making_part
+@part
 def _turn(d: F1, J: F2, j: int) -> None:
     """Turn rows j - 1 and j so that d[j] becomes 0."""
     one, other = d[j - 1], d[j]
