@@ -20,6 +20,10 @@ RETRY_STEPS = 4
 round trip. Later it waits as long again as it has waited, so that a long wait costs few packets."""
 
 
+NEVER = 2**30
+"""Number of steps that no flight has."""
+
+
 class BelievedState:
     """State that the server must take the vehicle to be in, as long as nothing is lost.
 
@@ -133,6 +137,14 @@ class Reporter:
                 break
             count += 1
         return count
+
+    def silent_until(self, silence: int) -> int:
+        """Last step up to which the server asks for no observation.
+
+        Args:
+            silence: see `is_due`.
+        """
+        return self._told + (silence - 1) // 2 if silence > 0 else self._step + NEVER
 
     def was_silent(self, step: int) -> None:
         """Note that no observation was due at any step up to this one; `belief` is there."""
