@@ -18,8 +18,6 @@ States = Sequence[tuple[float, float]]
 RETRY_STEPS = 4
 """Number of steps after which a vehicle that waits for its first horizon reports once more: about a
 round trip. Later it waits as long again as it has waited, so that a long wait costs few packets."""
-
-
 NEVER = 2**30
 """Number of steps that no flight has."""
 

@@ -569,7 +569,8 @@ class CompiledPilot(Pilot):
         assert ahead is not None
         self._ahead = None
         if keeps and count < len(ahead.told):
-            self._ahead = Ahead(*(each[count:] for each in ahead))
+            states, rows, believed = ahead
+            self._ahead = Ahead(states[count:], rows[count:], believed[count:])
         if not count:
             return
         assert self._flying is not None
