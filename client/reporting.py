@@ -18,6 +18,8 @@ States = Sequence[tuple[float, float]]
 RETRY_STEPS = 4
 """Number of steps after which a vehicle that waits for its first horizon reports once more: about a
 round trip. Later it waits as long again as it has waited, so that a long wait costs few packets."""
+NEVER = 2**30
+"""Number of steps that no flight has."""
 
 
 class BelievedState:
@@ -133,6 +135,14 @@ class Reporter:
                 break
             count += 1
         return count
+
+    def silent_until(self, silence: int) -> int:
+        """Last step up to which the server asks for no observation.
+
+        Args:
+            silence: see `is_due`.
+        """
+        return self._told + (silence - 1) // 2 if silence > 0 else self._step + NEVER
 
     def was_silent(self, step: int) -> None:
         """Note that no observation was due at any step up to this one; `belief` is there."""

@@ -2,8 +2,9 @@
 
 Most vehicles send far less often than once a step. After each step the vehicle is flown ahead, up
 to the next step at which something may happen (`sim.pilot`), and asks to be woken only then. If
-something comes before, it goes on to the time of that, and forgets the steps after. What is sent,
-told and recorded is the same; only the order of records is another one, see `Run.flight`.
+something comes before, it goes on to the time of that, and forgets the steps after where that
+changes them, as a heartbeat does not. What is sent, told and recorded is the same; only the order
+of records is another one, see `Run.flight`.
 """
 
 from collections.abc import Callable
@@ -35,8 +36,12 @@ class AheadClient(Client):
         self._span_ns = AHEAD * scenario.dt_ns
         """Longest time that is flown ahead [ns]."""
 
-    def catch_up(self) -> None:
-        """Go on to the present."""
+    def catch_up(self, *, keeps: bool = False) -> None:
+        """Go on to the present.
+
+        Args:
+            keeps: whether the steps after that stay flown ahead.
+        """
         pilot = self._ahead
         if not pilot.steps_ahead:
             return
@@ -47,12 +52,28 @@ class AheadClient(Client):
             if next_ns >= now_ns:
                 break
             woken_ns, count = next_ns, count + 1
-        pilot.go_on(count, now_ns=self._clock.local(woken_ns))
+        pilot.go_on(count, now_ns=self._clock.local(woken_ns), keeps=keeps)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""
-        self.catch_up()
+        self.catch_up(keeps=True)
+        before = self._situation()
         super().receive(datagram, now_ns=now_ns)
+        if before != self._situation():
+            self._ahead.forget()
+
+    def _situation(self) -> tuple[object, ...]:
+        """Facts that a datagram may change, and that steps were flown ahead by."""
+        session, failsafe, compensator = self._session, self._failsafe, self._ahead.compensator
+        return (
+            session.number,
+            session.asked,
+            failsafe.mode,
+            failsafe.reason,
+            compensator.newest,
+            compensator.in_force,
+            compensator.repeated,
+        )
 
     def wake(self, *, now_ns: int) -> None:
         """See `Endpoint`."""

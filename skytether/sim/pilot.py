@@ -37,8 +37,9 @@ from skytether.sim.aboard import (
     fly_step,
 )
 
-AHEAD = 32
-"""Most steps that are flown ahead at a time."""
+AHEAD, WORTHWHILE = 32, 5
+"""Most steps that are flown ahead at a time, and fewest for which that takes less time than flying
+them one by one."""
 
 
 class SimpleBody(NamedTuple):
@@ -524,6 +525,8 @@ class CompiledPilot(Pilot):
         flying = self._flying
         if flying is None or flying.step != self.flown or self._reporter.always:
             return
+        if self._reporter.silent_until(asked) - self.flown < WORTHWHILE:
+            return
         believed, failsafe, compensator = self._belief.next, self._failsafe, self.compensator
         # The bound of a braking vehicle's speed changes from step to step.
         brakes = failsafe.brakes and not compensator.covered and self._speed != 0.0
@@ -533,10 +536,11 @@ class CompiledPilot(Pilot):
         last = min(
             (calm_ns - self.starts_ns(0)) // self._dt_ns - 1,
             compensator.alike_until(self.flown),
+            self._reporter.silent_until(asked),
             self.steps - 2,
         )
         steps = min(last - self.flown, AHEAD)
-        if steps < 1:
+        if steps < WORTHWHILE:
             return
         ahead, apart = flying.look_ahead(steps, believed)
         off_m = self._belief.lengths(apart)
@@ -549,17 +553,26 @@ class CompiledPilot(Pilot):
         """Number of steps that were flown ahead."""
         return len(self._ahead.told) if self._ahead is not None else 0
 
-    def go_on(self, count: int, *, now_ns: int) -> None:
-        """Go on by some of the steps that were flown ahead; all others of them are forgotten.
+    def forget(self) -> None:
+        """Forget the steps that were flown ahead."""
+        self._ahead = None
+
+    def go_on(self, count: int, *, now_ns: int, keeps: bool) -> None:
+        """Go on by some of the steps that were flown ahead.
 
         Args:
             count: number of these steps.
             now_ns: begin of the last of them.
+            keeps: whether all others of them stay flown ahead; if not, they are forgotten.
         """
-        ahead, self._ahead = self._ahead, None
+        ahead = self._ahead
+        assert ahead is not None
+        self._ahead = None
+        if keeps and count < len(ahead.told):
+            states, rows, believed = ahead
+            self._ahead = Ahead(states[count:], rows[count:], believed[count:])
         if not count:
             return
-        assert ahead is not None
         assert self._flying is not None
         first, self.flown = self.flown + 1, self.flown + count
         self.step = self.flown

@@ -806,6 +806,7 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
     known_aboard: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its filter has found it; without that it would be blown off by what K leaves."""
+    uncompile(monkeypatch)
     if not known_aboard:
         monkeypatch.setattr(Navigation, "disturbance", property(lambda _: [0.0, 0.0]))
     flown = scenario(
