@@ -19,7 +19,8 @@ from skytether.server.control.budget import SharedBudget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
-from skytether.server.control.planner import Figures, Planner
+from skytether.server.control.moves import Figures
+from skytether.server.control.planner import Planner
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
 from skytether.server.control.together import Together

@@ -37,7 +37,7 @@ from skytether.server.control.apart import FlownMotions, HalfPlanes
 from skytether.server.control.aside import ASIDE_S, Aside
 from skytether.server.control.known import Known, Sent
 from skytether.server.control.motionplan import MotionPlan
-from skytether.server.control.planner import FIGURES, Figures
+from skytether.server.control.moves import FIGURES, Figures
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
