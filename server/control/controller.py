@@ -19,7 +19,8 @@ from skytether.server.control.budget import SharedBudget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
-from skytether.server.control.planner import Figures, Planner
+from skytether.server.control.moves import Figures
+from skytether.server.control.planner import Planner
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
 from skytether.server.control.together import Together
@@ -46,7 +47,7 @@ _MISSION = ("apart", "direct", "dual", "knots", "motionplan", "together")
 _SCHEMES = {
     "predictive": ("predictive", "planner", "exact"),
     "none": ("predictive", "planner", "exact"),
-    "committed": ("committed", "planner", "exact"),
+    "committed": ("committed", "memory", "planner", "exact"),
     "trajectory": ("trajectory", "knots", "exact"),
 }
 """Modules whose kernels plan by each scheme; the others' kernels are called with any of them."""

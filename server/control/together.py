@@ -40,7 +40,7 @@ from skytether.server.control.aside import ASIDE_S, Aside
 from skytether.server.control.direct import Direct
 from skytether.server.control.known import Known, Sent, repeats_after
 from skytether.server.control.motionplan import MotionPlan
-from skytether.server.control.planner import FIGURES, Figures
+from skytether.server.control.moves import FIGURES, Figures
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
 from skytether.shared.base.kernel import B1, I1, making_kernel

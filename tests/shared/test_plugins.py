@@ -1,5 +1,6 @@
 """Plug-ins: triggers and references of files and packages, in every process; their mistakes."""
 
+import csv
 import importlib.util
 import os
 import re
@@ -636,6 +637,48 @@ def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path
     plug(tmp_path, NEVER + "\n")
     assert digests([named])[path] != before[path]
     assert digests([scenario()]) == {}
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["sweep", "paper", "--out", "out", "--runs", "0"], "--runs: got 0"),
+        (["calibrate", "paper", "--runs", "0"], "--runs: got 0"),
+        (["compare", "--runs", "0"], "--runs: got 0"),
+        (["envelope", "demo-committed", "--out", "out", "--points", "0"], "--points: got 0"),
+        (["margins", "demo", "--runs", "0"], "--runs: got 0"),
+    ],
+    ids=lambda argv: argv[0],
+)
+def test_commands_of_the_laboratory_take_the_flag_several_times(
+    argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each file is imported, in order, before the command refuses something else."""
+    files = [tmp_path / "one.py", tmp_path / "two.py"]
+    for path, code in zip(files, (NEVER, SLOPE), strict=True):
+        path.write_text(HEAD + code)
+    given = [word for path in files for word in ("--plugin", str(path))]
+    with chdir(tmp_path):
+        assert main([*argv, *given]) == 2
+    assert said in capsys.readouterr().err
+    assert plugins.flags() == given
+
+
+@pytest.mark.usefixtures("here")
+def test_a_sweep_flies_with_the_triggers_of_several_files(tmp_path: Path) -> None:
+    """A cell for each: one never sends but for silence, one whenever it can."""
+    other = NEVER.replace("never", "ever").replace("zeros", "ones")
+    given = []
+    for name, code in (("one.py", NEVER), ("two.py", other)):
+        (tmp_path / name).write_text(HEAD + code)
+        given += ["--plugin", str(tmp_path / name)]
+    grid = ["--grid", "control.trigger=never | silence(1),ever"]
+    short = ["--runs", "1", "--duration", "3", "--settle", "0", "--out", str(tmp_path / "out")]
+    assert main(["sweep", "demo", *given, *grid, *short]) == 0
+    rows = csv.DictReader((tmp_path / "out" / "cells.csv").read_text().splitlines())
+    ratios = {row["control.trigger"]: float(row["event_ratio"]) for row in rows}
+    assert ratios["ever"] > 0.5
+    assert 0.0 < ratios["never | silence(1)"] < 0.2
 
 
 SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"

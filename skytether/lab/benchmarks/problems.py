@@ -10,8 +10,8 @@ import numpy as np
 
 from skytether.server.control import planner
 from skytether.server.control.exact import ExactSolver
+from skytether.server.control.moves import GENERATOR, TRACKER
 from skytether.server.control.mpc import FIRST, Problem, gradient, lead
-from skytether.server.control.planner import GENERATOR, TRACKER
 from skytether.server.control.solver import Solver
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading

@@ -1,0 +1,316 @@
+"""Moves of a plan: pose the generator's problem, pose the tracker's, appraise what came of both.
+
+Between the moves somebody solves: the compiled pass of `server.control.planner`, or another solver.
+A move works on one vehicle of a block, and reads and fills the draft of its plan.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.control.desired import Window
+from skytether.server.control.law import advance, axis_at
+from skytether.server.control.mpc import (
+    FIRST,
+    LATER,
+    MPC,
+    Inputs,
+    add_cost,
+    follow,
+    gradient,
+    lead,
+    slope,
+)
+from skytether.server.control.scheme import Foresight
+from skytether.shared.base.kernel import B1, F1, F2, F3, I1, S4, inline, lanes, record, records
+
+GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
+"""Moves of a plan; GENERATOR and TRACKER are also the first index of what both MPCs have."""
+
+
+class PlanFigures:
+    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
+
+    row: int
+    """Row of the vehicle."""
+    step: int
+    """Step k."""
+    start: int
+    """Step k + d, where planning starts."""
+    gap: int
+    """Steps since planning started before."""
+    state_gap: float
+    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
+    cost_gap: float
+    """Cost of flying on with what was sent above that of the plan [cost]."""
+    expected_gap: float
+    """Mean of that cost where packets in flight may be lost [cost]."""
+    deviation_m: float
+    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
+    fresh: bool
+    """Whether it is at its first step, or behind a gap that no plan reached over."""
+    solved: bool
+    """Whether the plan is new and right, so that it may be sent."""
+
+
+FIGURES = record(PlanFigures)
+Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
+"""Shape (n,)."""
+
+
+class PlanMemory(NamedTuple):
+    """Memory of both MPCs for every vehicle."""
+
+    # A thousand vehicles' memory is 0.8 MB like this. With float64, and with the states X(k-1) that
+    # the inputs lead to, it was four times as large, and no core's own cache held it.
+    inputs: S4
+    """U(k-1), the horizon computed last [m/s], rounded as it is sent; shape
+    (2, capacity, axes, H)."""
+    start: F3
+    """State that the generator's horizon begins at [m, m/s]; shape (capacity, axes, 2)."""
+    step: I1
+    """Step that they were computed for, or -1; shape (capacity,)."""
+    bounded: B1
+    """Whether an input was at its bound, of plans made side by side; shape (capacity,)."""
+
+
+class Draft(NamedTuple):
+    """The plans of a block of vehicles in the making."""
+
+    planned: F3
+    """Planned state x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
+    gradient: F3
+    """Gradient g of the problem to be solved; shape (block, axes, H)."""
+    guess: F3
+    """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
+    answer: F1
+    """Scratch: U(k) of one problem, not rounded yet [m/s]; shape (H,)."""
+    inputs: S4
+    """U(k) of both MPCs, rounded: planning goes on with what the vehicle will really be told
+    [m/s]; shape (2, block, axes, H)."""
+    states: F2
+    """Scratch: X(k) of the generator on one axis [m, m/s]; shape (H + 1, 2)."""
+    drift: F2
+    """Scratch of `gradient`; shape (H, 2)."""
+    distance: F1
+    """Scratch: squares of distances [m²]; shape (H + 1,)."""
+
+
+@inline
+def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
+    """Note what a plan starts from, in its record of FIGURES, and whether it begins anew."""
+    last, start = memory.step[row], k + ahead
+    plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
+    plan.solved = True
+    # Behind a gap longer than H nothing of the last plan is left to go on from (E17).
+    plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
+
+
+@inline
+def planned_state(
+    mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
+) -> tuple[float, float]:
+    """Planned state x_p(k|k-1) on one axis: where the generator's last plan leads at `plan.gap`.
+
+    Source: eq. (14).
+    """
+    model, u = axis_at(mpc.model, axis), memory.inputs[GENERATOR, plan.row, axis]
+    p, v = memory.start[plan.row, axis, 0], memory.start[plan.row, axis, 1]
+    for stage in range(plan.gap):
+        p, v = advance(model, p, v, u[stage])
+    return p, v
+
+
+@inline
+def pose_generator(
+    mpc: MPC,
+    memory: PlanMemory,
+    draft: Draft,
+    desired: Window,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
+    """Pose the generator's problem on one axis of vehicle `i` of the block, at draft `at`.
+
+    Source: eq. (14).
+    """
+    row, gap, fresh, H = plan.row, plan.gap, plan.fresh, memory.inputs.shape[3]
+    if fresh:
+        x = (found.start[i, axis, 0], found.start[i, axis, 1])
+    else:
+        x = planned_state(mpc, memory, plan, axis)
+    draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
+    place, first = desired.place[i], desired.first[i]
+    target = desired.states[place, axis, first : first + H + 1]
+    previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
+    # The generator plans for no vehicle in particular, and so for no disturbance.
+    lead(mpc, axis, x, 0.0, target, draft.drift)
+    which = FIRST if fresh else LATER
+    gradient(mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
+
+
+@inline
+def pose_tracker(
+    mpc: MPC,
+    memory: PlanMemory,
+    draft: Draft,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+    axis: int,
+) -> None:
+    """Pose the tracker's problem on one axis, behind the generator's answer in the draft.
+
+    Source: eq. (15).
+    """
+    u, states = draft.inputs[GENERATOR, at, axis], draft.states
+    x = (found.start[i, axis, 0], found.start[i, axis, 1])
+    planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
+    previous, g = memory.inputs[TRACKER, plan.row, axis], draft.gradient[at, axis]
+    which, w, gap = FIRST if plan.fresh else LATER, found.disturbance[i, axis], plan.gap
+    follow(mpc, axis, x, w, planned, u, states, draft.drift)
+    gradient(mpc, axis, which, w, states, previous, gap, plan.fresh, draft.drift, g)
+
+
+@inline
+def _deviate(
+    mpc: MPC,
+    memory: PlanMemory,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    axis: int,
+    distance: F1,
+) -> None:
+    """Add the squares of how far `held` leads away from the generator's last plan on one axis.
+
+    Args:
+        distance: what is added to, stage by stage, as far as that plan goes and a new one would be
+            flown [m²]; shape (H + 1,).
+    """
+    held, flown = found.held[i, axis], found.flown[i]
+    model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
+    planned = memory.inputs[GENERATOR, plan.row, axis]
+    p, v = found.start[i, axis, 0], found.start[i, axis, 1]
+    planned_p, planned_v = planned_state(mpc, memory, plan, axis)
+    for stage in range(min(H - plan.gap, flown) + 1):
+        away = p - planned_p
+        distance[stage] += away * away
+        if stage < flown:
+            p, v = advance(model, p, v, held[stage] + w)
+        if stage + plan.gap < H:
+            u = planned[stage + plan.gap]
+            planned_p, planned_v = advance(model, planned_p, planned_v, u)
+
+
+@inline
+def _add_gap(
+    mpc: MPC,
+    axis: int,
+    x: tuple[float, float],
+    held: F1,
+    u: Inputs,
+    steep: F1,
+    change: F1,
+    cost: float,
+) -> float:
+    """Add to `cost` what flying on with other inputs costs above the optimum, twice, on one axis.
+
+    Args:
+        x: by how much the state at stage 0 is another then [m, m/s].
+        held: the other inputs [m/s]; shape (H,).
+        u: the optimal ones [m/s]; shape (H,).
+        steep: `slope` there, by which the cost rises where a bound is active; shape (H,).
+        change: scratch, as long as inputs are compared; shape (flown,).
+    """
+    for stage in range(len(change)):
+        # The slope is 0 but where a bound is active, and there every change that is allowed costs
+        # more: less than 0 is rounding. Without this term the gap was wrong in 68 % of the tests of
+        # a flight in wind 0.3.
+        change[stage] = held[stage] - u[stage]
+        cost += 2.0 * max(0.0, steep[stage] * change[stage])
+    return add_cost(mpc, axis, x, change, cost)
+
+
+@inline
+def finish(mpc: MPC, draft: Draft, plan: PlanFigures, compares: bool, at: int, axis: int) -> None:
+    """Find the slope at the tracker's answer on one axis, where plans are compared."""
+    if compares:
+        u, which = draft.inputs[TRACKER, at, axis], FIRST if plan.fresh else LATER
+        slope(mpc, axis, which, u, draft.gradient[at, axis], draft.drift)
+
+
+@lanes
+def copy(numbers: Inputs, to: Inputs) -> None:
+    """Put numbers into the beginning of an array."""
+    for i in range(len(numbers)):
+        to[i] = numbers[i]
+
+
+@inline
+def conclude(
+    mpc: MPC,
+    terminal_weight: F1,
+    compares: bool,
+    memory: PlanMemory,
+    draft: Draft,
+    found: Foresight,
+    plan: PlanFigures,
+    i: int,
+    at: int,
+) -> None:
+    """Appraise the plan of vehicle `i`, with V(k) among its figures, and remember it.
+
+    Source: eq. (16).
+    """
+    axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
+    row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
+    # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
+    change = draft.guess[at, 0, : found.flown[i]]
+    distance, furthest = draft.distance, 0.0
+    sure, doubted = 1.0, 0.0
+    if compares:
+        for stage in range(H + 1):
+            distance[stage] = 0.0
+    for axis in range(axes):
+        u = draft.inputs[TRACKER, at, axis]
+        off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
+        off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
+        state_gap += off_p * off_p * P[0] + off_v * off_v * P[1]
+        if compares:
+            steep = draft.gradient[at, axis]
+            x = (0.0, 0.0)
+            cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
+            for j in range(found.doubt.shape[1]):
+                share = found.doubt[i, j]
+                if share > 0.0:
+                    x = (
+                        found.doubted_start[i, j, axis, 0] - found.start[i, axis, 0],
+                        found.doubted_start[i, j, axis, 1] - found.start[i, axis, 1],
+                    )
+                    held = found.doubted[i, j, axis]
+                    doubted += share * _add_gap(mpc, axis, x, held, u, steep, change, 0.0)
+            if not plan.fresh:
+                _deviate(mpc, memory, found, plan, i, axis, distance)
+        copy(found.committed[i, axis, :d], found.horizons[i, axis])
+        copy(u, found.horizons[i, axis, d:])
+    if compares:
+        for stage in range(H + 1):
+            furthest = max(furthest, distance[stage])
+        furthest = np.sqrt(furthest)
+    for j in range(found.doubt.shape[1]):
+        sure -= found.doubt[i, j]
+    plan.state_gap, plan.cost_gap, plan.deviation_m = state_gap, cost, furthest
+    plan.expected_gap = sure * cost + doubted
+    for axis in range(axes):
+        for which in (GENERATOR, TRACKER):
+            copy(draft.inputs[which, at, axis], memory.inputs[which, row, axis])
+        memory.start[row, axis, 0] = draft.planned[i, axis, 0]
+        memory.start[row, axis, 1] = draft.planned[i, axis, 1]
+    # A first plan that failed is no plan to go on from.
+    memory.step[row] = plan.start if plan.solved or not plan.fresh else -1
