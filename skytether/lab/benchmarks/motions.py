@@ -11,7 +11,8 @@ Ticks are of swaps in virtual time: all vehicles are heard and planned for by on
 The last table has ticks of fleets of which a share is near others: pairs that change places again
 and again, 20 m from the next pair, beside vehicles that fly to and fro alone. The planning of each
 tick (everything, from the motions that may be flown to the one that is sent) is compared with OSQP
-on one QP for each vehicle planned for in that tick, the last of its rounds.
+on one QP for each vehicle planned for in that tick, the last of its rounds. Both are CPU time. This
+table is the section `motions` of `make bench`.
 """
 
 import itertools
@@ -19,7 +20,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -71,6 +72,21 @@ class MotionsOptions:
     """Length of a flight [s]."""
     markdown: Path | None = None
     """File for the tables as Markdown."""
+
+
+@dataclass(frozen=True)
+class MotionsCounts:
+    """Fleets to measure the planning of."""
+
+    fleets: tuple[int, ...] = FLEETS
+    """Numbers of vehicles."""
+    shares: tuple[float, ...] = SHARES
+    """Shares of vehicles near others."""
+    duration: float = 30.0
+    """Length of a flight [s]."""
+
+
+FULL, QUICK = MotionsCounts(), MotionsCounts((16,), (0.5,), 12.0)
 
 
 class MotionProblem(NamedTuple):
@@ -291,9 +307,9 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
     of_tick: list[MotionProblem] = []
 
     def timed(self: Together, *given: Any) -> None:
-        began = time.perf_counter_ns()
+        began = time.thread_time_ns()
         plan(self, *given)
-        plan_us.append((time.perf_counter_ns() - began) / 1e3)
+        plan_us.append((time.thread_time_ns() - began) / 1e3)
 
     def collected(self: Together, *given: Any) -> None:
         of_tick.clear()
@@ -319,35 +335,58 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
         own.plan, own._toward = plan, toward
 
 
-def shares(options: MotionsOptions) -> TextTable:
+def measure(counts: MotionsCounts) -> dict[str, Any]:
     """Planning of whole ticks beside OSQP for each vehicle in turn, by the share near others."""
-    rows = []
+    fleets = []
     with tempfile.TemporaryDirectory() as folder:
-        for vehicles, share in progress(list(itertools.product(FLEETS, SHARES)), "fleets"):
-            flown = shared_space(vehicles, share, options.duration, Path(folder))
+        kinds = list(itertools.product(counts.fleets, counts.shares))
+        for vehicles, share in progress(kinds, "fleets"):
+            flown = shared_space(vehicles, share, counts.duration, Path(folder))
             spent: list[float] = []
             problems: list[list[MotionProblem]] = []
+            with watched([], None):  # loads machine code
+                flight.fly(msgspec.structs.replace(flown, duration=2 * LEG_S), vehicles=vehicles)
             with watched(spent, None):
                 flight.fly(flown, vehicles=vehicles)
             with watched([], problems):  # the same flight once more, to the last bit
                 flight.fly(flown, vehicles=vehicles)
             planned = [tick for tick, each in enumerate(problems) if each]
-            rows.append([str(vehicles), f"{share:.0%}", *_beside_osqp(spent, problems, planned)])
+            beside = _beside_osqp(spent, problems, planned)
+            fleets.append({"vehicles": vehicles, "near": share, **beside})
+    return {"fleets": fleets}
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
+    """Table of planning beside OSQP."""
+    rows = []
+    for each in result["fleets"]:
+        ours, theirs = (
+            [each[whose][q] for q in ("p50", "p99")] for whose in ("ours_ms", "osqp_ms")
+        )
+        ratios = (of_osqp / own for of_osqp, own in zip(theirs, ours, strict=True))
+        rows.append(
+            [
+                f"{each['vehicles']}, {each['near']:.0%}",
+                f"{each['planned']:.1f}",
+                ", ".join(f"{ms:.2f}" for ms in ours),
+                ", ".join(f"{ms:.2f}" for ms in theirs),
+                ", ".join(f"{ratio:.1f}" for ratio in ratios),
+            ]
+        )
     headings = [
-        "vehicles",
-        "near others",
+        "vehicles, near others",
         "planned for in a tick",
         "planning p50, p99 [ms]",
         "OSQP p50, p99 [ms]",
         "OSQP over it p50, p99",
     ]
-    return TextTable(headings, rows)
+    return {"motions": TextTable(headings, rows)}
 
 
 def _beside_osqp(
     spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
-) -> list[str]:
-    """Cells of a row: planning of the ticks in which vehicles are planned for, and OSQP's time."""
+) -> dict[str, Any]:
+    """Planning of the ticks in which vehicles are planned for, and OSQP's time."""
     root = problems[planned[0]][0].solver.root
     rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
     looked_at = planned[:: max(1, len(planned) // RIVALS)]
@@ -355,24 +394,29 @@ def _beside_osqp(
         rival.solve(each)  # warms up
     osqp_ms = []
     for tick in looked_at:
-        began = time.perf_counter_ns()
+        began = time.thread_time_ns()
         for each in problems[tick]:
             rival.solve(each)
-        osqp_ms.append((time.perf_counter_ns() - began) / 1e6)
+        osqp_ms.append((time.thread_time_ns() - began) / 1e6)
     ours_ms = [spent[tick] / 1e3 for tick in looked_at]
-    ours, theirs = np.quantile(ours_ms, (0.5, 0.99)), np.quantile(osqp_ms, (0.5, 0.99))
-    return [
-        f"{np.mean([len(problems[tick]) for tick in looked_at]):.1f}",
-        *(f"{each[0]:.2f}, {each[1]:.2f}" for each in (ours, theirs)),
-        f"{theirs[0] / ours[0]:.1f}, {theirs[1] / ours[1]:.1f}",
-    ]
+    return {
+        "planned": float(np.mean([len(problems[tick]) for tick in looked_at])),
+        "ours_ms": _quantiles(ours_ms),
+        "osqp_ms": _quantiles(osqp_ms),
+    }
+
+
+def _quantiles(numbers: list[float]) -> dict[str, float]:
+    p50, p99 = np.quantile(numbers, (0.5, 0.99)).tolist()
+    return {"p50": p50, "p99": p99}
 
 
 def main() -> int:
     """Measure, and print tables."""
     options = tyro.cli(MotionsOptions, description=__doc__)
     titles = ("one QP", f"swaps of {options.duration:g} s", "planning of a tick by share near")
-    found = [solvers(options), ticks(options), shares(options)]
+    measured = measure(MotionsCounts(duration=options.duration))
+    found = [solvers(options), ticks(options), tables(measured)["motions"]]
     for each, title in zip(found, titles, strict=True):
         each.show(title)
     if options.markdown:
