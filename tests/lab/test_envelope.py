@@ -375,8 +375,8 @@ def _able_whatever_the_delay(
 
 
 def test_no_point_of_the_demo_flies_away() -> None:
-    """Sixty random points, each flown, hovering within the braking curve, or refused."""
-    points = [DEMO.fly(number) for number in range(60)]
+    """Forty random points, each flown, hovering within the braking curve, or refused."""
+    points = [DEMO.fly(number) for number in range(40)]
     assert [DEMO.command(point.number) for point in worst_first(points) if point.line] == []
     outcomes = [point.outcome for point in points]
     assert {"flown", "hovering", "refused"} <= {*outcomes}

@@ -68,7 +68,9 @@ def fault(
 # -- what is flown ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize(
+    "seed", [*range(1, 5), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(5, 9))]
+)
 def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
     """To the last count."""
     outcome = fly(short_trial(seed))

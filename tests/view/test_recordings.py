@@ -1121,7 +1121,7 @@ def test_a_process_that_begins_thousands_of_times_is_checked_once(
     assert checked.count("the scenario of a process") == 1
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(400, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [30, pytest.param(400, marks=pytest.mark.long)])
 def test_mutated_recordings_end_in_a_line_in_little_memory(tmp_path: Path, count: int) -> None:
     """Dozens, and hundreds in the long tests, in a process of its own; by hand there are more."""
     scenario = msgspec.structs.replace(SCENARIO, duration=2.0, settle=0.0)
