@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.client.navigation import sensing
-from skytether.client.simulated.normals import Normals
+from skytether.client.simulated.normals import BLOCK, Normals
 from skytether.client.vehicle import Measurement
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
@@ -38,6 +38,8 @@ class Sensor:
         noisy = [bool(noise) for noise in self.noise]
         self._normals = Normals(rng, (sum(noisy), scenario.model.axes)) if any(noisy) else None
         """Numbers n of a sensor that measures the whole state at every step."""
+        self._without = np.array([self.bias] * BLOCK)
+        """Numbers n of as many steps without noise; shape (BLOCK, 2, axes)."""
         self._states: deque[list[Sequence[float]]] = deque(maxlen=self.delay + 1)
         """Measurements that are not available yet, the oldest first; each of shape (axes, 2)."""
         self._step = 0
@@ -86,7 +88,7 @@ class Sensor:
             the bias, which noise of 0 makes nothing of; shape (n, 2, axes).
         """
         if self._normals is None:
-            return np.array([self.bias] * steps)
+            return self._without[:steps]
         drawn = self._normals.ahead(steps)
         if all(self.noise):
             return drawn

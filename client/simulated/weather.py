@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.client.simulated.normals import Normals
+from skytether.client.simulated.normals import BLOCK, Normals
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
@@ -41,6 +41,7 @@ class Weather:
         self._gust: Array | None = None
         """Way that the gust blows, of any length; shape (axes,). None between gusts."""
         self._still = np.zeros((len(self._tau), 2))
+        self._stills = np.zeros((BLOCK, *self._still.shape))
         self._normals = Normals(rng, self._still.shape)
         self._drawn: Array | None = None
         """Wind drawn for the next step and not used yet, where there are gusts."""
@@ -88,7 +89,7 @@ class Weather:
         if self._gust_mps2 == 0.0:
             if self.white:
                 return self._normals.ahead(steps)
-            return np.broadcast_to(self._still, (steps, *self._still.shape)).copy()
+            return self._stills[:steps]
         if self._drawn is None:
             # What gusts draw lies between the numbers of two steps.
             self._gusts()

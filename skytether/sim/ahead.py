@@ -56,6 +56,9 @@ class AheadClient(Client):
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""
+        if not self._ahead.steps_ahead:
+            super().receive(datagram, now_ns=now_ns)
+            return
         self.catch_up(keeps=True)
         before = self._situation()
         super().receive(datagram, now_ns=now_ns)
@@ -101,6 +104,8 @@ class AheadClient(Client):
         """See `Client`."""
         super()._fly(now_ns)
         session, pilot = self._session, self._ahead
+        if pilot.always_reports:
+            return
         # Keys that are due make the vehicle say HELLO.
         if session.number is not None and not session.link.wants_hello(now_ns + self._span_ns):
             pilot.look_ahead(session.number, session.asked, now_ns=now_ns)

@@ -515,6 +515,11 @@ class CompiledPilot(Pilot):
 
     # -- steps that are flown ahead -----------------------------------------------------------
 
+    @property
+    def always_reports(self) -> bool:
+        """Whether there is an observation of every step, so that none is flown ahead."""
+        return self._reporter.always
+
     def look_ahead(self, session: int, asked: int, *, now_ns: int) -> None:
         """Fly ahead over the steps after the one just flown at which nothing is sent or changed.
 
