@@ -104,7 +104,7 @@ class AheadClient(Client):
         """See `Client`."""
         super()._fly(now_ns)
         session, pilot = self._session, self._ahead
-        if pilot.always_reports:
+        if not pilot.looks_ahead:
             return
         # Keys that are due make the vehicle say HELLO.
         if session.number is not None and not session.link.wants_hello(now_ns + self._span_ns):

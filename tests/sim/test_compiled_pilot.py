@@ -183,8 +183,8 @@ def test_vehicles_are_woken_only_where_something_happens() -> None:
     assert_as_by_pilot(flown, vehicles=16, changes=changes)
 
 
-def test_vehicles_of_a_batch_and_of_a_fleet_are_flown_ahead() -> None:
-    """Records keep the order of time: of several vehicles, of a batch, and on a sealed link."""
+def test_vehicles_of_a_batch_and_of_a_fleet_keep_the_order_of_their_records() -> None:
+    """The order is that of time: of several vehicles, of a batch, and on a sealed link."""
     flown = packaged("target", {"duration": 8.0, "settle": 0.0})
     assert_as_by_pilot(flown, vehicles=3, secure=True)
     batch = fly_batch(flown, [3, 4, 5])
