@@ -51,8 +51,9 @@ class ClientOptions:
     key_id: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the key to use, of a vehicle that has two; the highest unless given."""
     set_parameters: bool = False
-    """Set the autopilot's parameters that decide what it does in silence, where they are not safe;
-    without it, they are told, and nothing is armed."""
+    """Set the autopilot's parameters for the case that set-points stop, where their values are
+    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
+    armed."""
     insecure: bool = False
     """Do without keys even where the server is another machine: anybody on the way can fly the
     vehicle."""

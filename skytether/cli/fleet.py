@@ -53,7 +53,7 @@ class FleetOptions:
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a CSV file with
     the columns vehicle, t, x, y (and z), the format of light shows."""
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Number of vehicles: unless given, 20, or as many as the mission has."""
+    """Number of vehicles; by default 20, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of server processes, which share the vehicles."""
     secure: bool = False

@@ -55,9 +55,9 @@ class FlyOptions:
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
-    """Set those parameters of the autopilot to safe values that decide what it does when
-    set-points stop. Without --set-parameters, unsafe values are only reported, and the vehicle
-    is not armed."""
+    """Set the autopilot's parameters for the case that set-points stop, where their values are
+    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
+    armed."""
     control: Path | None = None
     """Folder for sockets called server, netem and client, through which keys change in flight, see
     `skytether set`; created if necessary. Not in virtual time."""

@@ -76,9 +76,9 @@ class IdentifyOptions:
     repeats: int = 3
     """Number of repetitions on each axis, of four steps: out, back, out to the other side, back."""
     set_parameters: bool = False
-    """Set those parameters of the autopilot to safe values that decide what it does when
-    set-points stop. Without --set-parameters, unsafe values are only reported, and the vehicle
-    is not armed."""
+    """Set the autopilot's parameters for the case that set-points stop, where their values are
+    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
+    armed."""
     out: Path = Path("identified")
     """Folder for the scenario (scenario.toml), the picture (steps.png), the measurements
     (measured.csv) and the results for programs (identified.json)."""
