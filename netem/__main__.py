@@ -75,8 +75,9 @@ def emulate(argv: Sequence[str]) -> None:
         skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --uplink "constant(0.05)"
             --downlink "gamma(0.02, 0.08, 0.03) & loss(0.05) & rate(125000, queue=30000)"
 
-    SIGUSR1 prints the counters so far; they are also printed at the end. With --control, `skytether set`
-    changes directions meanwhile. Without --uplink and --downlink the network is the scenario's.
+    SIGUSR1 prints the counters so far; they are also printed at the end. With --control,
+    `skytether set` changes directions meanwhile. Without --uplink and
+    --downlink the network is the scenario's.
     """
     gc.set_threshold(COLLECT_AFTER)
     options = _with_directions(
