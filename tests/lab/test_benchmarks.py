@@ -21,6 +21,7 @@ from skytether.lab.benchmarks import (
     growth,
     least,
     link,
+    motions,
     netem,
     restarts,
     sockets,
@@ -62,6 +63,7 @@ TINY = MappingProxyType(
             packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1
         ),
         "flood": flood.FloodCounts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
+        "motions": motions.MotionsCounts(fleets=(4,), shares=(0.5,), duration=8.0),
         "restarts": restarts.RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
         "starting": starting.StartingCounts(warm=1, cold=0),
     }

@@ -385,7 +385,7 @@ def fewer() -> Iterator[None]:
     real = contenders.quick
 
     def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
-        return dataclasses.replace(real(scale), search_duration=FLOWN_S, duration=FLOWN_S)
+        return dataclasses.replace(real(scale), duration=FLOWN_S)
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):

@@ -156,7 +156,7 @@ class MotionOsqp:
             )
         else:
             solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
-        found: Array = np.asarray(solver.solve().x)
+        found: Array = np.asarray(solver.solve(raise_error=False).x)
         return found
 
 
@@ -194,7 +194,7 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
             solver.setup(
                 hessian, -problem.linear, rows[:n], problem.least[:n], rows[n:], problem.least[n:]
             )
-            solver.solve()
+            solver.solve(raise_error=False)
             return np.asarray(solver.result.x)
 
         found["PIQP"] = of_piqp
