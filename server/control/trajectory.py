@@ -442,7 +442,7 @@ def _appraise(
             sent = memory.sent[row, number % ROOM]
             if sent.step > known.in_force and sent.due > observed:
                 newest, ends = number, max(ends, sent.ends)
-        # What would be too old by then as well is no reason to send at every step.
+        # Only if the new one would be young enough: otherwise one would be sent at each step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         for axis in range(axes):
             p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
