@@ -91,7 +91,7 @@ def test_a_change_is_made_at_steady_time() -> None:
 
 @pytest.mark.parametrize("jump_ns", [-1, -HOUR_NS, JUMP_NS + 1, HOUR_NS])
 def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
-    """Whatever looks at the clock next, and the wake that is due moves with it."""
+    """Every call that reads the clock notices the jump, and the wake that is due moves with it."""
     for look in ("receive", "wake", "close"):
         probe = Probe(due_ns=MIDNIGHT_NS)
         steady = Steady(probe)

@@ -607,7 +607,7 @@ def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
 
 
 def test_the_terms_of_our_shapes_are_their_names() -> None:
-    """Whatever they give follows from other terms."""
+    """Their other properties follow from other terms."""
     for shape in ("circle", "figure-eight", "square", "target", "live"):
         assert scenario(reference={"shape": shape}).terms().shape == shape
     assert all(entry.is_ours for entry in REFERENCES.values())

@@ -191,7 +191,7 @@ HALF_NS = 2**31 * MICROSECOND
 
 @given(clock, st.integers(-HALF_NS + MICROSECOND, HALF_NS - MICROSECOND))
 def test_a_stamp_is_the_time_nearest_to_what_is_expected(time_ns: int, off_ns: int) -> None:
-    """Whatever the clock shows, as long as what is expected is off by less than 35 minutes."""
+    """At any time, if the expected time is off by less than 35 minutes."""
     assert 0 <= stamp_us(time_ns) < STAMPS
     assert stamped_ns(stamp_us(time_ns), time_ns + off_ns) == time_ns // MICROSECOND * MICROSECOND
 
@@ -200,7 +200,7 @@ def test_a_stamp_is_the_time_nearest_to_what_is_expected(time_ns: int, off_ns: i
 def test_a_stamp_of_long_ago_is_taken_for_one_of_half_an_hour_about_now(
     stamp: int, near_ns: int
 ) -> None:
-    """Whatever is told: it tells the stamp, and no time that is further away."""
+    """The time read has this stamp, and is no more than half an hour from the expected one."""
     time_ns = stamped_ns(stamp, near_ns)
     assert stamp_us(time_ns) == stamp
     assert abs(time_ns - near_ns) <= HALF_NS + MICROSECOND

@@ -61,7 +61,7 @@ def raw_of(sock: socket.socket) -> bytes:
 def test_datagrams_arrive_whole_in_order_and_with_their_senders(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """Whatever their size, from none to the longest that UDP carries."""
+    """Any size arrives, from none to the longest that UDP carries."""
     here, there = ends
     batch, payloads = Batch(FAMILIES[host]), [b"", b"a", bytes(range(256)) * 255, b"z" * 1200]
     for payload in payloads:

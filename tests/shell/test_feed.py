@@ -94,7 +94,7 @@ def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.Data
 @given(st.binary(max_size=200), st.booleans())
 @settings(max_examples=300)
 def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool) -> None:
-    """Whatever is at the other end of a socket, a reader meets nothing else."""
+    """A reader meets nothing else, even if the other end of the socket sends random bytes."""
     head = len(garbage).to_bytes(4, "big") if framed else b""
     try:
         Reader().read(head + garbage)
