@@ -16,8 +16,8 @@ from skytether.shared.wire.protocol import Mode
 States = Sequence[tuple[float, float]]
 """Position [m] and velocity [m/s] of each axis."""
 RETRY_STEPS = 4
-"""Number of steps after which a vehicle that waits for its first horizon reports once more: about a
-round trip. Later it waits as long again as it has waited, so that a long wait costs few packets."""
+"""Number of steps after which a vehicle that waits for its first horizon reports once more. Later
+it waits as long again as it has waited, so that a long wait costs few packets."""
 NEVER = 2**30
 """Number of steps that no flight has."""
 

@@ -517,7 +517,7 @@ class CompiledPilot(Pilot):
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether any steps are flown ahead: on missions, but for reports at every step."""
+        """Whether steps are flown ahead: on missions only, and not if every step is reported."""
         # Where horizons come several times a second most steps flown ahead are thrown away: in
         # batches of `demo` and `target` that took up to a tenth more time than it saved.
         return bool(self._terms.join) and not self._reporter.always
