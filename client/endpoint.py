@@ -209,10 +209,7 @@ class Client(Endpoint):
             self._events.append(FenceHolds(vehicle=self.vehicle))
         if pilot.step >= pilot.steps:
             self._end(now_ns)
-        assert session.number is not None
-        number, echo, said = session.number, session.echo, session.said
-        asks = session.hearing.silence
-        observation = pilot.observation(number, echo, session.asked, said, asks)
+        observation = pilot.observation(session)
         if observation is not None:
             session.send(observation)
 

@@ -18,7 +18,7 @@ from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
 from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
 from skytether.client.reporting import Reporter
-from skytether.client.session import Echo
+from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.model import Array
@@ -310,28 +310,29 @@ class Pilot:
 
     # -- what is told of a step --------------------------------------------------------------
 
-    def observation(
-        self, session: int, echo: Echo, asked: int, number: int, asks: int
-    ) -> Observation | None:
+    def observation(self, session: ServerSession) -> Observation | None:
         """Observation of the step that has just begun; None where none is due, or no state known.
 
         Args:
-            session: number of the session.
-            echo: newest packet of the server.
-            asked: longest silence that the server asks for [half steps]; 0 for none.
-            number: number of packets sent in the session before, modulo NUMBERS.
-            asks: longest silence that is asked of the server [half steps].
+            session: session that it is sent in.
         """
+        assert session.number is not None
         failsafe, compensator = self._failsafe, self.compensator
         states, flown = self._navigation.predicted, self._input.tolist()
         if not self._navigation.is_known or not self._reporter.is_due(
-            session, self.flown, failsafe.mode, states, flown, asked
+            session.number,
+            self.flown,
+            failsafe.mode,
+            states,
+            flown,
+            session.asked,
         ):
             return None
+        echo = session.echo
         backward_ns = echo.received_ns - self.starts_ns(0) - echo.server_ns
         return Observation(
             self._number,
-            session,
+            session.number,
             self.flown,
             compensator.in_force,
             compensator.since,
@@ -341,8 +342,8 @@ class Pilot:
             int(failsafe.takes),
             np.array(states),
             NO_INPUT if self._terms.splines else self._input,
-            number,
-            asks,
+            session.said,
+            session.hearing.silence,
         )
 
     def _record(self) -> None:
