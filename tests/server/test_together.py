@@ -27,8 +27,9 @@ from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.known import PROMPT, Known, Sent
 from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.roster import LONGEST, Roster
 from skytether.server.control.routes import Routes
-from skytether.server.control.together import LONGEST, Together
+from skytether.server.control.together import Together
 from skytether.shared.core.events import ChangeRefused
 from skytether.shared.law.model import Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
@@ -269,21 +270,21 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     loss: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At every plan, though only those are gathered that are others than before."""
-    real, looked_at = Together._gather, list[int]()
+    real, looked_at = Roster.gather, list[int]()
 
-    def gather(self: Together) -> None:
+    def gather(self: Roster) -> None:
         real(self)
         expected = sorted(
-            (row, motion.first - int(self._vehicles.ahead[row]), len(motion.position), known.off_m)
-            for row, known in self._rows.items()
+            (row, motion.first - self.ahead(row), len(motion.position), known.off_m)
+            for row, known in self.known.items()
             for motion in known.motions()
         )
-        count, held = self._flown.count, self._flown.arrays
+        count, held = self.flown.count, self.flown.arrays
         found = zip(held.of, held.first, held.knots, held.wide, strict=True)
         assert sorted(list(found)[:count]) == expected
         looked_at.append(count)
 
-    monkeypatch.setattr(Together, "_gather", gather)
+    monkeypatch.setattr(Roster, "gather", gather)
     flight.fly(scenario(6, loss, duration=20.0), vehicles=6)
     assert len(looked_at) > 10
     assert max(looked_at) > 6
@@ -307,8 +308,8 @@ def alone() -> Together:
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     """It is in force, may still be taken, or is known to be lost."""
-    made, known = alone(), Known()
-    made._rows[0] = known
+    made, known = alone()._roster, Known()
+    made.known[0] = known
     assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
     first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
     known.sent.append(Sent(10, first))
@@ -329,13 +330,13 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     made = alone()
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._rows[0].in_force = Sent(90, resting(100, np.array([4.0, 0.0])))
+    made._roster.known[0].in_force = Sent(90, resting(100, np.array([4.0, 0.0])))
     for step, plans in ((111, False), (71 + LONGEST + 10, True)):
         made.observe(0, observation(step, 90, (4.0, 0.0)))
         made.observe(1, observation(step, 70, (-4.0, 0.0)))
         rows, steps = np.arange(2), np.array([step, step])
         made.plan(rows, steps, None)  # type: ignore[arg-type]
-        assert (made._rows[0].next is not None) == plans
+        assert (made._roster.known[0].next is not None) == plans
 
 
 def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:

@@ -1,0 +1,293 @@
+"""Motions that each vehicle of a mission may fly, as far as the server knows.
+
+Kept up by the observations, which acknowledge motions, and by what is sent; `together` plans by
+it. The steps of all vehicles are brought onto one grid here, so that motions can be compared.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from skytether.server.control.apart import FlownMotions
+from skytether.server.control.known import Known, Sent, repeats_after
+from skytether.shared.base.kernel import B1, I1, making_kernel
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import NO_HORIZON, Observation
+
+LONGEST = (INTERVALS + JOIN_MAX) * SPACING
+"""Steps that a motion takes at most."""
+DECIDES, REPEATS = 1, 2
+"""Bits: it is a vehicle's turn to be decided on; it is sent a motion once more."""
+
+
+class VehicleRows(NamedTuple):
+    """Numbers of all rows; each of shape (capacity,)."""
+
+    ahead: I1
+    """Steps by which the vehicle is ahead of one on no grid of its own."""
+    met: B1
+    """Whether that is known."""
+    heard: B1
+    """Whether an observation has come in this session."""
+    number: I1
+    """Number of the vehicle that was observed last."""
+    observed_step: I1
+    """Step of its newest observation; -1 before any."""
+    unknown_until: I1
+    """Step from which on a motion is over that another server has sent."""
+    sent_step: I1
+    """Step of the motion that was sent last and is not acknowledged."""
+    repeats_for: I1
+    """Steps after that up to which it is sent once more, see `Known.repeats`."""
+
+    @classmethod
+    def of(cls, capacity: int) -> Self:
+        """Numbers of rows of which nothing is known."""
+        ahead, number, sent_step, repeats_for = np.zeros((4, capacity), dtype=np.int64)
+        met, heard = np.zeros((2, capacity), dtype=np.bool_)
+        observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
+        return cls(ahead, met, heard, number, observed_step, unknown_until, sent_step, repeats_for)
+
+
+class Roster:
+    """What is known of the vehicles of a mission.
+
+    Args:
+        scenario: what is asked for, as `mission` says it.
+        terms: the rule of flight.
+        capacity: number of vehicles there can be.
+        block: number of vehicles that are decided on at a time.
+        references: where each vehicle wants to be, by its number.
+        number_of: number of the vehicle in a row.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        terms: Terms,
+        capacity: int,
+        block: int,
+        references: Callable[[int], Reference],
+        number_of: Callable[[int], int],
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.left: list[tuple[int, float]] = []
+        """Vehicles that have left their tube since this was emptied, and how far outside they were
+        [m]."""
+        self.state = np.zeros((capacity, terms.axes, 2))
+        """States that were observed last; shape (capacity, axes, 2)."""
+        self.known: dict[int, Known] = {}
+        """Motions of the vehicles, and what is decided on them, by row."""
+        self.number_of = number_of
+        """Number of the vehicle in a row."""
+        self._references = references
+        goals = scenario.make_reference()
+        self.absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
+        """Numbers of vehicles on the mission that were not yet at rest where it begins."""
+        self._tube_m, self._dt_s, self._join = scenario.mission.tube_m, terms.dt_s, terms.join
+        self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
+        """Time constant and deceleration with which it comes to rest without a motion [s, m/s²]."""
+        self.now = 0
+        """Step of a vehicle on no grid of its own."""
+        self.rows = VehicleRows.of(capacity)
+        """Numbers of all rows."""
+        self.observed_step: Indices = self.rows.observed_step
+        """Step of the newest observation; shape (capacity,)."""
+        self.looks, self._found, self._places = np.zeros((3, block), dtype=np.int64)
+        """Scratch of `meet`: what is to be done for each vehicle, DECIDES and REPEATS; steps by
+        which it is ahead; and the step of each that is known to be on the grid."""
+        scale = np.ones(terms.axes)
+        scale[2:] = scenario.mission.height_scale
+        self.flown = FlownMotions(scale, terms.dt_s)
+        """All motions that may be flown, but for those of rows that changed since `gather`."""
+        self._changed: set[int] = set()
+        """Rows to gather anew: their motions that may be flown have changed, or the distance kept
+        from these, or their place on the grid."""
+        self.decided: set[int] = set()
+        """Rows of the vehicles that have a motion to be sent at their newest step."""
+        self.foreign: int | None = None
+        """Row of a vehicle that may still fly a motion of another server; None of none."""
+
+    def forget(self, row: int) -> None:
+        """Take note that a session is over; motions stay, for the vehicle goes on with them."""
+        self.observed_step[row] = -1
+        self.rows.heard[row] = False
+
+    def ahead(self, row: int) -> int:
+        """Steps by which a vehicle is ahead of one on no grid of its own."""
+        return int(self.rows.ahead[row])
+
+    def sent(self, row: int, step: int, motion: Motion) -> None:
+        """Take note of a motion that is sent with the packet of a step."""
+        known = self.known[row]
+        known.sent.append(Sent(step, motion))
+        self._note(row, known)
+
+    def begins_at(self, number: int) -> Array:
+        """Place where a vehicle begins its mission [m]; shape (axes,)."""
+        place: Array = self._references(number)(np.zeros(()))[:, 0]
+        return place
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Take an observation; False if it is not newer than the last.
+
+        Args:
+            row: of the vehicle.
+            observation: it.
+        """
+        if observation.step <= self.observed_step[row]:
+            return False
+        k = observation.step
+        self.observed_step[row] = k
+        self.state[row] = observation.state
+        known = self.known.setdefault(row, Known())
+        self.rows.number[row] = self.number_of(row)
+        if observation.in_force == NO_HORIZON:
+            # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
+            known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
+            if not observation.takes:
+                known.sent.clear()
+        elif known.in_force is None or known.in_force.step != observation.in_force:
+            found = next((each for each in known.sent if each.step == observation.in_force), None)
+            if found is None:  # of another server, or of a vehicle that was in this row before
+                self.rows.unknown_until[row] = observation.in_force + LONGEST
+                found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
+            known.in_force = found
+        if k <= self.rows.unknown_until[row]:
+            known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
+        newest, motion = known.in_force
+        self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
+        while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
+            gone = known.sent.popleft()
+            self.counts["horizons_lost"] += gone.step > newest
+            known.learn(gone.step == newest and k <= observation.since + 1)
+        self.rows.heard[row] = True
+        self._note(row, known)
+        return True
+
+    def _note(self, row: int, known: Known) -> None:
+        """Mark a row whose motions that may be flown, or be sent again, have changed."""
+        self._changed.add(row)
+        known.again = None
+        self.rows.sent_step[row], self.rows.repeats_for[row] = known.repeats
+
+    def _measure(self, row: int, known: Known, expected: Array) -> None:
+        """Take note of how far a vehicle may be from where its motion has it."""
+        number, state = self.number_of(row), self.state[row]
+        assert known.in_force is not None
+        off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
+        known.speed_mps = float(np.linalg.norm(state[:, 1]))
+        if known.in_force.step < 0:  # it brakes, and rests further on than where it was seen
+            off_m = max(off_m, known.speed_mps * (self._tau_s + known.speed_mps / self._braking))
+        elif off_m <= 0.0:
+            self.absent.discard(number)
+        elif number not in self.absent:
+            self.counts["left_tube"] += 1
+            if not known.off_m:
+                self.left.append((number, off_m))
+        known.off_m = 0.0 if number in self.absent else max(off_m, 0.0)
+
+    def _place(self, row: int, observed: Array) -> Array:
+        """Resting place of a vehicle without a motion: where it begins its mission, or is."""
+        number = self.number_of(row)
+        if number not in self.absent:
+            return observed
+        first = self.begins_at(number)
+        return first if np.linalg.norm(first - observed) < self._tube_m else observed
+
+    def meet(self, rows: Indices, step: Indices) -> None:
+        """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
+        n = len(rows)
+        self.now, moved, foreign = _meet(
+            rows, step, self.now, self.rows, self.looks, self._found, self._places
+        )
+        if moved:
+            self._changed.update(rows[self._found[:n] != 0].tolist())
+        if self.decided:
+            for row in self.decided.intersection(rows.tolist()):
+                self.known[row].next = None
+                self._changed.add(row)
+                self.decided.remove(row)
+        self.foreign = None if foreign < 0 else foreign
+
+    def gather(self) -> None:
+        """Bring all motions that may be flown side by side, those that are others since then."""
+        for row in self._changed & self.known.keys():
+            each = self.known[row]
+            # All that may be flown, also those whose acknowledgement is still under way.
+            self.flown.replace(row, each.motions(), self.ahead(row), each.off_m)
+        self._changed.clear()
+
+    def goal(self, row: int) -> Array:
+        """Goal of a vehicle at the present step [m]; shape (axes,)."""
+        k = self.now + self.ahead(row)
+        wanted = self._references(self.number_of(row))(np.array(k * self._dt_s))
+        return np.ascontiguousarray(wanted[:, 0])  # kernels reckon with that
+
+    def rests(self, row: int) -> list[Array]:
+        """Resting places of all vehicles but one [m]."""
+        found = []
+        for other, each in self.known.items():
+            motions, now = each.motions(), self.now + self.rows.ahead[other]
+            if other != row and motions and all(motion.last <= now for motion in motions):
+                found.append(motions[0].position[-1])
+        return found
+
+
+@making_kernel
+def _meet(
+    rows: I1,
+    step: I1,
+    now: int,
+    vehicles: VehicleRows,
+    looks: I1,
+    found: I1,
+    places: I1,
+) -> tuple[int, int, int]:
+    """Bring vehicles onto one grid, and find what is to be done for each.
+
+    Args:
+        rows, step: the vehicles, and the step of each; shape (n,).
+        now: step on the grid before, of a vehicle on no grid of its own.
+        vehicles: numbers of all rows.
+        looks: output: DECIDES, REPEATS, both or 0; shape (n,) at least.
+        found: output: change of the place on the grid [steps]; shape (n,) at least.
+        places: scratch; shape (n,) at least.
+
+    Returns:
+        the step on the grid now, the number of vehicles whose place on it has changed, and the row
+        of a vehicle that may still fly a motion of another server, or -1.
+    """
+    known, moved, foreign = 0, 0, -1
+    for i in range(len(rows)):
+        row = rows[i]
+        if vehicles.met[row]:
+            places[known] = step[i] - vehicles.ahead[row]
+            known += 1
+    # The median, for one vehicle that begins anew must not move the grid of all others.
+    now = np.sort(places[:known])[known // 2] if known else now + 1
+    for i in range(len(rows)):
+        row = rows[i]
+        found[i] = step[i] - now - vehicles.ahead[row]
+        moved += found[i] != 0
+        vehicles.ahead[row], vehicles.met[row] = step[i] - now, True
+        looks[i] = 0
+        if vehicles.heard[row] and (step[i] - vehicles.number[row]) % SPACING == 0:
+            looks[i] |= DECIDES
+        if repeats_after(step[i] - vehicles.sent_step[row], vehicles.repeats_for[row]):
+            looks[i] |= REPEATS
+    for row in range(len(vehicles.heard)):
+        if (
+            foreign < 0
+            and vehicles.heard[row]
+            and vehicles.observed_step[row] <= vehicles.unknown_until[row]
+        ):
+            foreign = row
+    return now, moved, foreign
