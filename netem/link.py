@@ -197,8 +197,12 @@ class Link:
         for waiting in before.drain() if before else ():
             self._wait(waiting.item, now_ns)
 
-    def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> None:
-        """Take a packet that enters, addressed to where it is to come out."""
+    def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> bool:
+        """Take a packet that enters, addressed to where it is to come out.
+
+        Returns:
+            whether something may be due because of it: most packets are delayed.
+        """
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
         # Packets of one slot have a rank, for else they would all meet one fate.
@@ -210,11 +214,13 @@ class Link:
         counts.bytes += size
         if size > self._mtu:
             counts.oversized += 1
-        elif self._bottleneck is None:
+            return False
+        if self._bottleneck is None:
             self._delay(datagram, lane, number, fate, now_ns, now_ns)
-        else:
-            self._pass(now_ns)
-            self._wait(Entered(datagram, lane, number, fate, now_ns), now_ns)
+            return fate.delay_ns <= 0
+        self._pass(now_ns)
+        self._wait(Entered(datagram, lane, number, fate, now_ns), now_ns)
+        return True
 
     def _wait(self, entered: Entered, now_ns: int) -> None:
         """Put a packet into the bottleneck, or delay it at once where there is none."""

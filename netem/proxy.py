@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
 from skytether.shared.core.events import Fault, FlowOpened
 from skytether.shared.scenario.catalogue import keys_of
@@ -55,6 +55,7 @@ class Proxy(Endpoint):
     """
 
     changeable = keys_of(InFlight.IMPAIRMENT)
+    patience_ns = MILLISECOND_NS // 2
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class Proxy(Endpoint):
                 self.refused += 1
                 return
             onward = make_datagram((payload, self._server, flow.socket))
-            self.downlink.take(onward, flow.downlink, now_ns=now_ns)
+            may_leave = self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
             # A flow's socket is open to anybody, and only the server may answer through it.
@@ -102,7 +103,7 @@ class Proxy(Endpoint):
                 self.refused += 1
                 return
             onward = make_datagram((payload, flow.client, 0))
-            self.uplink.take(onward, flow.uplink, now_ns=now_ns)
+            may_leave = self.uplink.take(onward, flow.uplink, now_ns=now_ns)
             # Its place is earned by the server's answer, for a sender's address can be made up.
             if flow.order is self._unanswered:
                 flow.order = self._answered
@@ -114,7 +115,7 @@ class Proxy(Endpoint):
         # a flood of new clients.
         flow.order.move_to_end(flow.client)
         # What is not delayed leaves now, and not a wake later.
-        if self.uplink.is_due(now_ns) or self.downlink.is_due(now_ns):
+        if may_leave:
             self._forward(now_ns)
 
     def _tell_faults(self, flow: Flow) -> None:

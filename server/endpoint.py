@@ -81,6 +81,7 @@ class Server(Endpoint):
         if scenario.is_mission:
             self.changeable |= ZONES | GOALS
         terms = scenario.terms()
+        self.patience_ns = terms.dt_ns // 4
         own = scenario.is_mission or scenario.reference.shape == "target"
         if references is None and own:
             references = lru_cache(room)(scenario.make_reference)

@@ -36,7 +36,7 @@ class Steady(Endpoint):
     def __init__(self, inner: Endpoint) -> None:
         super().__init__()
         self._inner = inner
-        self.changeable = inner.changeable
+        self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
         self._seen_ns: int | None = None
         """Time that the clock showed last."""
         self._jumps_ns = 0

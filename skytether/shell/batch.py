@@ -1,8 +1,10 @@
 """Batches of datagrams: one system call receives or sends many of them, on Linux.
 
 `recvmmsg` and `sendmmsg` take an array of message headers, which this module lays out once in
-memory that stays where it is. A third way, UDP segmentation offload, sends datagrams of one size to
-one peer as a single long one, which the kernel cuts up as late as it can.
+memory that stays where it is. With each datagram `recvmmsg` can hand over the time at which the
+kernel has received it, so one that is read late is not taken for one that came late. A third way,
+UDP segmentation offload, sends datagrams of one size to one peer as a single long one, which the
+kernel cuts up as late as it can.
 
 None of them says which datagram failed and why. Where one does not do all of its work, the caller
 repeats the first datagram that is left by the plain call of its socket, which raises the error that
@@ -16,9 +18,13 @@ import mmap
 import socket
 import struct
 import sys
+import time
+from array import array
 from collections.abc import Sequence
 from operator import ne
 from typing import Any
+
+from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 """Most datagrams in one call."""
@@ -42,8 +48,13 @@ address and size of control data, flags, size of what was received or sent."""
 _BUFFER = struct.Struct("@QQ")
 """Layout of `struct iovec`: address of a buffer and its size."""
 _MSG_DONTWAIT = 0x40
+_SO_TIMESTAMPNS = 35
+_STAMP = struct.Struct("@Qiiqq")
+"""Layout of the control data with a time: size, level and type, seconds and nanoseconds."""
 _IPV4, _IPV6 = struct.Struct("=HH4s8x"), struct.Struct("=HHI16sI")
 """Layouts of `struct sockaddr_in` and `sockaddr_in6`; ports are in network order."""
+_WHOLE = memoryview(array("Q", [_STAMP.size] * BATCH_MAX))
+"""Room for control data, for each datagram [B]."""
 
 RawAddress = bytes
 """Address of a peer in the kernel's own form, `struct sockaddr_in` or `sockaddr_in6`."""
@@ -97,17 +108,27 @@ class _Headers:
         self.room = memoryview(room)
         self.names = bytearray(name_bytes * BATCH_MAX)
         buffers, headers = bytearray(_BUFFER.size * BATCH_MAX), bytearray(_HEADER.size * BATCH_MAX)
-        at, names_at, buffers_at = (_address(each) for each in (room, self.names, buffers))
+        stamps = bytearray(_STAMP.size * BATCH_MAX)
+        parts = room, self.names, buffers, stamps
+        at, names_at, buffers_at, stamps_at = (_address(each) for each in parts)
         for i in range(BATCH_MAX):
             _BUFFER.pack_into(buffers, i * _BUFFER.size, at + i * stride, size)
             name, buffer = names_at + i * name_bytes, buffers_at + i * _BUFFER.size
-            _HEADER.pack_into(headers, i * _HEADER.size, name, name_bytes, buffer, 1, 0, 0, 0, 0)
+            stamp = stamps_at + i * _STAMP.size
+            row = name, name_bytes, buffer, 1, stamp, 0, 0, 0
+            _HEADER.pack_into(headers, i * _HEADER.size, *row)
         self.first = ctypes.c_void_p(_address(headers))
         """Address of the array."""
         self.sizes = memoryview(buffers).cast("Q")[1::2]
         """Sizes of the buffers [B]; shape (BATCH_MAX,)."""
         self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
         """Sizes of what was received [B]; shape (BATCH_MAX,)."""
+        self.stamp_sizes = memoryview(headers).cast("Q")[5 :: _HEADER.size // 8]
+        """Sizes of the control data, which the kernel shortens to what there is [B]."""
+        words = memoryview(stamps).cast("q")
+        self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
+        """Times of arrival of the clock that tells the time of day: seconds, and nanoseconds beyond
+        them; each of shape (BATCH_MAX,)."""
 
 
 def _address(room: bytearray | mmap.mmap) -> int:
@@ -139,25 +160,37 @@ class Batch:
         self._in = _Headers(_STRIDE, 65_536, self._name_bytes)
         self._out = _Headers(SIZE_MAX, 0, self._name_bytes)
 
-    def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress]]:
+    @staticmethod
+    def stamp(sock: socket.socket) -> None:
+        """Let the kernel note when datagrams come to a socket, from the next one on."""
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+    def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress], list[int]]:
         """Payloads and senders of the datagrams that have arrived, at most BATCH_MAX.
 
         Args:
-            sock: socket of this family.
+            sock: socket of this family, see `stamp`.
 
         Returns:
-            payloads and senders in the order of arrival; none where nothing came, or an error.
+            payloads, senders, and how long ago each has arrived [ns; by the clock that tells the
+            time of day, which may be set meanwhile; 0 where nobody knows], in the order of arrival;
+            none where nothing came, or an error.
         """
         rows, size = self._in, self._name_bytes
+        rows.stamp_sizes[:] = _WHOLE
         count = self._receive(sock.fileno(), rows.first, BATCH_MAX, _MSG_DONTWAIT, None)
+        now_ns = time.time_ns()
         if count <= 0:
-            return [], []
+            return [], [], []
         room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
         lengths = rows.done[:count].tolist()
         payloads = [
             room[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
         ]
-        return payloads, [names[at : at + size] for at in range(0, ends, size)]
+        columns = rows.stamp_sizes, rows.stamps_s, rows.stamps_ns
+        times = zip(*(column[:count].tolist() for column in columns), strict=True)
+        ago_ns = [now_ns - SECOND_NS * s - ns if stamp else 0 for stamp, s, ns in times]
+        return payloads, [names[at : at + size] for at in range(0, ends, size)], ago_ns
 
     def send(
         self, sock: socket.socket, payloads: Sequence[bytes], peers: Sequence[RawAddress]

@@ -151,6 +151,7 @@ def test_all_else_is_the_endpoints_own() -> None:
     steady.tell(Degraded(degraded=True))
     assert steady.events() == (Degraded(degraded=True),)
     assert steady.changeable == server.changeable
+    assert steady.patience_ns == server.patience_ns > 0
     probe = Probe()
     steady = Steady(probe)
     hear(steady, [1])

@@ -3,8 +3,10 @@
 import asyncio
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 
@@ -66,10 +68,33 @@ def test_datagrams_arrive_whole_in_order_and_with_their_senders(
     batch, payloads = Batch(FAMILIES[host]), [b"", b"a", bytes(range(256)) * 255, b"z" * 1200]
     for payload in payloads:
         there.sendto(payload, here.getsockname())
-    came, raws = batch.receive(here)
+    came, raws, ago_ns = batch.receive(here)
     assert came == payloads
+    assert ago_ns == [0] * len(payloads)  # nobody has asked for stamps
     assert [unpack_address(raw) for raw in raws] == [there.getsockname()] * len(payloads)
-    assert batch.receive(here) == ([], [])
+    assert batch.receive(here) == ([], [], [])
+
+
+def test_the_kernel_tells_how_long_ago_each_came(
+    host: str, ends: tuple[socket.socket, socket.socket]
+) -> None:
+    """However late they are read; sizes of one call are not those of the next."""
+    here, there = ends
+    batch = Batch(FAMILIES[host])
+    Batch.stamp(here)
+    for _ in range(2):
+        sent_ns = []
+        for payload in (b"a", b"b", b"c"):
+            there.sendto(payload, here.getsockname())
+            sent_ns.append(time.monotonic_ns())
+            time.sleep(0.01)
+        _, _, ago_ns = batch.receive(here)
+        now_ns = time.monotonic_ns()
+        assert len(ago_ns) == 3
+        # Each was there before the next was sent, 10 ms or more later.
+        for ago, later_ns in zip(ago_ns, sent_ns[1:], strict=False):
+            assert now_ns - ago < later_ns
+        assert sorted(ago_ns, reverse=True) == ago_ns
 
 
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
@@ -346,28 +371,122 @@ def test_a_fault_in_the_middle_of_a_batch_costs_no_other_datagram() -> None:
         assert [type(event) for event in events] == [Fault, Fault]
 
 
-def test_a_crowded_socket_is_read_in_batches_and_a_quiet_one_is_not() -> None:
-    """One datagram takes less time by the plain call."""
-    with open_socket(("127.0.0.1", 0)) as sock:
-        seen: list[bool] = []
-        endpoint = Answering(31, lambda _: [])
-        shells: list[Shell] = []
+class Crowd:
+    """Datagrams sent to a driven endpoint, and how its sockets are read."""
 
-        class Watched(Shell):
-            def _hear(self, number: int) -> None:
-                seen.append(number in self._crowded)
-                super()._hear(number)
+    def __init__(self, endpoint: Answering, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.endpoint = endpoint
+        self.read: list[int] = []
+        """Number of datagrams that each call for a batch has read."""
+        real = Batch.receive
+
+        def receive(batch: Batch, sock: socket.socket) -> Any:
+            found = real(batch, sock)
+            self.read.append(len(found[0]))
+            return found
+
+        monkeypatch.setattr(Batch, "receive", receive)
+
+    def send(self, counts: Sequence[int]) -> None:
+        """Send so many datagrams at once, one time after the other, and end once all are heard."""
 
         async def fly() -> None:
-            shells.append(Watched(endpoint, ("127.0.0.1", 0)))
-            task = asyncio.get_running_loop().create_task(shells[0].run())
+            shell = Shell(self.endpoint, ("127.0.0.1", 0))
+            task = asyncio.get_running_loop().create_task(shell.run())
             await asyncio.sleep(0)
-            for count in (1, 10, 10, 1, 9):
-                for _ in range(count):
-                    sock.sendto(b"x", shells[0].address)
-                await asyncio.sleep(0.01)
+            with open_socket(("127.0.0.1", 0)) as sock:
+                heard = 0
+                for count in counts:
+                    for _ in range(count):
+                        sock.sendto(b"x", shell.address)
+                    heard += count
+                    while len(self.endpoint.heard) < heard:
+                        await asyncio.sleep(0.001)
             await asyncio.wait_for(task, 5.0)
 
         with asyncio.Runner(loop_factory=new_event_loop) as runner:
             runner.run(fly())
-        assert seen == [False, False, True, True, False]
+
+
+def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By an endpoint that is patient; the time at which each came is told all the same."""
+    crowd = Crowd(Answering(31, lambda _: []), monkeypatch)
+    crowd.endpoint.patience_ns = 20_000_000
+    crowd.send((1, 10, 10, 10))
+    assert sum(crowd.read) == 20  # the first ten made it crowded
+    assert max(crowd.read) > 1
+    stamps_ns = crowd.endpoint.stamps_ns
+    assert sorted(stamps_ns) == stamps_ns
+    assert stamps_ns[-1] - stamps_ns[0] < 5e9
+
+
+@pytest.mark.parametrize("set_s", [-3600, 3600])
+def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
+    set_s: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel's stamps are of the time of day, which may be set between arrival and reading."""
+    crowd = Crowd(Answering(40, lambda _: []), monkeypatch)
+    crowd.endpoint.patience_ns = 5_000_000
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + set_s * 10**9)
+    began_ns = time.monotonic_ns()
+    crowd.send((10, 10, 10, 10))
+    stamps_ns = crowd.endpoint.stamps_ns
+    assert sorted(stamps_ns) == stamps_ns
+    assert began_ns <= stamps_ns[0]
+    assert stamps_ns[-1] <= time.monotonic_ns()
+
+
+def test_an_endpoint_without_patience_hears_each_as_it_comes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many there are."""
+    crowd = Crowd(Answering(60, lambda _: []), monkeypatch)
+    crowd.send((30, 30))
+    assert crowd.read == []
+
+
+def test_a_crowd_that_has_gone_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a slice in which few came each is read as it comes again."""
+    crowd = Crowd(Answering(24, lambda _: []), monkeypatch)
+    crowd.endpoint.patience_ns = 1_000_000
+    real, listened = Shell._listen, list[int]()
+
+    def listen(shell: Shell, number: int) -> None:
+        listened.append(number)
+        real(shell, number)
+
+    monkeypatch.setattr(Shell, "_listen", listen)
+
+    crowd.send((20, 1, 1, 1, 1))
+    assert listened[:2] == [0, 0]  # at the start, and once the crowd was gone
+
+
+def test_what_came_before_a_wake_is_heard_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the slice is not over: what is planned knows all that has come."""
+
+    class Ticking(Answering):
+        """An endpoint that is woken 20 ms after it was crowded, and is patient for long."""
+
+        patience_ns = 10_000_000_000
+        due_ns: int | None = None
+        knew = 0
+
+        def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+            super().receive(datagram, now_ns=now_ns)
+            if len(self.heard) == 10:
+                self.due_ns = now_ns + 20_000_000
+
+        def wake(self, *, now_ns: int) -> None:
+            self.knew, self.due_ns = len(self.heard), None
+            assert all(stamp_ns <= now_ns for stamp_ns in self.stamps_ns)
+
+        def next_wake_ns(self) -> int | None:
+            return self.due_ns
+
+    endpoint = Ticking(13, lambda _: [])
+    crowd = Crowd(endpoint, monkeypatch)
+    crowd.send((10, 3))
+    assert endpoint.knew == 13

@@ -1,8 +1,8 @@
 """Cost of the shell to receive an observation and send a horizon, by number of vehicles.
 
 Two shells drive the same endpoint in one process, by turns in an order drawn anew each time. One
-makes a system call for each datagram, the other reads and sends datagrams in batches where several
-wait (`shell.batch`). In a turn so many sockets send one datagram each; the CPU time counts from
+makes a system call for each datagram, the other reads and sends datagrams in batches where many
+come (`shell.batch`). In a turn so many sockets send one datagram each; the CPU time counts from
 then until the last of them is answered, with all that the event loop does for it. The vehicles'
 own calls do not count.
 """
@@ -25,6 +25,7 @@ from skytether.lab.benchmarks.harness import (
     us,
     without_gc,
 )
+from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shell.batch import Batch
 from skytether.shell.driver import Shell, new_event_loop
@@ -52,6 +53,8 @@ FULL, QUICK = SocketCounts(), SocketCounts(datagrams=500, turns=5)
 
 class Answering(Endpoint):
     """Endpoint that answers every datagram."""
+
+    patience_ns = MILLISECOND_NS
 
     def __init__(self) -> None:
         super().__init__()
