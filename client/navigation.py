@@ -191,7 +191,7 @@ class Leaps:
         """Newest velocity [m/s] of each axis, and its stamp."""
 
     def leaps(self, measured: Measurement) -> bool:
-        """Whether a measurement is too far from the last one for any vehicle, and remember it."""
+        """Remember a measurement; whether no vehicle can have come so far since the last one."""
         stamp_ns, position, velocity = measured
         before, found = self._velocity, False
         if velocity is not None:

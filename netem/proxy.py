@@ -80,7 +80,7 @@ class Proxy(Endpoint):
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self._faults: set[str] = set()
-        """Mistakes of plug-ins that were told."""
+        """Tracebacks of mistakes in plug-ins that were reported."""
         self.refused = 0
         """Packets of clients for which there is no flow, and of strangers at a flow's socket."""
 

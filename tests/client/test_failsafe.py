@@ -744,7 +744,7 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
 
 
 def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
-    """Drawn by `lab.states`, which says how to draw it anew."""
+    """`lab.states` draws the diagram of modes, and says how to draw it anew."""
     assert DIAGRAM.read_text() == svg()
 
 

@@ -231,7 +231,7 @@ def test_every_packet_is_measured_as_it_was() -> None:
 
 
 def test_a_clock_that_drifts_is_found_out() -> None:
-    """Offset and drift of the other end, within what is said of the doubt."""
+    """Offset and drift of the other end's clock are found within the stated uncertainty."""
     measured, _ = measure("gamma(0.05, 0.06, 0.005)", "gamma(0.05, 0.06, 0.005)", seconds=300.0)
     told = outcome(measured, "x", secure=False).told
     assert told.drift_doubt_ppm < 5.0

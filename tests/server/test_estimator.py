@@ -246,7 +246,7 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
 def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:
-    """Each with its own row, steps, gaps and age, to the last bit."""
+    """Estimates of vehicles with different steps, gaps and ages equal those made one by one."""
     rng = np.random.default_rng(seed)
     rows = rng.permutation(8)[:vehicles]
     together = make(8, compensate=compensate)
