@@ -8,7 +8,7 @@ import pytest
 from helpers import packaged
 from skytether.client.compensator import Compensator
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.committed import Replay
+from skytether.server.control.committed import LEARNED, Replay
 from skytether.server.control.planner import Planner
 from skytether.server.control.scheme import Foresight, foresight
 from skytether.shared.law import rule
@@ -133,6 +133,34 @@ def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
     np.testing.assert_allclose(seen.estimate[0], x, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(seen.committed[0, :, 0], np.float32(old[:, 6]))
     np.testing.assert_array_equal(seen.committed[0, :, 1], np.float32(new[:, 4]))
+
+
+@pytest.mark.parametrize("under_way", [0, 1, 2, 3, 6])
+def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int) -> None:
+    """By how likely it is that these are lost and no more; the last stands for all the others."""
+    loss, given = 0.2, plans(3, *[BOUND + H] * (under_way + 1))
+
+    def foreseen(count: int) -> Foresight:
+        """What is foreseen where so many of these horizons were sent."""
+        replay = make(small())
+        send(replay, 100, given[0])
+        see(replay, 103, np.array([[1.0, 0.2], [-1.0, 0.1]]), 100)
+        for number, inputs in enumerate(given[1 : count + 1]):
+            send(replay, 103 + number, inputs)
+        replay._memory.seen["loss"] = loss / (1.0 - LEARNED)  # one has come since
+        found = foresight(1, 2, H, MOST, doubts=3)
+        replay.foresee(ROW, np.array([110]), found)
+        return found
+
+    found, cases = foreseen(under_way), 3
+    expected = [loss ** (j + 1) * (1.0 - loss) for j in range(min(under_way, cases))]
+    if expected:
+        expected[-1] = loss ** len(expected)
+    assert found.doubt[0].tolist() == pytest.approx(expected + [0.0] * (cases - len(expected)))
+    for j in range(len(expected)):
+        without = foreseen(under_way - j - 1)
+        np.testing.assert_array_equal(found.doubted[0, j], without.held[0])
+        np.testing.assert_array_equal(found.doubted_start[0, j], without.start[0])
 
 
 def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:

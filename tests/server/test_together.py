@@ -325,15 +325,41 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     assert not made.observe(0, observation(30, 10, (4.0, 0.0)))
 
 
+@pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
+def test_a_motion_is_too_near_below_the_distance_and_what_pieces_bend(
+    beyond_m: float, is_hit: bool
+) -> None:
+    """D = separation_m + 2 tube_m, and twice what a motion may be off its straight pieces.
+
+    From one that was outside its tube the distance is as much larger.
+    """
+    made, flown = alone(), scenario(2)
+    for row, x in ((0, 4.0), (1, -4.0)):
+        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
+    made._roster.meet(np.arange(2), np.array([100, 100]))
+    made._roster.known[1].off_m = 0.1
+    made._roster.gather()
+    mission, dt_s = flown.mission, flown.terms().dt_s
+    bend_m = apart.bend_m(np.sqrt(2.0) * mission.acceleration_mps2, dt_s)
+    keep_m = mission.separation_m + 2.0 * mission.tube_m + 2.0 * bend_m + 0.1
+    near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
+    assert made._hit(0, near, 100).tolist() == [False, is_hit, False]
+
+
 def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     """Until that motion is over, however long it may be."""
     made = alone()
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
     made._roster.known[0].in_force = Sent(90, resting(100, np.array([4.0, 0.0])))
-    for step, plans in ((111, False), (71 + LONGEST + 10, True)):
+    over = 70 + LONGEST  # the last step of the longest motion
+    for step, seen, plans in (
+        (111, 111, False),
+        (over + 1, over, False),
+        (over + 11, over + 1, True),
+    ):
         made.observe(0, observation(step, 90, (4.0, 0.0)))
-        made.observe(1, observation(step, 70, (-4.0, 0.0)))
+        made.observe(1, observation(seen, 70, (-4.0, 0.0)))
         rows, steps = np.arange(2), np.array([step, step])
         made.plan(rows, steps, None)  # type: ignore[arg-type]
         assert (made._roster.known[0].next is not None) == plans
