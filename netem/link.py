@@ -349,7 +349,7 @@ class Link:
         return due_ns
 
     def depth(self) -> int:
-        """Number of packets under way."""
+        """Number of packets under way, but for the one that a finite rate is serving."""
         waiting = self._bottleneck.waiting if self._bottleneck else 0
         return self._queue.size + waiting
 

@@ -153,6 +153,20 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
     assert (link.counts.lost, link.counts.queueing.largest_ns) == (3, 30 * MILLISECOND_NS)
 
 
+def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
+    """Both count, packets and bytes, but for the packet that is served; what waits has its header."""
+    direction = DirectionConfig(impairments="constant(0.1) & rate(12800)")
+    link = Link(UPLINK, 1472, None, direction.path)
+    lane, size = Lane(0, Fates(direction, 1, "uplink", 0), 0), 128 - HEADER_BYTES
+    for _ in range(5):
+        link.take(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)
+    assert (link.depth(), link.depth_bytes()) == (4, 4 * 128)
+    link.give(now_ns=25 * MILLISECOND_NS)  # two have passed, and arrive 0.1 s later
+    assert (link.depth(), link.depth_bytes()) == (4, 2 * size + 2 * 128)
+    link.give(now_ns=115 * MILLISECOND_NS)
+    assert (link.depth(), link.depth_bytes()) == (4, 4 * size)
+
+
 def test_a_rate_that_changes_serves_those_who_wait() -> None:
     """Under the new one; without one they are under way at once."""
     for text, due_ms in (("rate(100000)", 40), ("constant(0)", 20)):
