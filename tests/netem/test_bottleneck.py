@@ -154,7 +154,7 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
 
 
 def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
-    """Both count, packets and bytes, but for the packet that is served; what waits has its header."""
+    """Both count, but for the packet that is served; what waits counts with its header."""
     direction = DirectionConfig(impairments="constant(0.1) & rate(12800)")
     link = Link(UPLINK, 1472, None, direction.path)
     lane, size = Lane(0, Fates(direction, 1, "uplink", 0), 0), 128 - HEADER_BYTES

@@ -439,6 +439,30 @@ def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
     assert stamps_ns[-1] <= time.monotonic_ns()
 
 
+def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The others of the slice are heard, each with its own sender."""
+    with ExitStack() as stack:
+        endpoint = Answering(31, lambda _: [])
+        endpoint.patience_ns = 20_000_000
+        sock, gone = (stack.enter_context(open_socket(("127.0.0.1", 0))) for _ in range(2))
+        unplugged = raw_of(gone)
+        real = Names.heard
+
+        def heard(names: Names, raw: bytes) -> Address:
+            if raw == unplugged:
+                raise OSError("no such interface")
+            return real(names, raw)
+
+        monkeypatch.setattr(Names, "heard", heard)
+        burst = [b"%d" % number for number in range(10)]
+        pieces = [(sock, burst), (sock, burst), (gone, [b"lost"]), (sock, [*burst, b"last"])]
+        converse(endpoint, pieces)
+        assert [each.payload for each in endpoint.heard] == [*burst * 3, b"last"]
+        assert {each.peer for each in endpoint.heard} == {sock.getsockname()}
+
+
 def test_an_endpoint_without_patience_hears_each_as_it_comes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
