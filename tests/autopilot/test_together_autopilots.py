@@ -9,6 +9,7 @@ import sys
 from itertools import combinations
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -19,12 +20,15 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
+from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
+from skytether.shared.telemetry.summary import least_separation
+from skytether.shell.log import LogLine
 from skytether.sim.world import Clock, World
 
 NUMBERS = (1, 2, 3)
@@ -86,7 +90,10 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
 
 @pytest.mark.long
 def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
-    """Each line in a process of its own; clients for 45 s."""
+    """Each line in a process of its own; clients for 45 s, over the emulated network.
+
+    Clients begin at different times, which the times of their steps tell.
+    """
     found = re.findall(r"```sh\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     (block,) = (each for each in found if "skytether autopilot" in each)
     lines = [shlex.split(line)[1:] for line in block.splitlines()]
@@ -96,18 +103,28 @@ def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
     there = [subprocess.Popen([*run, *line], stdout=subprocess.DEVNULL) for line in behind]
     try:
         files = [tmp_path / line[line.index("--id") + 1] for line in flown]
+        asked = ["--duration", "45", "--log", "json", "--record"]
         flying = [
-            subprocess.Popen([*run, *line, "--duration", "45", "--record", str(file)])
+            subprocess.Popen([*run, *line, *asked, str(file)], stdout=subprocess.PIPE)
             for line, file in zip(flown, files, strict=True)
         ]
-        assert [each.wait(120) for each in flying] == [0, 0, 0]
+        said = [each.communicate(timeout=120)[0] for each in flying]
+        assert [each.returncode for each in flying] == [0, 0, 0]
     finally:
         for each in there:
             each.send_signal(signal.SIGTERM)
             each.wait(30)
     told = reading.load("swap-autopilot")
     rows = [record.read(file) for file in files]
-    for number, each in zip(NUMBERS, rows, strict=True):
+    for number, track in zip(NUMBERS, rows, strict=True):
         goal = told.make_reference(number)(np.array(told.duration))[:, 0]
-        assert np.linalg.norm(each["state"][-1, :, 0] - goal) < 1.0
-    assert apart_m([each["state"][:, :, 0] for each in rows]) > told.mission.separation_m
+        assert np.linalg.norm(track["state"][-1, :, 0] - goal) < 1.0
+    began_s = [
+        event.event.figures["by_vehicle"][str(number)]["began_s"]
+        for number, lines in zip(NUMBERS, said, strict=True)
+        for event in map(msgspec.json.Decoder(LogLine).decode, lines.splitlines())
+        if isinstance(event.event, Counted)
+    ]
+    least_m = least_separation(rows, began_s, told.control.dt)
+    assert least_m is not None
+    assert least_m > told.mission.separation_m

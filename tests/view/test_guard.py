@@ -179,6 +179,8 @@ def test_a_message_of_countless_frames_ends_the_connection(page: Page, sent: byt
             sock.sendall(sent)
         until(lambda: counts(page).get(TurnedAway.ROOM))
         until(lambda: not page._guard.connections)
+    # Nor does it keep a browser's place until what it has sent was read at the allowed rate.
+    until(lambda: not page._guard.browsers)
 
 
 def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:

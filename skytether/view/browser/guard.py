@@ -201,6 +201,8 @@ class _Connection(sockets.ServerConnection):
         self._guard = guard
         self._due_s = 0.0
         """Time at which the messages so far would have been sent at RATE_HZ [s]."""
+        self._is_cut = False
+        """Whether it was ended by this guard."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See `asyncio.Protocol`."""
@@ -229,8 +231,12 @@ class _Connection(sockets.ServerConnection):
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
-        """Next message that the page accepts; others are dropped."""
-        while True:
+        """Next message that the page accepts; others are dropped.
+
+        Raises:
+            ConnectionClosed: the connection has ended.
+        """
+        while not self._is_cut:
             pieces = []
             async for piece in self._pieces():
                 pieces.append(piece)
@@ -240,6 +246,9 @@ class _Connection(sockets.ServerConnection):
             if is_taken(message := b"".join(pieces)):
                 return message
             self._guard.count(TurnedAway.MESSAGE)
+        # What is left unread of a flood would take its turns for minutes, and a browser's place.
+        await self.wait_closed()
+        raise self.protocol.close_exc
 
     def _pieces(self) -> AsyncIterator[bytes]:
         return self.recv_streaming(decode=False)
@@ -252,6 +261,7 @@ class _Connection(sockets.ServerConnection):
 
     def _cut(self, why: TurnedAway) -> None:
         self._guard.count(why)
+        self._is_cut = True
         self.transport.abort()
 
 
