@@ -55,7 +55,7 @@ class Proxy(Endpoint):
     """
 
     changeable = keys_of(InFlight.IMPAIRMENT)
-    patience_ns = MILLISECOND_NS // 2
+    patience_ns = MILLISECOND_NS // 4
 
     def __init__(
         self,
