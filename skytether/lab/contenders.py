@@ -35,7 +35,7 @@ SCOUTS = 8
 """Number of flights, on seeds of the search, by which points are chosen for the budgets."""
 EFFORT_ROOM = 1.05
 """Factor by which a chosen point may exceed the effort limit of a case."""
-NEAR = (0.1, 0.3, 0.6, 1, 2, 3, 4, 6, 8, 10)
+NEAR = (0.1, 0.3, 0.6, 1, 2, 3, 4, 6, 8, 10, 20, 40)
 """Factors of a threshold on a figure of the flight, each one point."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
 """Factors of a period of ten steps, each one point."""

@@ -158,7 +158,9 @@ def test_a_curve_goes_through_what_was_found_and_rises() -> None:
     """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
     gap = replace(PAPER, control=replace(PAPER.control, cost_gap=0.8))
     found = thresholds(BY_NAME["committed-gap"], gap)
-    assert list(found) == pytest.approx([0.08, 0.24, 0.48, 0.8, 1.6, 2.4, 3.2, 4.8, 6.4, 8.0])
+    assert list(found) == pytest.approx(
+        [0.08, 0.24, 0.48, 0.8, 1.6, 2.4, 3.2, 4.8, 6.4, 8.0, 16.0, 32.0]
+    )
     assert [value for value, tuned in found.items() if tuned] == [0.8]
     assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [1, 2, 5, 10, 20, 40, 80]
     often = replace(PAPER, control=replace(PAPER.control, period=2))
