@@ -22,6 +22,7 @@ from skytether.server.control.desired import Desired
 from skytether.server.control.moves import Figures
 from skytether.server.control.planner import Planner
 from skytether.server.control.predictive import Estimator
+from skytether.server.control.roster import Roster
 from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
 from skytether.server.control.together import Together
 from skytether.server.control.trajectory import Guidance
@@ -125,7 +126,10 @@ class Controller:
         """Planner that keeps vehicles of a mission apart."""
         if scenario.is_mission and references is not None:
             self._scheme = self.planner = self._together = Together(
-                scenario, terms, room, block, references, self.desired.number
+                scenario,
+                terms,
+                block,
+                Roster(scenario, terms, room, block, references, self.desired.number),
             )
         elif terms.splines:
             self._scheme = self.planner = Guidance(

@@ -24,7 +24,8 @@ from skytether.shared.wire.protocol import NO_HORIZON, Observation
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
 DECIDES, REPEATS = 1, 2
-"""Bits: it is a vehicle's turn to be decided on; it is sent a motion once more."""
+"""Flags in `Roster.looks`: a motion may be planned for the vehicle at this step; its last one is
+sent once more."""
 
 
 class VehicleRows(NamedTuple):
@@ -57,7 +58,7 @@ class VehicleRows(NamedTuple):
 
 
 class Roster:
-    """What is known of the vehicles of a mission.
+    """Vehicles of a mission, the motions that each may fly, and their places on one grid of steps.
 
     Args:
         scenario: what is asked for, as `mission` says it.

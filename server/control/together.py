@@ -25,7 +25,6 @@ zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom
 """
 
 import math
-from collections.abc import Callable
 from functools import partial
 from operator import sub
 from typing import NamedTuple
@@ -46,7 +45,6 @@ from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING, Motion
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, Observation
@@ -87,28 +85,16 @@ class Together:
     Args:
         scenario: what is asked for, as `mission` says it, and the seed of directions.
         terms: the rule of flight.
-        capacity: number of vehicles there can be.
         block: number of vehicles that are decided on at a time.
-        references: where each vehicle wants to be, by its number.
-        number_of: number of the vehicle in a row.
+        roster: vehicles, and the motions that each may fly.
     """
 
     solve_ns = -1
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        terms: Terms,
-        capacity: int,
-        block: int,
-        references: Callable[[int], Reference],
-        number_of: Callable[[int], int],
-    ) -> None:
+    def __init__(self, scenario: Scenario, terms: Terms, block: int, roster: Roster) -> None:
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
-        roster = Roster(scenario, terms, capacity, block, references, number_of)
         self._roster = roster
-        """What is known of the vehicles."""
         self.counts, self.left = roster.counts, roster.left
         self.observed_step = roster.observed_step
         mission = scenario.mission

@@ -90,9 +90,10 @@ class Endpoint(ABC):
     changeable: frozenset[str] = frozenset()
     """Keys of its scenario that may change in flight, see `shared.core.change`."""
     patience_ns = 0
-    """Time for which datagrams may wait where many come, to be received several at once [ns]; each
-    is received with the time at which it came, and before the next wake. Wakes may come so much
-    later then, unless the last was longer ago. 0: nothing waits."""
+    """Longest time that datagrams wait to be received together, on sockets to which many come [ns].
+
+    Each is received with its own time of arrival, and before the next wake. While many come, wakes
+    are at least this far apart. 0: each datagram is received at once."""
 
     def __init__(self) -> None:
         # Both are handed to the parts that an endpoint is made of: they stay the same objects.

@@ -130,7 +130,7 @@ class Shell:
         """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
-        """What comes to each socket of a patient endpoint."""
+        """Counts of arrivals by socket, of an endpoint with `patience_ns`."""
         self._crowded: dict[int, Batch] = {}
         """Sockets that are read in slices of time, and the arrays that read them."""
         self._heard_ns = 0
@@ -291,6 +291,7 @@ class Shell:
         count = len(payloads)
         if not count:
             self._hear(number)  # nothing came, or an error, which the plain call tells apart
+            self._heard_ns = time.monotonic_ns()
             return 0
         self._count(number, count)
         # The clock of the stamps may be set meanwhile, ours may not.
@@ -302,6 +303,7 @@ class Shell:
         except OSError:  # an interface has gone since
             payloads, peers = self._still_here(payloads, raws)
             stamps_ns = [now_ns] * len(payloads)
+            self._heard_ns = now_ns
         datagrams = [
             make_datagram((payload, peer, number))
             for payload, peer in zip(payloads, peers, strict=True)

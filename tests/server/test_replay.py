@@ -141,7 +141,7 @@ def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int)
     loss, given = 0.2, plans(3, *[BOUND + H] * (under_way + 1))
 
     def foreseen(count: int) -> Foresight:
-        """What is foreseen where so many of these horizons were sent."""
+        """Prediction with so many of these horizons under way."""
         replay = make(small())
         send(replay, 100, given[0])
         see(replay, 103, np.array([[1.0, 0.2], [-1.0, 0.1]]), 100)

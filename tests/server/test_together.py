@@ -303,7 +303,8 @@ def alone() -> Together:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
-    return Together(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+    return Together(flown, flown.terms(), 2, roster)
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:

@@ -191,7 +191,7 @@ HALF_NS = 2**31 * MICROSECOND
 
 @given(clock, st.integers(-HALF_NS + MICROSECOND, HALF_NS - MICROSECOND))
 def test_a_stamp_is_the_time_nearest_to_what_is_expected(time_ns: int, off_ns: int) -> None:
-    """At any time, if the expected time is off by less than 35 minutes."""
+    """A stamp of 32 bits gives the full time if the expected time is less than 35 minutes off."""
     assert 0 <= stamp_us(time_ns) < STAMPS
     assert stamped_ns(stamp_us(time_ns), time_ns + off_ns) == time_ns // MICROSECOND * MICROSECOND
 

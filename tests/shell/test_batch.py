@@ -411,7 +411,7 @@ class Crowd:
 def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By an endpoint that is patient; the time at which each came is told all the same."""
+    """Batches read it, and each datagram is still received with its own time of arrival."""
     crowd = Crowd(Answering(31, lambda _: []), monkeypatch)
     crowd.endpoint.patience_ns = 20_000_000
     crowd.send((1, 10, 10, 10))
@@ -442,7 +442,17 @@ def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
 def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The others of the slice are heard, each with its own sender."""
+    """The others of the slice are heard, each with its own sender, and no time goes back.
+
+    Their times are those of reading, and what is read next may have come before.
+    """
+    received = Batch.receive
+
+    def earlier(batch: Batch, sock: socket.socket) -> Any:
+        payloads, raws, ago_ns = received(batch, sock)
+        return payloads, raws, [ago + 50_000_000 for ago in ago_ns]
+
+    monkeypatch.setattr(Batch, "receive", earlier)
     with ExitStack() as stack:
         endpoint = Answering(31, lambda _: [])
         endpoint.patience_ns = 20_000_000
@@ -461,6 +471,7 @@ def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
         converse(endpoint, pieces)
         assert [each.payload for each in endpoint.heard] == [*burst * 3, b"last"]
         assert {each.peer for each in endpoint.heard} == {sock.getsockname()}
+        assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns
 
 
 def test_an_endpoint_without_patience_hears_each_as_it_comes(
@@ -492,7 +503,7 @@ def test_what_came_before_a_wake_is_heard_before_it(monkeypatch: pytest.MonkeyPa
     """Though the slice is not over: what is planned knows all that has come."""
 
     class Ticking(Answering):
-        """An endpoint that is woken 20 ms after it was crowded, and is patient for long."""
+        """Endpoint with a slice far longer than the 20 ms until its wake."""
 
         patience_ns = 10_000_000_000
         due_ns: int | None = None
