@@ -10,9 +10,8 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -158,9 +157,7 @@ def test_a_curve_goes_through_what_was_found_and_rises() -> None:
     """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
     gap = replace(PAPER, control=replace(PAPER.control, cost_gap=0.8))
     found = thresholds(BY_NAME["committed-gap"], gap)
-    assert list(found) == pytest.approx(
-        [0.08, 0.24, 0.48, 0.8, 1.6, 2.4, 3.2, 4.8, 6.4, 8.0, 16.0, 32.0]
-    )
+    assert list(found) == pytest.approx([0.08, 0.24, 0.8, 2.4, 8.0, 24.0, 80.0])
     assert [value for value, tuned in found.items() if tuned] == [0.8]
     assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [1, 2, 5, 10, 20, 40, 80]
     often = replace(PAPER, control=replace(PAPER.control, period=2))
@@ -180,22 +177,36 @@ def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_
         }
 
 
+SPENT = {"rmse_xy": 1.0, "packets_per_s": 50.0, "effort_mps": 0.1}
+
+
+def planned(name: str, every: int = 1, case: str = "gusts") -> Plan:
+    """Plan of one contender in a case, one scouting flight a point."""
+    scale = contenders.ComparisonSize(
+        runs=4, generations=1, scouts=1, contenders=[BY_NAME[name]], every=every
+    )
+    return Plan(BY_CASE[case], COMPARED, scale)
+
+
+def scout(
+    plan: Plan,
+    points: Sequence[FlownContender],
+    flies: Callable[[FlownContender], dict[str, float | None]],
+) -> None:
+    """Let scouting flights end in what `flies` says of a point."""
+    runs = [(replace(SUMMARY, **{**SPENT, **flies(point)}),) for point in points]
+    plan.scouted(points, {(cell, 0): Done(cell, 0, run) for cell, run in enumerate(runs)})
+
+
 def test_within_a_budget_the_nearest_is_chosen() -> None:
     """It spends no more packets than that, nor much more effort than its case allows."""
-    scale = contenders.ComparisonSize(
-        runs=4, generations=1, scouts=1, contenders=[BY_NAME["committed-gap"]], every=3
-    )
-    plan = Plan(BY_CASE["gusts"], COMPARED, scale)
-    spent = {"rmse_xy": 1.0, "packets_per_s": 50.0, "effort_mps": 0.1}
-    done = {
-        (cell, 0): Done(cell, 0, (replace(SUMMARY, **spent),)) for cell in range(len(plan.points))
-    }
 
-    def chosen(*flown: dict[str, Any]) -> list[int | None]:
+    def chosen(*flown: dict[str, float | None]) -> list[int | None]:
         """Number of what is chosen within each budget, where the first points fly like this."""
-        for cell, values in enumerate(flown):
-            done[cell, 0] = Done(cell, 0, (replace(SUMMARY, **{**spent, **values}),))
-        found = plan.choose(done)
+        plan = planned("committed-gap", every=3)
+        all_flown = [*flown, *[{}] * (len(plan.points) - len(flown))]
+        scout(plan, plan.points, lambda point: all_flown[plan.points.index(point)])
+        found = plan.chosen()
         points = (found.get(("committed-gap", budget)) for budget in BUDGETS)
         return [None if point is None else plan.points.index(point) for point in points]
 
@@ -206,6 +217,49 @@ def test_within_a_budget_the_nearest_is_chosen() -> None:
         *(None, 0, 0),
         *(1, 1, 1),
     ]
+
+
+@pytest.mark.parametrize("name", ["committed-gap", "feedback-expected"])
+def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> None:
+    """More packets, less error: what is chosen could send hardly more within its budget.
+
+    Without these rounds a threshold left up to two thirds of its budget unused.
+    """
+    plan = planned(name, case="target")
+    points = list(plan.points)
+    asked = len(points)
+    middle = next(point.threshold for point in plan.points if point.tuned)
+    assert middle
+
+    def flies(point: FlownContender) -> dict[str, float | None]:
+        """Packets as the inverse of the threshold; only one way of reporting costs little."""
+        assert point.threshold
+        share = point.threshold / middle
+        extra = 0.0 if point.report == "every 4 s" else 60.0
+        return {"packets_per_s": extra + 6.0 / share, "rmse_xy": share}
+
+    for number in range(1 + contenders.ROUNDS):
+        if number:
+            points = plan.halfway()
+            asked += len(points)
+        scout(plan, points, flies)
+    for (_, budget), point in plan.chosen().items():
+        used = flies(point)["packets_per_s"]
+        assert used is not None
+        assert 0.9 * budget < used <= budget
+        assert point.keys["control." + point.contender.threshold] == point.threshold
+        assert not point.tuned
+    assert len(plan.chosen()) == len(BUDGETS)
+    assert asked <= len(plan.points) + contenders.ROUNDS * len(BUDGETS)
+
+
+def test_nothing_is_tried_where_it_cannot_be_better() -> None:
+    """Neither beyond what is worse already, nor between thresholds that are close together."""
+    plan = planned("committed-gap")
+    scout(plan, plan.points, lambda point: {"packets_per_s": 6.0 / (point.threshold or 1.0)})
+    assert not plan.halfway()
+    scout(plan, plan.points, lambda _: {"rmse_xy": None})
+    assert not plan.halfway()
 
 
 # -- what is said of it --------------------------------------------------------------------------
@@ -391,7 +445,9 @@ def fewer() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):
-            patch.setattr(contenders, name, getattr(contenders, name)[3:5])
+            factors = getattr(contenders, name)
+            first = factors.index(1)
+            patch.setattr(contenders, name, factors[first : first + 2])
         patch.setattr(contenders, "quick", quick)
         yield
 
@@ -525,7 +581,7 @@ def test_other_weights_are_another_comparison(
     file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
     assert main(["compare", "--quick", "--weights", str(file), "--out", str(out)]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"compare: {out / 'scouts' / 'target'}: grid: got [")
+    assert said.startswith(f"compare: {out / 'scouts' / 'target' / 'round-0'}: grid: got [")
     assert said.endswith("], to go on there; or another --out\n")
 
 

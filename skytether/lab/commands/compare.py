@@ -74,12 +74,8 @@ def compare(argv: Sequence[str]) -> None:
 def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
     """Fly all contenders in all cases, and write the report."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
-    chosen = []
-    with crew(options.pool, "choosing", sum(plan.scouts.flights for plan in plans)) as flyers:
-        for plan in plans:
-            folder = options.out / "scouts" / plan.case.name
-            chosen.append(plan.choose(flyers.flown(plan.scouts, folder, plan.case.title)))
-        runs = flyers.spent.runs
+    runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
+    chosen = [plan.chosen() for plan in plans]
     sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
     results = []
     with crew(options.pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
@@ -94,6 +90,24 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
         report_folder.show(table)
     print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
+
+
+def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
+    """Fly the scouting flights of one round: of all points, and later of those near the budgets.
+
+    Returns:
+        the number of flights flown now.
+    """
+    asked = [plan.halfway() if number else plan.points for plan in plans]
+    if not any(asked):
+        return 0
+    total = sum(plan.scouts(points).flights for plan, points in zip(plans, asked, strict=True))
+    with crew(options.pool, "choosing", total) as flyers:
+        for plan, points in zip(plans, asked, strict=True):
+            if points:
+                folder = options.out / "scouts" / plan.case.name / f"round-{number}"
+                plan.scouted(points, flyers.flown(plan.scouts(points), folder, plan.case.title))
+        return flyers.spent.runs
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
