@@ -469,7 +469,8 @@ def flying(
     values: list[float | None] = [None]
     here = getattr(tuned.control, key) if key else None
     if here is not None:
-        scaled = [here * factor for factor in contender.factors[:: scale.every]]
+        first = contender.factors.index(1) % scale.every
+        scaled = [here * factor for factor in contender.factors[first :: scale.every]]
         if isinstance(here, int):  # steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})

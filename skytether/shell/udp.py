@@ -25,8 +25,9 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
 come through, what a process can read that waits for a core for half a second."""
 
-ADDRESSES_MAX = 8192
-"""Most addresses whose other forms are kept; with more peers they are worked out again."""
+ADDRESSES_MAX = 4096
+"""Most addresses whose other forms are kept, 360 B for each; with more peers they are worked out
+again. A flood of HELLOs from ever new ports fills this memory."""
 
 SPARE_FILES = 48
 """Number of open files that a process may need beside its sockets, with all who look on."""
