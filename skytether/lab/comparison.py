@@ -17,6 +17,7 @@ from skytether.lab.contenders import (
     BUDGETS,
     CONTENDERS,
     EVERY,
+    SOUGHT,
     Case,
     Chosen,
     Contender,
@@ -122,7 +123,7 @@ class ComparedCase:
 
     def curve(self, contender: str) -> list[ContenderRuns]:
         """Choices of a contender with rising budget; each point once."""
-        points = (self.bought.get((contender, budget)) for budget in BUDGETS)
+        points = (self.bought.get((contender, budget)) for budget in SOUGHT)
         return list({id(each): each for each in points if each is not None}.values())
 
 

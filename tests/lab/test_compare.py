@@ -44,6 +44,7 @@ from skytether.lab.contenders import (
     LOOKED_AT,
     REGULATED,
     REPORTS,
+    SOUGHT,
     Case,
     Contender,
     FlownContender,
@@ -249,8 +250,8 @@ def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> 
         assert 0.9 * budget < used <= budget
         assert point.keys["control." + point.contender.threshold] == point.threshold
         assert not point.tuned
-    assert len(plan.chosen()) == len(BUDGETS)
-    assert asked <= len(plan.points) + contenders.ROUNDS * len(BUDGETS)
+    assert len(plan.chosen()) == len(SOUGHT)
+    assert asked <= len(plan.points) + contenders.ROUNDS * len(SOUGHT)
 
 
 def test_nothing_is_tried_where_it_cannot_be_better() -> None:
