@@ -48,7 +48,7 @@ from skytether.lab.benchmarks.reference import Reference
 from skytether.server.control.controller import BLOCK
 from skytether.server.control.exact import ExactSolver
 
-pytestmark = [pytest.mark.long, pytest.mark.xdist_group("benchmarks")]
+pytestmark = pytest.mark.long
 
 TINY = MappingProxyType(
     {

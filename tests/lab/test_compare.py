@@ -59,7 +59,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim import flight
 
-pytestmark = [pytest.mark.usefixtures("here"), pytest.mark.xdist_group("compare")]
+pytestmark = pytest.mark.usefixtures("here")
 
 PAPER = reading.load("paper")
 BY_NAME = {contender.name: contender for contender in CONTENDERS}

@@ -24,7 +24,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim import flight
 
-pytestmark = [pytest.mark.long, pytest.mark.xdist_group("reproduce")]
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 PAPER = reading.load("paper")

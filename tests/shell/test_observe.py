@@ -25,7 +25,7 @@ from skytether.shell.exporter import names
 from skytether.shell.log import LogLine
 from skytether.shell.metrics import TABLES
 
-pytestmark = [pytest.mark.long, pytest.mark.xdist_group("observe")]
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 OBSERVE = ROOT / "deploy"
