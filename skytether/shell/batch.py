@@ -172,14 +172,14 @@ class Batch:
             sock: socket of this family, see `stamp`.
 
         Returns:
-            payloads, senders, and how long ago each has arrived [ns; by the clock that tells the
-            time of day, which may be set meanwhile; 0 where nobody knows], in the order of arrival;
-            none where nothing came, or an error.
+            payloads, senders, and when each has arrived [ns; CLOCK_MONOTONIC], in the order of
+            arrival; none where nothing came, or an error. Times follow from stamps of the clock
+            that tells the time of day, which may be set meanwhile; where nobody knows it is now.
         """
         rows, size = self._in, self._name_bytes
         rows.stamp_sizes[:] = _WHOLE
         count = self._receive(sock.fileno(), rows.first, BATCH_MAX, _MSG_DONTWAIT, None)
-        now_ns = time.time_ns()
+        ahead_ns = time.time_ns() - (now_ns := time.monotonic_ns())
         if count <= 0:
             return [], [], []
         room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
@@ -189,8 +189,8 @@ class Batch:
         ]
         columns = rows.stamp_sizes, rows.stamps_s, rows.stamps_ns
         times = zip(*(column[:count].tolist() for column in columns), strict=True)
-        ago_ns = [now_ns - SECOND_NS * s - ns if stamp else 0 for stamp, s, ns in times]
-        return payloads, [names[at : at + size] for at in range(0, ends, size)], ago_ns
+        came_ns = [SECOND_NS * s + ns - ahead_ns if stamp else now_ns for stamp, s, ns in times]
+        return payloads, [names[at : at + size] for at in range(0, ends, size)], came_ns
 
     def send(
         self, sock: socket.socket, payloads: Sequence[bytes], peers: Sequence[RawAddress]

@@ -49,6 +49,8 @@ BATCHES_MAX = 4
 """Most batches read from one socket before timers and other sockets have their turn."""
 SOCKET = itemgetter(2)
 """Function that takes the number of its socket from a datagram."""
+CAME = itemgetter(0)
+"""Function that takes the time from a datagram and the time at which it came."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""
@@ -169,7 +171,7 @@ class Shell:
         self._on_event = on_event
         self._armed: int | None = None
         self._timer = make_timer(self._loop, self._wake)
-        self._slices = make_timer(self._loop, self._hear_slice)
+        self._slices = make_timer(self._loop, self._hear_slice) if self._patience_ns else None
         for number in self._sockets:
             self._listen(number)
         if self._control:
@@ -188,7 +190,8 @@ class Shell:
             if self._feed:
                 self._feed.end()
             self._timer.close()
-            self._slices.close()
+            if self._slices:
+                self._slices.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
             self._send_all(self.endpoint.outbox())
             self._drops = self.kernel_drops()
@@ -226,6 +229,8 @@ class Shell:
             if self._patience_ns:
                 self._count(number, count)
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
+            if self._patience_ns:
+                self._heard_ns = clock_ns()
             self._after()
 
     def _count(self, number: int, count: int) -> None:
@@ -245,9 +250,9 @@ class Shell:
         """Read a socket in slices of time from now on, where the system has a call for batches."""
         sock = self._sockets[number]
         batch = self._batch(sock)
-        if batch is None:
+        if batch is None or self._slices is None:
             return
-        self._crowded[number], self._heard_ns = batch, now_ns
+        self._crowded[number] = batch
         batch.stamp(sock)
         self._loop.remove_reader(sock)
         self._slices.set(now_ns + self._patience_ns)
@@ -265,14 +270,30 @@ class Shell:
         Datagrams that are handled one after the other take half the time of as many that wake the
         process one by one, with cold caches. The kernel's stamps tell when each has come.
         """
-        is_left = False
+        is_left, nothing_came = False, list[int]()
+        came: list[tuple[int, Datagram]] = []
         for number, batch in list(self._crowded.items()):
-            for _ in range(BATCHES_MAX):
-                count = self._read_batch(number, batch)
+            count = BURST_MAX
+            for read in range(BATCHES_MAX):
+                datagrams = self._read_batch(number, batch)
+                count = len(datagrams)
+                if not (count or read):
+                    nothing_came.append(number)
+                came += datagrams
                 if count < BURST_MAX:
                     break
             is_left |= count == BURST_MAX
-        if self._crowded:
+        came.sort(key=CAME)  # in the order in which they came to this machine
+        hear = self.endpoint.receive
+        for came_ns, datagram in came:
+            self._heard_ns = came_ns
+            try:
+                hear(datagram, now_ns=came_ns)
+            except Exception as error:  # a fault of ours is told, and the next datagram is heard
+                self._loop.call_exception_handler({"message": str(error), "exception": error})
+        for number in nothing_came:
+            self._hear(number)  # there may be an error, which the plain call tells apart
+        if self._crowded and self._slices:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
     def _batch(self, sock: socket) -> Batch | None:
@@ -284,50 +305,39 @@ class Shell:
                 self._batches[sock.family] = None
         return self._batches[sock.family]
 
-    def _read_batch(self, number: int, batch: Batch) -> int:
-        """Hear datagrams that one call reads; returns how many came."""
+    def _read_batch(self, number: int, batch: Batch) -> list[tuple[int, Datagram]]:
+        """Datagrams that one call reads from a socket, each with the time at which it came [ns]."""
         self._stopwatch.start()
-        payloads, raws, ago_ns = batch.receive(self._sockets[number])
-        count = len(payloads)
-        if not count:
-            self._hear(number)  # nothing came, or an error, which the plain call tells apart
-            self._heard_ns = time.monotonic_ns()
-            return 0
-        self._count(number, count)
+        payloads, raws, came_ns = batch.receive(self._sockets[number])
+        if not payloads:
+            return []
+        self._count(number, len(payloads))
         # The clock of the stamps may be set meanwhile, ours may not.
         now_ns, last_ns = time.monotonic_ns(), self._heard_ns
-        stamps_ns = [min(max(now_ns - ago, last_ns), now_ns) for ago in ago_ns]
-        self._heard_ns = stamps_ns[-1]
+        stamps_ns = [min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
             peers = self._names.heard_all(raws)
         except OSError:  # an interface has gone since
-            payloads, peers = self._still_here(payloads, raws)
-            stamps_ns = [now_ns] * len(payloads)
-            self._heard_ns = now_ns
-        datagrams = [
-            make_datagram((payload, peer, number))
-            for payload, peer in zip(payloads, peers, strict=True)
-        ]
+            payloads, peers, stamps_ns = self._still_here(payloads, raws, stamps_ns)
         self._stopwatch.lap("receive")
-        hear = self.endpoint.receive
-        for datagram, came_ns in zip(datagrams, stamps_ns, strict=True):
-            try:
-                hear(datagram, now_ns=came_ns)
-            except Exception as error:  # a fault of ours is told, and the next datagram is heard
-                self._loop.call_exception_handler({"message": str(error), "exception": error})
-        return count
+        return [
+            (came_ns, make_datagram((payload, peer, number)))
+            for came_ns, payload, peer in zip(stamps_ns, payloads, peers, strict=True)
+        ]
 
     def _still_here(
-        self, payloads: Sequence[bytes], raws: Sequence[bytes]
-    ) -> tuple[list[bytes], list[Address]]:
-        """Payloads and senders of the datagrams that came over an interface that is still there."""
+        self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
+    ) -> tuple[list[bytes], list[Address], list[int]]:
+        """Those of some datagrams that came over an interface that is still there."""
         kept: list[bytes] = []
         peers: list[Address] = []
-        for payload, raw in zip(payloads, raws, strict=True):
+        kept_ns: list[int] = []
+        for payload, raw, came_ns in zip(payloads, raws, stamps_ns, strict=True):
             with contextlib.suppress(OSError):
                 peers.append(self._names.heard(raw))
                 kept.append(payload)
-        return kept, peers
+                kept_ns.append(came_ns)
+        return kept, peers, kept_ns
 
     def _wake(self) -> None:
         self._armed = None
