@@ -109,6 +109,17 @@ def test_a_filter_that_knows_of_the_dead_time_is_right_with_noise_and_late_measu
     assert (off[False] > 3.0 * off[True]).all()
 
 
+def test_the_error_of_an_estimate_is_taken_when_the_next_input_meets_the_vehicle() -> None:
+    """It is hardly larger with a dead time: the vehicle flies by where it will be then."""
+    noise = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
+    late = {"dead_time_s": 0.27}
+    with_it, _ = flown(model=late, vehicle=late, sensor=noise)
+    without, _ = flown(sensor=noise)
+    assert with_it.estimate_error_m is not None
+    assert without.estimate_error_m is not None
+    assert with_it.estimate_error_m < 2.0 * without.estimate_error_m
+
+
 def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
     """Learned aboard even where the state is measured as it is, for nothing else tells of it."""
     known = scenario(model={"dead_time_s": 0.4}, vehicle={"steady_wind_mps": [1.0, -0.5]})

@@ -427,6 +427,20 @@ def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
     assert client.open(first, now_ns=0) is None
 
 
+def test_a_cookie_that_is_tried_again_is_the_newest_of_those_tried() -> None:
+    """It is forgotten after 64 others, and not as early as it would have been without."""
+    client, server = link(), gate()
+    hello = client.hello(HELLO, now_ns=0)
+    for port in range(65):
+        assert server.open(Datagram(hello, ("observer", port)), now_ns=0) is None
+    first, second, *others, last = (each.payload for each in server.outbox())
+    for challenge in (first, second, *others):
+        assert client.open(challenge, now_ns=0) is None
+    assert client.open(first, now_ns=AGAIN_NS) is None
+    assert client.open(last, now_ns=AGAIN_NS) is None
+    assert refusal(client, first, AGAIN_NS) == "replayed"
+
+
 def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
     """The answer is sent again after a loss; foreign challenges in between change nothing."""
     client, server = link(), gate()

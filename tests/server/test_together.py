@@ -772,6 +772,8 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
     homes = np.array([[2.5, 1.0], [1.5, 0.5], [1.0, -1.5]])
     assert aside.off_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
     assert aside.first_on(way, homes, 0.9) == 1
+    both, moved = np.array([[0.5, 0.2], [1.5, 0.5]]), np.array([-7.0, 0.0])
+    assert aside.first_on(way + moved, both + moved, 0.9) == 0  # the nearer one to where it begins
     assert aside.first_on(way, homes[[0, 2]], 0.9) == 0
     assert aside.first_on(way, homes[2:], 0.9) is None
     assert aside.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
