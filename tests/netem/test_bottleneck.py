@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.netem.bottleneck import INTERVAL_NS, TARGET_NS, Bottleneck
+from skytether.netem.bottleneck import INTERVAL_NS, TARGET_NS, Bottleneck, Codel
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
@@ -87,6 +87,23 @@ def test_fair_serves_each_flow_alike() -> None:
     assert wait_s < 0.16  # a turn of the other, and what it is just sending
     share, wait_s = served("first")
     assert wait_s > 0.5
+
+
+def test_codel_drops_at_the_times_of_rfc_8289() -> None:
+    """One interval after waits became too long, then at INTERVAL / √n; not while they are short."""
+    codel, began_ns = Codel(), SECOND_NS
+    assert not codel.drops(began_ns, is_fine=False)
+    assert not codel.drops(began_ns + INTERVAL_NS - 1, is_fine=False)
+    first_ns = began_ns + INTERVAL_NS
+    assert codel.drops(first_ns, is_fine=False)
+    assert not codel.drops(first_ns + INTERVAL_NS - 1, is_fine=False)
+    second_ns = first_ns + INTERVAL_NS
+    assert codel.drops(second_ns, is_fine=False)
+    third_ns = second_ns + round(INTERVAL_NS / 2**0.5)
+    assert not codel.drops(third_ns - 1, is_fine=False)
+    assert codel.drops(third_ns, is_fine=False)
+    assert not codel.drops(third_ns + SECOND_NS, is_fine=True)
+    assert not codel.drops(third_ns + SECOND_NS + 1, is_fine=False)
 
 
 def test_codel_keeps_the_queue_short() -> None:
