@@ -57,7 +57,7 @@ test: setup  ## everything but Docker and what takes long, in four minutes on tw
 
 long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
 	@$(KERNELS)
-	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 4 --dist loadfile --durations=12
+	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 5 --dist loadfile --durations=12
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .
