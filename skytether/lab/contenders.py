@@ -458,7 +458,7 @@ class FlownContender:
         return self.contender.name, self.threshold, self.report
 
     def at(self, threshold: float) -> "FlownContender":
-        """The same contender at another threshold than the one that the search found."""
+        """Contender as here, at another threshold than the one that the search found."""
         keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
         return FlownContender(self.contender, threshold, self.report, False, keys)
 

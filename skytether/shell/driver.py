@@ -328,7 +328,7 @@ class Shell:
     def _still_here(
         self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
     ) -> tuple[list[bytes], list[Address], list[int]]:
-        """Those of some datagrams that came over an interface that is still there."""
+        """Keep of some datagrams those that came over an interface that is still there."""
         kept: list[bytes] = []
         peers: list[Address] = []
         kept_ns: list[int] = []
