@@ -1,12 +1,15 @@
 """Requirements of the tests on the machine."""
 
+import fcntl
 import os
 import signal
 import socket
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import hypothesis
@@ -69,4 +72,12 @@ def here() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pool, "_executor", lambda _: nullcontext(Here()))
+        yield
+
+
+@pytest.fixture
+def documented_ports() -> Iterator[None]:
+    """Wait until no other test uses the fixed ports of commands in the documents, and use them."""
+    with (Path(tempfile.gettempdir()) / "skytether-documented-ports").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # ends with the file, whatever becomes of the process
         yield

@@ -458,7 +458,7 @@ class FlownContender:
         return self.contender.name, self.threshold, self.report
 
     def at(self, threshold: float) -> "FlownContender":
-        """Contender as here, at another threshold than the one that the search found."""
+        """Point of this contender and way of reporting, at a threshold near the budgets."""
         keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
         return FlownContender(self.contender, threshold, self.report, False, keys)
 

@@ -88,6 +88,7 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
     assert server.figures()["counts"].get("left_tube", 0) == 0
 
 
+@pytest.mark.usefixtures("documented_ports")
 @pytest.mark.long
 def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
     """Each line in a process of its own; clients for 45 s, over the emulated network.

@@ -136,6 +136,7 @@ def field_in(folder: Path) -> list[str]:
     return commands
 
 
+@pytest.mark.usefixtures("documented_ports")
 def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
     """Those of docs/fly-a-real-one.md, with its scenario, each line in a process of its own."""
     blocks = field_in(tmp_path)
@@ -153,6 +154,7 @@ def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
     assert "flies a plan" in run.stdout
 
 
+@pytest.mark.usefixtures("documented_ports")
 def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
     """It sets the parameters where it is told to, and is refused where it is not."""
     field_in(tmp_path)

@@ -106,6 +106,7 @@ def test_a_documented_flight_flies(
         assert capsys.readouterr().out.strip()
 
 
+@pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
     """Block of docs/running.md with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
@@ -114,6 +115,7 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
     assert "NO FAILSAFE" not in said
 
 
+@pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
     """Block of docs/running.md with keys, all of its hosts being this one."""
     _, on_three = terminals()
