@@ -78,6 +78,8 @@ def here() -> Iterator[None]:
 @pytest.fixture
 def documented_ports() -> Iterator[None]:
     """Wait until no other test uses the fixed ports of commands in the documents, and use them."""
-    with (Path(tempfile.gettempdir()) / "skytether-documented-ports").open("a") as file:
+    with (Path(tempfile.gettempdir()) / f"skytether-documented-ports-{os.getuid()}").open(
+        "a"
+    ) as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # ends with the file, whatever becomes of the process
         yield

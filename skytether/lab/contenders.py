@@ -33,7 +33,7 @@ PACKETS = 0.1
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both ways and including heartbeats."""
-SOUGHT = (1.0, 2.0, 4.5, 5.0, 10.0, 20.0, 40.0)
+SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
 """Budgets for which points are chosen and flown: those above, and a little less than 0.12 of what
 the paper's scheme takes at every step, for the ratios that are asked for (`comparison.CLAIMS`)."""
 SCOUTS = 16
@@ -458,7 +458,7 @@ class FlownContender:
         return self.contender.name, self.threshold, self.report
 
     def at(self, threshold: float) -> "FlownContender":
-        """Point of this contender and way of reporting, at a threshold near the budgets."""
+        """Point of this contender and way of reporting, at another threshold."""
         keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
         return FlownContender(self.contender, threshold, self.report, False, keys)
 
@@ -565,13 +565,14 @@ class Plan:
         each = {point.name: point for point in points}
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
-    def scouted(self, points: Sequence[FlownContender], done: Results) -> None:
+    def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
         """Take in the results of scouting flights.
 
         Args:
-            points, done: see `scouts`.
+            points: the points that were flown.
+            sweep: their flights, see `scouts`.
+            done: results of these flights.
         """
-        sweep = self.scouts(points)
         for cell, point in enumerate(points):
             runs = sweep.of_cell(done, cell)
             packets, effort = (
@@ -597,7 +598,7 @@ class Plan:
     def halfway(self) -> list[FlownContender]:
         """Points to be scouted next: halfway between a threshold within a budget and one beyond it.
 
-        None if the one beyond it is no better than what is already known within the budget.
+        Where the one beyond it is no better than what is known within, none between them would be.
         """
         best, found = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}

@@ -50,7 +50,7 @@ BATCHES_MAX = 4
 SOCKET = itemgetter(2)
 """Function that takes the number of its socket from a datagram."""
 CAME = itemgetter(0)
-"""Function that takes the time from a datagram and the time at which it came."""
+"""Function that takes the time from a pair of arrival time and datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Time after which names are looked up again [s]: a restarted host may have a new address."""

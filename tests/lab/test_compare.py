@@ -196,7 +196,8 @@ def scout(
 ) -> None:
     """Let scouting flights end in what `flies` says of a point."""
     runs = [(replace(SUMMARY, **{**SPENT, **flies(point)}),) for point in points]
-    plan.scouted(points, {(cell, 0): Done(cell, 0, run) for cell, run in enumerate(runs)})
+    done = {(cell, 0): Done(cell, 0, run) for cell, run in enumerate(runs)}
+    plan.scouted(points, plan.scouts(points), done)
 
 
 def test_within_a_budget_the_nearest_is_chosen() -> None:

@@ -412,7 +412,7 @@ class Crowd:
 def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Batches read it, and each datagram is still received with its own time of arrival."""
+    """Its datagrams are received in batches, each with its own time of arrival."""
     crowd = Crowd(Answering(31, lambda _: []), monkeypatch)
     crowd.endpoint.patience_ns = 20_000_000
     crowd.send((1, 10, 10, 10))

@@ -101,12 +101,12 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
     asked = [plan.halfway() if number else plan.points for plan in plans]
     if not any(asked):
         return 0
-    total = sum(plan.scouts(points).flights for plan, points in zip(plans, asked, strict=True))
-    with crew(options.pool, "choosing", total) as flyers:
-        for plan, points in zip(plans, asked, strict=True):
+    sweeps = [plan.scouts(points) for plan, points in zip(plans, asked, strict=True)]
+    with crew(options.pool, "choosing", sum(each.flights for each in sweeps)) as flyers:
+        for plan, points, sweep in zip(plans, asked, sweeps, strict=True):
             if points:
                 folder = options.out / "scouts" / plan.case.name / f"round-{number}"
-                plan.scouted(points, flyers.flown(plan.scouts(points), folder, plan.case.title))
+                plan.scouted(points, sweep, flyers.flown(sweep, folder, plan.case.title))
         return flyers.spent.runs
 
 
