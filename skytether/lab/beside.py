@@ -7,7 +7,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.lab import floor
-from skytether.lab.contenders import BESIDE, REGULATED, Plan
+from skytether.lab.budgets import Plan
+from skytether.lab.contenders import BESIDE, REGULATED
 from skytether.lab.journal import digests
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario

@@ -12,18 +12,8 @@ from skytether.figures.page import Table, as_text
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab import plates
 from skytether.lab.beside import Baselines, Floor
-from skytether.lab.contenders import (
-    ABOARD,
-    BUDGETS,
-    CONTENDERS,
-    EVERY,
-    SOUGHT,
-    Case,
-    Chosen,
-    Contender,
-    FlownContender,
-    Plan,
-)
+from skytether.lab.budgets import BUDGETS, EVERY, SOUGHT, Chosen, FlownContender, Plan
+from skytether.lab.contenders import ABOARD, CONTENDERS, Case, Contender
 from skytether.lab.plates import Plate
 from skytether.lab.report import Drawn
 from skytether.lab.sweep import Estimate, Results, Sweep, by_name, interval

@@ -1,25 +1,18 @@
 """Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
 The best weights of a contender in a case are a table of that file, found by a search
-(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. With these
-weights the contender flies at several thresholds and with several ways of reporting, on the seeds
-of the search (scouting flights). Near each budget of packets, both ways, more thresholds are tried
-until the budget is almost used up. Then the best choice within each budget flies in the comparison.
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. What flies
+with them within a budget of packets is chosen in `lab.budgets`.
 Some cases are flown with the weights of another case: they show how well the weights transfer.
 """
 
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
-import numpy as np
-from msgspec.structs import replace
-
-from skytether.lab.sweep import GridAxis, Results, Sweep
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import reading
@@ -30,12 +23,6 @@ SEARCH_SEED = 1001
 """First seed of a search; the compared seeds begin at the plant's own."""
 PACKETS = 0.1
 """Largest share of steps that may send, for a contender whose trigger looks at the state."""
-
-BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
-"""Budgets: largest numbers of packets per second, both ways and including heartbeats."""
-SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen and flown: those above, and a little less than 0.12 of what
-the paper's scheme takes at every step, for the ratios that are asked for (`comparison.CLAIMS`)."""
 SCOUTS = 16
 """Number of flights, on seeds of the search, by which points are chosen for the budgets."""
 ROUNDS = 4
@@ -43,28 +30,10 @@ ROUNDS = 4
 
 With 1 packet/s after `target` an error falls by a fifth for 5 % more packets. So thresholds far
 apart made contenders look worse only because theirs left more of the budget unused."""
-CLOSE = 1.05
-"""Ratio of two thresholds between which no other is tried."""
-EFFORT_ROOM = 1.05
-"""Factor by which a chosen point may exceed the effort limit of a case."""
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
 """Factors of a threshold on a figure of the flight, each one point."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
 """Factors of a period of ten steps, each one point."""
-REPORTS: Mapping[str, Mapping[str, Any]] = {
-    "every step": {"vehicle.report": "always"},
-    "by event": {"vehicle.report": "deviation(0.05) | silence(1)"},
-    "each second": {"vehicle.report": "silence(1)"},
-    "every 4 s": {
-        "vehicle.report": "silence(4)",
-        "link.heartbeat_s": 4.0,
-        "link.timeout_s": 20.0,
-        "link.age_max_s": 10.0,
-    },
-}
-"""Ways of reporting to the server, and the keys that each changes."""
-EVERY = "every step"
-"""Way of reporting with which weights are searched for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -433,204 +402,3 @@ def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
     """Keys in the sections of a scenario that differ from its plant, with dots, and values."""
     here, there = (dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant)))
     return {key: value for key, value in here.items() if "." in key and value != there[key]}
-
-
-# -- flights -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class FlownContender:
-    """Contender in a case, at one threshold and with one way of reporting."""
-
-    contender: Contender
-    threshold: float | None
-    """Value of the contender's threshold; None without one."""
-    report: str
-    """Way of reporting, a key of REPORTS."""
-    tuned: bool
-    """Whether the threshold is the one that the search found."""
-    keys: Mapping[str, Any]
-    """Keys that differ from the plant, with dots, and their values."""
-
-    @property
-    def name(self) -> tuple[str, float | None, str]:
-        """Contender, threshold and way of reporting."""
-        return self.contender.name, self.threshold, self.report
-
-    def at(self, threshold: float) -> "FlownContender":
-        """Point of this contender and way of reporting, at another threshold."""
-        keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
-        return FlownContender(self.contender, threshold, self.report, False, keys)
-
-
-def flying(
-    contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
-) -> list[FlownContender]:
-    """Contender with every way of reporting at all its thresholds, in rising order."""
-    keys, key = differences(tuned, case.plant), contender.threshold
-    keys = {path: value for path, value in keys.items() if path not in case.keys}
-    values: list[float | None] = [None]
-    here = getattr(tuned.control, key) if key else None
-    if here is not None:
-        first = contender.factors.index(1) % scale.every
-        scaled = [here * factor for factor in contender.factors[first :: scale.every]]
-        if isinstance(here, int):  # steps
-            scaled = [max(1, round(value)) for value in scaled]
-        values = sorted({*scaled})
-    return [
-        FlownContender(
-            contender,
-            value,
-            report,
-            value == here,
-            {**keys, **({f"control.{key}": value} if key else {}), **changes},
-        )
-        for value in values
-        for report, changes in REPORTS.items()
-    ]
-
-
-Chosen = Mapping[tuple[str, float], FlownContender]
-"""Choice of each contender within each budget, by its name and the budget [1/s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Scouted:
-    """Means of a point's scouting flights."""
-
-    point: FlownContender
-    rmse_xy_m: float
-    """RMSE xy [m]; infinite if a flight failed."""
-    packets_per_s: float
-    """Packets both ways [1/s]."""
-    is_valid: bool
-    """Whether its effort is within the limit of the case."""
-
-    def is_within(self, budget: float) -> bool:
-        """Whether the point may be chosen for a budget of packets [1/s]."""
-        return self.is_valid and self.packets_per_s <= budget and math.isfinite(self.rmse_xy_m)
-
-
-def _between(lower: float | None, upper: float | None) -> float | None:
-    """Geometric mean of two thresholds; None if they are too close together for another."""
-    if lower is None or upper is None:
-        return None
-    mean = math.sqrt(lower * upper)
-    if isinstance(upper, int):  # steps
-        return round(mean) if lower < round(mean) < upper else None
-    return float(f"{mean:.4g}") if upper > CLOSE * lower else None
-
-
-class Plan:
-    """Flights of all contenders in one case.
-
-    Args:
-        weights: COMPARED, or the path of a file made by `to_file`.
-
-    Raises:
-        ConfigError: the file cannot be read, or a contender is missing or invalid in it.
-    """
-
-    def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
-        self.case = case
-        self.points: list[FlownContender] = []
-        """All contenders at all thresholds with all ways of reporting."""
-        known = reading.names(weights)
-        for contender in scale.who(case):
-            name = entry(contender, case)
-            if f"{weights}/{name}" not in known:
-                there_is = "expected every contender in every case, as --tune writes them"
-                raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
-            self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
-        self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each chosen point."""
-        plant = reading.to_table(reading.load(case.plant))
-        lay(case.keys, plant)
-        plant["duration"] = min(plant["duration"], scale.duration)
-        self._scenario = reading.check(plant, case.title)
-        self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
-        self._scouted: list[Scouted] = []
-
-    def scouts(self, points: Sequence[FlownContender]) -> Sweep:
-        """Flights by which points are chosen."""
-        runs, scenario = self._scouting
-        return self._sweep(scenario, points, runs)
-
-    def _sweep(self, scenario: Scenario, points: Sequence[FlownContender], runs: int) -> Sweep:
-        names, changes = tuple(each.name for each in points), tuple(each.keys for each in points)
-        return Sweep(self.case.name, scenario, [GridAxis("contender", names, changes)], runs)
-
-    def comparison(self, points: Iterable[FlownContender]) -> Sweep:
-        """Flights of some points, without duplicates."""
-        each = {point.name: point for point in points}
-        return self._sweep(self._scenario, list(each.values()), self.runs)
-
-    def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Take in the results of scouting flights.
-
-        Args:
-            points: the points that were flown.
-            sweep: their flights, see `scouts`.
-            done: results of these flights.
-        """
-        for cell, point in enumerate(points):
-            runs = sweep.of_cell(done, cell)
-            packets, effort = (
-                float(np.mean([getattr(run, figure) for run in runs]))
-                for figure in ("packets_per_s", "effort_mps")
-            )
-            errors = [math.inf if run.rmse_xy is None else run.rmse_xy for run in runs]
-            is_valid = effort <= EFFORT_ROOM * self.case.effort_mps
-            self._scouted.append(Scouted(point, float(np.mean(errors)), packets, is_valid))
-
-    def _best(self) -> dict[tuple[str, float], Scouted]:
-        """Point with the least RMSE xy within each budget, by contender and budget."""
-        found: dict[tuple[str, float], Scouted] = {}
-        for each in self._scouted:
-            for budget in SOUGHT:
-                name = each.point.contender.name, budget
-                if each.is_within(budget) and (
-                    name not in found or each.rmse_xy_m < found[name].rmse_xy_m
-                ):
-                    found[name] = each
-        return found
-
-    def halfway(self) -> list[FlownContender]:
-        """Points to be scouted next: halfway between a threshold within a budget and one beyond it.
-
-        Where the one beyond it is no better than what is known within, none between them would be.
-        """
-        best, found = self._best(), {}
-        ways: dict[tuple[str, str], list[Scouted]] = {}
-        for each in self._scouted:
-            ways.setdefault((each.point.contender.name, each.point.report), []).append(each)
-        for (contender, _), points in ways.items():
-            rising = sorted(points, key=lambda each: each.point.threshold or 0.0)
-            for lower, upper in pairwise(rising):
-                value = _between(lower.point.threshold, upper.point.threshold)
-                if value is not None and any(
-                    upper.is_within(budget)
-                    and not lower.is_within(budget)
-                    and lower.rmse_xy_m < best[contender, budget].rmse_xy_m
-                    for budget in SOUGHT
-                ):
-                    point = upper.point.at(value)
-                    found[point.name] = point
-        return list(found.values())
-
-    def chosen(self) -> Chosen:
-        """Point with the least RMSE xy within each budget, by contender and budget.
-
-        A contender has no entry for a budget if no point is within the budget and the case's effort
-        limit without a failed flight.
-        """
-        return {name: each.point for name, each in self._best().items()}
-
-    def tuned(self, name: str) -> Scenario:
-        """Points of a contender at the found threshold, reporting at every step."""
-        (point,) = (
-            each
-            for each in self.points
-            if each.contender.name == name and each.tuned and each.report == EVERY
-        )
-        return self.comparison([point]).scenario_of(point.name)

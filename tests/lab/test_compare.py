@@ -22,7 +22,8 @@ from msgspec.structs import replace
 import skytether
 from helpers import refused_before_writing
 from skytether.__main__ import main
-from skytether.lab import contenders
+from skytether.lab import budgets, contenders
+from skytether.lab.budgets import BUDGETS, REPORTS, SOUGHT, FlownContender, Plan
 from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
 from skytether.lab.comparison import (
@@ -38,18 +39,13 @@ from skytether.lab.comparison import (
 from skytether.lab.contenders import (
     ABOARD,
     BESIDE,
-    BUDGETS,
     CASES,
     CONTENDERS,
     LOOKED_AT,
     REGULATED,
-    REPORTS,
-    SOUGHT,
     Case,
     Contender,
-    FlownContender,
     Found,
-    Plan,
 )
 from skytether.lab.sweep import Done
 from skytether.shared.base.errors import ConfigError
@@ -146,7 +142,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
 
 def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
     """Those at which it flies, each with every way of reporting, and which is tuned."""
-    points = contenders.flying(contender, BY_CASE["gusts"], scenario, SCALE)
+    points = budgets.flying(contender, BY_CASE["gusts"], scenario, SCALE)
     found = {point.threshold: point.tuned for point in points}
     assert [(point.threshold, point.report) for point in points] == [
         (threshold, report) for threshold in found for report in REPORTS
@@ -172,7 +168,7 @@ def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_
     tuned = contenders.search_start(contender, TARGET, SCALE)
     lossy = replace(tuned.network.uplink, loss=0.2)
     tuned = replace(tuned, network=replace(tuned.network, uplink=lossy))
-    for flying in contenders.flying(contender, case, tuned, SCALE):
+    for flying in budgets.flying(contender, case, tuned, SCALE):
         assert flying.keys.keys() & case.keys.keys() <= {
             key for changes in REPORTS.values() for key in changes
         }

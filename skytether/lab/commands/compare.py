@@ -11,11 +11,12 @@ import tyro
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
 from skytether.lab.beside import Baselines, Work, floor_of, fly_aboard
+from skytether.lab.budgets import Plan
 from skytether.lab.calibration import HERE, Rmse, SearchLimits
 from skytether.lab.commands import report_folder
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found, Plan
+from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
 from skytether.lab.journal import Journal, write
 from skytether.lab.search import Search, SearchPoint, best
 from skytether.shared.scenario import reading
