@@ -24,6 +24,7 @@ from skytether.shared.core.events import (
     ModeChanged,
     NotFlown,
 )
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
@@ -85,7 +86,7 @@ class Client(Endpoint):
             server=server,
             connect_s=scenario.link.connect_s,
             link=link or PlainLink(),
-            hearing=scenario.link.hearing(terms.dt_ns),
+            hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
             failsafe=self._failsafe,
             out=self._out,
             events=self._events,

@@ -189,8 +189,12 @@ class Failsafe:
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
 
     def _is_good(self, now_ns: int) -> bool:
-        """Whether something of the session has come within half of the time-out."""
-        return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns // 2
+        """Whether something of the session has come within two thirds of the time-out.
+
+        A heartbeat comes at least in each third, see `heartbeat.FEWEST`: so one may be lost. And
+        the first one comes a round trip after WELCOME, which may take a second.
+        """
+        return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
     def calm_until_ns(self, now_ns: int) -> int:
         """Time up to which `step` changes nothing as long as nothing comes [ns].
@@ -212,7 +216,7 @@ class Failsafe:
 
     def heard(self, *, now_ns: int) -> None:
         """Note a packet of the session, authenticated where the link is."""
-        # After a gap of more than half of the time-out the link has to prove itself anew.
+        # After a gap of more than two thirds of the time-out the link has to prove itself anew.
         if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns

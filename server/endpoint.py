@@ -17,10 +17,11 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
 from skytether.server.sessions import Sessions
 from skytether.server.tick import Grid, Ticker
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
 from skytether.shared.core.events import SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.mission import Guided, given
 from skytether.shared.scenario.owners import InFlight
@@ -94,11 +95,12 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(room, terms.dt_ns)
         self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
+        silence_ns = scenario.link.patience_ns
         self.sessions = Sessions(
             room,
             entropy,
-            seconds_to_ns(scenario.link.timeout_s),
-            partial(scenario.link.hearing, terms.dt_ns),
+            silence_ns,
+            partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
         )
         """Sessions of the vehicles that fly."""
         self._grid = Grid(terms.dt_ns, self._events)

@@ -18,13 +18,11 @@ import numpy as np
 from skytether.server.gate import WayBack
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.law.heartbeat import NUMBERS, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation
 
-SESSION_NS = 30 * SECOND_NS
-"""A vehicle unheard for so long is forgotten [ns]."""
 WELCOME_NS = 5 * SECOND_NS
 """Time after its last HELLO for which a welcomed vehicle keeps its place without coming [ns]."""
 

@@ -35,6 +35,12 @@ BEFORE = -(2**64)
 """Time or step before all others."""
 SILENCE_MAX = 2**16 - 1
 """Longest silence that can be asked for [half steps]."""
+SESSION_NS = 30 * SECOND_NS
+"""Silence after which the server forgets a vehicle [ns]."""
+# With three, the observations behind the plans became so old that at 30 % loss 5 of 30 flights of
+# `target` braked before a newer plan came; with two, none.
+PATIENCE = 2
+"""Time-outs of the vehicle that the server waits for it."""
 
 
 def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:

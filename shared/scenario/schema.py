@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.law.heartbeat import Hearing
+from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import policies, zones
@@ -437,16 +437,29 @@ class LinkConfig(Section, frozen=True):
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Time after its first knot up to which the vehicle takes a trajectory [s]; 0: at any time. It
     tells the server for certain which one is flown."""
-    timeout_s: OfEach[Interval] = 2.0
-    """Time of silence after which the other end is taken for gone [s]: the vehicle brakes and says
-    HELLO again; the server lets another client have the vehicle's number."""
+    timeout_s: OfEach[Interval] = 1.5
+    """Time of silence after which the vehicle takes the server for gone [s]: it brakes and says
+    HELLO again. After the same time, or twice that with heartbeats "auto", the server lets
+    another client have the vehicle's number."""
     connect_s: OfVehicle[Interval] = 15.0
     """Time for which the vehicle waits for its first session before it gives up [s]."""
 
-    def hearing(self, dt_ns: int) -> Hearing:
-        """Ear of one end, with steps of dt_ns [ns]."""
-        fixed_ns = None if self.heartbeat_s == "auto" else seconds_to_ns(self.heartbeat_s)
-        return Hearing(seconds_to_ns(self.timeout_s), dt_ns, fixed_ns)
+    @property
+    def fixed_ns(self) -> int | None:
+        """`heartbeat_s` [ns]; None where it follows the loss."""
+        return None if self.heartbeat_s == "auto" else seconds_to_ns(self.heartbeat_s)
+
+    @property
+    def patience_ns(self) -> int:
+        """Time of silence after which the server takes a vehicle for gone [ns].
+
+        A vehicle brakes when its server is silent. The server only keeps the vehicle's number from
+        another client, so it can wait longer, and then needs half as many heartbeats.
+        """
+        timeout_ns = seconds_to_ns(self.timeout_s)
+        if self.fixed_ns is not None:
+            return timeout_ns
+        return max(timeout_ns, min(PATIENCE * timeout_ns, SESSION_NS))
 
 
 class SimulationConfig(Section, frozen=True):

@@ -28,6 +28,8 @@ from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 """Most datagrams in one call."""
+NEAR_NS, READINGS = 5_000, 4
+"""Time within which two clocks are read together [ns], and how often this is tried."""
 SIZE_MAX = 2048
 """Largest payload that `Batch.send` takes [B]: packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
@@ -179,7 +181,7 @@ class Batch:
         rows, size = self._in, self._name_bytes
         rows.stamp_sizes[:] = _WHOLE
         count = self._receive(sock.fileno(), rows.first, BATCH_MAX, _MSG_DONTWAIT, None)
-        ahead_ns = time.time_ns() - (now_ns := time.monotonic_ns())
+        ahead_ns, now_ns = _clocks()
         if count <= 0:
             return [], [], []
         room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
@@ -258,3 +260,18 @@ class Segments:
                 break
             first = last
         return first
+
+
+def _clocks() -> tuple[int, int]:
+    """Lead of the time of day over CLOCK_MONOTONIC, and the time of that clock [ns].
+
+    A process may lose its core between the two clocks: on a busy machine that moved stamps by 20
+    ms. So they are read again unless they were read within NEAR_NS of each other.
+    """
+    for _ in range(READINGS):
+        before_ns = time.monotonic_ns()
+        day_ns = time.time_ns()
+        now_ns = time.monotonic_ns()
+        if now_ns - before_ns < NEAR_NS:
+            break
+    return day_ns - now_ns, now_ns

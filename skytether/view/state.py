@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import zones
@@ -33,7 +33,7 @@ from skytether.shared.telemetry.feed import (
     columns_of,
     table,
 )
-from skytether.shared.telemetry.record import Reason, compared
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, compared
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.wire.protocol import Mode
 from skytether.view.network import DIRECTIONS, SPAN_S, Network
@@ -557,10 +557,11 @@ class State:
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
             return Word("NONE", "there is no session yet", GREY)
-        silent_ns = self.scenario.link.timeout_s * SECOND_NS
+        link = self.scenario.link
+        longest_ns = {UPLINK: seconds_to_ns(link.timeout_s), DOWNLINK: link.patience_ns}
         for direction, name in DIRECTIONS.items():
             heard_ns = self.network.heard_ns.get(direction)
-            if heard_ns is not None and now_ns - heard_ns > silent_ns:
+            if heard_ns is not None and now_ns - heard_ns > longest_ns[direction]:
                 ago_s = (now_ns - heard_ns) / SECOND_NS
                 return Word("CUT", f"nothing gets through {name} for {ago_s:.0f} s", RED)
         if track.row["reason"] == Reason.LOST:
@@ -569,6 +570,6 @@ class State:
             traffic = self.network.traffic(direction, LOSS_S, now_ns)
             if traffic.loss > LOSS_HIGH:
                 return Word("DEGRADED", f"{traffic.loss:.0%} of what goes {name} is lost", AMBER)
-        if track.age_s > self.scenario.link.age_max_s / 2:
+        if track.age_s > link.age_max_s / 2:
             return Word("DEGRADED", f"what is flown by is {track.age_s:.1f} s old", AMBER)
         return Word("GOOD", "packets come through both ways", GREEN)

@@ -9,7 +9,7 @@ from skytether.lab.benchmarks import failsafe
 from skytether.lab.benchmarks.failsafe import CaseName, Ending, FaultOutcome
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
-SILENCE_S = (1.9, 2.6)
+SILENCE_S = (1.4, 2.1)
 """Times within which a lost server is noticed: `link.timeout_s` after what was under way [s]."""
 STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
     "link cut": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),

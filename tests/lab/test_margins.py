@@ -74,7 +74,7 @@ def test_a_regulator_aboard_has_the_variance_of_its_lyapunov_equation(change_wei
     [
         ({"control__trigger": "periodic(10)"}, 10, 0.1),
         pytest.param({"control__trigger": "always", **NOISE}, 6, 0.1, marks=pytest.mark.long),
-        ({**BLIND, "control__trigger": "periodic(10)", "vehicle__dead_time_s": 0.08}, 16, 0.1),
+        ({**BLIND, "control__trigger": "periodic(10)", "vehicle__dead_time_s": 0.08}, 32, 0.1),
         (
             {
                 "control__trigger": "periodic(10)",

@@ -163,7 +163,7 @@ def test_a_flight_is_that_of_the_simulation(flown: skytether.Flight) -> None:
     assert {each.host for each in flown.events} == {"server", "netem", "client"}
     parts = record.client, record.server, record.netem
     assert flown.summary == summarise(scenario, "demo", *parts)
-    assert flown.summary.rmse_xy == pytest.approx(0.0283, abs=1e-4)
+    assert flown.summary.rmse_xy == pytest.approx(0.0280, abs=1e-4)
     assert (flown.failure, flown.name, flown.scenario) == (None, "demo", scenario)
     assert repr(flown) == "<Flight 'demo', seed 1: 200 steps in 10 s>"
 

@@ -14,7 +14,7 @@ from helpers import packaged
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import PlainGate
 from skytether.server.secure import SecureGate
-from skytether.server.sessions import SESSION_NS, WELCOME_NS, Sessions
+from skytether.server.sessions import WELCOME_NS, Sessions
 from skytether.server.tick import Grid
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -30,7 +30,7 @@ from skytether.shared.core.events import (
     SessionRefused,
     Unauthenticated,
 )
-from skytether.shared.law.heartbeat import NUMBERS, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns

@@ -324,7 +324,7 @@ WRONG = {
     ),
     "a time-out within a heartbeat": (
         "link.heartbeat_s = 2.0",
-        "link.timeout_s: got 2.0, expected more than link.heartbeat_s = 2",
+        "link.timeout_s: got 1.5, expected more than link.heartbeat_s = 2",
     ),
     # No trajectory.
     "a single waypoint": (

@@ -501,6 +501,29 @@ def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
     assert stamps_ns[-1] <= time.monotonic_ns()
 
 
+def test_who_loses_the_core_between_two_clocks_reads_them_again(
+    ends: tuple[socket.socket, socket.socket], host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else what came 30 ms ago would seem to come in the future."""
+    here, there = ends
+    batch, real, slept = Batch(FAMILIES[host]), time.time_ns, iter([0.03])
+
+    def late() -> int:
+        time_ns = real()
+        for slept_s in slept:
+            time.sleep(slept_s)
+        return time_ns
+
+    Batch.stamp(here)
+    before_ns = time.monotonic_ns()
+    there.sendto(b"a", here.getsockname())
+    sent_ns = time.monotonic_ns()
+    monkeypatch.setattr(time, "time_ns", late)
+    _, _, (came_ns,) = batch.receive(here)
+    # The clocks are read within 5 µs of each other.
+    assert before_ns - 5_000 <= came_ns <= sent_ns + 5_000
+
+
 def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

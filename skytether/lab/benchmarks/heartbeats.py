@@ -33,7 +33,7 @@ NETWORKS = (
     ("0.1 in bursts of 0.5 s", DirectionConfig(loss=0.1, burst_s=0.5)),
 )
 """Networks by the share of packets lost; delays are the paper's."""
-LINKS = ((1.0, 0.1), (2.0, 0.5), (2.0, None), (4.0, None))
+LINKS = ((1.0, 0.1), (2.0, 0.5), (1.5, None), (3.0, None))
 """Time-out [s], and time between heartbeats [s]; None where the time follows the loss."""
 
 

@@ -28,20 +28,20 @@ from skytether.lab.benchmarks.harness import TextTable, progress, refresh
 from skytether.lab.benchmarks.heartbeats import computed
 from skytether.netem.fate import Fates
 from skytether.server.sessions import Session
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import ModeChanged
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.dotted import lay
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.schema import DirectionConfig, LinkConfig, Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shell import options
 from skytether.sim.flight import fly, fly_batch
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "protocol.md"
-TIMEOUT_S = 2.0
-"""Time-out of both ends [s]."""
+LINK = LinkConfig()
+"""Time-out and heartbeats of a scenario that says nothing of them."""
 STEP_NS = 50 * MILLISECOND_NS
 """Length of a step of both ends [ns]; the server's steps begin half a step later."""
 SESSION_S = 600
@@ -80,14 +80,15 @@ def keep(network: DirectionConfig, sessions: int) -> Alive:
 
 def _session(network: DirectionConfig, seed: int) -> tuple[int, float]:
     """Number of false losses in one session, and how soon its end was noticed [s]."""
-    timeout_ns, end_ns = round(TIMEOUT_S * SECOND_NS), SESSION_S * SECOND_NS
+    timeout_ns, end_ns = seconds_to_ns(LINK.timeout_s), SESSION_S * SECOND_NS
     up, down = (Fates(network, seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, None)
     failsafe = Failsafe(
         TABLE, armed=True, timeout_ns=timeout_ns, land_after_ns=end_ns, changed=lambda *_: None
     )
     nowhere = ("nowhere", 0)
-    server = Session(1, 1, 1, nowhere, nowhere, _Unsealed(), Hearing(timeout_ns, STEP_NS, None))
+    hearing = Hearing(LINK.patience_ns, STEP_NS, None)
+    server = Session(1, 1, 1, nowhere, nowhere, _Unsealed(), hearing)
     asked, said, told_ns, heard_ns = ear.silence, 0, -end_ns, 0
     false, is_lost, never_ns = 0, False, 2 * end_ns
     failsafe.heard(now_ns=0)
@@ -165,8 +166,8 @@ def scenario_of(loss: float, duration_s: float) -> Scenario:
         "control.scheme": "trajectory",
         "control.trigger": "expected_gap(0.05) | silence(1)",
         "vehicle.report": "deviation(0.05) | silence(1)",
-        "link.timeout_s": TIMEOUT_S,
-        "link.heartbeat_s": "auto",
+        "link.timeout_s": LINK.timeout_s,
+        "link.heartbeat_s": LINK.heartbeat_s,
         "network.uplink.loss": loss,
         "network.downlink.loss": loss,
     }
@@ -243,7 +244,7 @@ def table_of(hours: float, flown_hours: int) -> TextTable:
     rows = []
     for name, network in progress(networks, "keeping alive"):
         kept = keep(network, max(1, round(hours * 3600.0 / SESSION_S)))
-        known = "" if network.burst_s else f"{computed(network.loss, TIMEOUT_S, None):.2g}"
+        known = "" if network.burst_s else f"{computed(network.loss, LINK.timeout_s, None):.2g}"
         row = [name, known, _rate(kept), "", _noticed(kept), ""]
         if flown_hours and not network.burst_s and network.loss in FLOWN:
             seen = flown(network.loss, flown_hours)
