@@ -101,6 +101,7 @@ class Server(Endpoint):
             entropy,
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
+            keeps_rows=scenario.is_mission,
         )
         """Sessions of the vehicles that fly."""
         self._grid = Grid(terms.dt_ns, self._events)

@@ -92,6 +92,8 @@ class Sessions:
         entropy: makes so many random bytes, of which the numbers of sessions are made.
         silence_ns: time after which a vehicle that is not heard may be taken for gone [ns].
         hearing: makes an ear for each session.
+        keeps_rows: whether a row stays that of its vehicle when its session has ended. On a mission
+            the others have to keep apart from a vehicle that nobody hears any more.
     """
 
     def __init__(
@@ -100,6 +102,8 @@ class Sessions:
         entropy: Callable[[int], bytes],
         silence_ns: int,
         hearing: Callable[[], Hearing],
+        *,
+        keeps_rows: bool = False,
     ) -> None:
         self._hearing = hearing
         self._entropy = entropy
@@ -110,10 +114,13 @@ class Sessions:
         """Welcomed vehicles without a row, the one that said HELLO longest ago first; never more
         than there are free rows."""
         self._again: dict[int, Session] = {}
-        """New lives of vehicles in session, until their first observation, by vehicle."""
+        """New lives of vehicles that have a row, until their first observation, by vehicle."""
         self._by_row: dict[int, Session] = {}
         self._free_rows = list(range(room))
         """Rows that are free, a heap."""
+        self._keeps_rows = keeps_rows
+        self._kept: dict[int, int] = {}
+        """Rows of vehicles without a session that keep them, by vehicle."""
         self.rows: Indices = np.zeros(0, dtype=np.int64)
         """Rows in use, rising; shape (n,)."""
         self.vehicle = np.zeros(room, dtype=np.int64)
@@ -156,7 +163,7 @@ class Sessions:
 
     def is_full(self, hello: Hello, now_ns: int) -> bool:
         """Whether there is no room for the vehicle that says HELLO."""
-        known = hello.vehicle in self._live or hello.vehicle in self.coming
+        known = self._has_row(hello.vehicle) or hello.vehicle in self.coming
         if known or len(self.coming) < len(self._free_rows):
             return False
         oldest = next(iter(self.coming.values()), None)
@@ -191,7 +198,11 @@ class Sessions:
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
         """Sessions among which the welcomed one of a vehicle is kept, if it has one."""
-        return self._again if vehicle in self._live else self.coming
+        return self._again if self._has_row(vehicle) else self.coming
+
+    def _has_row(self, vehicle: int) -> bool:
+        """Whether a row is that of a vehicle."""
+        return vehicle in self._live or vehicle in self._kept
 
     def _is_heard(self, live: Session, now_ns: int) -> bool:
         """Whether a vehicle in session has been heard of late."""
@@ -217,8 +228,13 @@ class Sessions:
         if before is not None and self._is_heard(before, now_ns):
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
-        # The lowest free row, so that arrays are used from the front.
-        session.row = heappop(self._free_rows) if before is None else before.row
+        if before is not None:
+            session.row = before.row
+        elif session.vehicle in self._kept:
+            session.row = self._kept.pop(session.vehicle)
+        else:
+            # The lowest free row, so that arrays are used from the front.
+            session.row = heappop(self._free_rows)
         session.sent_ns = now_ns
         self._live[session.vehicle] = self._by_row[session.row] = session
         self.vehicle[session.row] = session.vehicle
@@ -245,11 +261,14 @@ class Sessions:
 
     def _forget(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
-        heappush(self._free_rows, session.row)
-        # A new life that was waiting for the old one to fall silent takes the free place.
-        again = self._again.pop(session.vehicle, None)
-        if again is not None:
-            self.coming[session.vehicle] = again
+        if self._keeps_rows:
+            self._kept[session.vehicle] = session.row
+        else:
+            heappush(self._free_rows, session.row)
+            # A new life that was waiting for the old one to fall silent takes the free place.
+            again = self._again.pop(session.vehicle, None)
+            if again is not None:
+                self.coming[session.vehicle] = again
         self._note_rows()
 
     def _note_rows(self) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import math
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -571,17 +572,25 @@ def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(["hello", "observe", "wait"]), st.integers(0, 5), st.integers(0, 2)
+            st.sampled_from(["hello", "observe", "wait", "close"]),
+            st.integers(0, 5),
+            st.integers(0, 2),
         ),
         max_size=60,
-    )
+    ),
+    st.booleans(),
 )
 def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
-    moves: list[tuple[str, int, int]],
+    moves: list[tuple[str, int, int]], keeps: bool
 ) -> None:
-    """Any vehicles, lives and waits: never more than there is room for, and never a crash."""
+    """Any vehicles, lives and waits: never more than there is room for, and never a crash.
+
+    Where rows are kept, a row never becomes that of another vehicle.
+    """
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
-    sessions, now_ns = Sessions(3, stream(1, "entropy").bytes, SILENCE_NS, ear), DAY_NS
+    entropy, now_ns = stream(1, "entropy").bytes, DAY_NS
+    sessions = Sessions(3, entropy, SILENCE_NS, ear, keeps_rows=keeps)
+    kept: dict[int, int] = {}
     terms = scenario().terms()
     numbers: dict[tuple[int, int], int] = {}
     due: dict[int, tuple[int, int]] = {}
@@ -604,11 +613,16 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
                     refused = error.reason
                 in_time = granted[0] == boot_id and now_ns <= granted[1]
                 assert refused in ("", "taken") or not in_time
+            case "close" if (vehicle, boot_id) in numbers:
+                with suppress(ProtocolError):
+                    sessions.end(vehicle, numbers[vehicle, boot_id])
             case "wait":
                 now_ns += boot_id * (SILENCE_NS // 2 + 1) + vehicle * SECOND_NS
                 if vehicle == 5:
                     now_ns += SESSION_NS
                 sessions.expire(now_ns)
+        for session in sessions:
+            assert not keeps or kept.setdefault(session.row, session.vehicle) == session.vehicle
         assert len(sessions) + len(sessions.coming) <= 3
         assert len(sessions.rows) == len(sessions)
 

@@ -18,6 +18,7 @@ from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks import published
 from skytether.lab.benchmarks.together import MortalServer
+from skytether.server import sessions
 from skytether.server.control import apart, aside, motionplan
 from skytether.server.control import known as known_vehicles
 from skytether.server.control.aims import Aims
@@ -30,7 +31,11 @@ from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.roster import LONGEST, Roster
 from skytether.server.control.routes import Routes
 from skytether.server.control.together import Together
-from skytether.shared.core.events import ChangeRefused
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import ChangeRefused, SessionEnded
 from skytether.shared.law.model import Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
@@ -552,6 +557,42 @@ def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
     flown = flight.fly(swaps, vehicles=8, server=server)
     assert separation_m(flown) > 0.5
     assert max(left_m(flown, 8)) < 0.3
+
+
+class HardOfHearing(Server):
+    """A server that hears vehicle 1 at first alone, and vehicle 3 only long after that."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`; the times are those of the day at whose midnight the flight begins."""
+        number, time_s = datagram.peer[1], now_ns / SECOND_NS % 86_400
+        if (number == 1 and time_s > 5.0) or (number == 3 and time_s < 15.0):
+            return
+        super().receive(datagram, now_ns=now_ns)
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_who_is_silent_for_long_keeps_its_place_when_another_joins(
+    keeps: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ablation: without a row of its own it is forgotten, and flown into by the one that joins.
+
+    Found by 1 of 600 flights of sixteen vehicles with links that are cut.
+    """
+    monkeypatch.setattr(sessions, "SESSION_NS", 8 * SECOND_NS)
+    if not keeps:
+        monkeypatch.setattr("skytether.server.endpoint.Sessions", forgetful)
+    swaps = scenario(4, duration=50.0)
+    server = HardOfHearing(swaps, boot_id=1, entropy=stream(1, "entropy").bytes, room=4)
+    flown = flight.fly(swaps, vehicles=4, server=server)
+    ended = [event for *_, event in flown.events if isinstance(event, SessionEnded)]
+    assert ended[0] == SessionEnded(vehicle=1)
+    assert (separation_m(flown) > 0.5) == keeps
+
+
+def forgetful(*args: Any, keeps_rows: bool) -> sessions.Sessions:
+    """Sessions whose rows are free for anybody once they have ended."""
+    assert keeps_rows
+    return sessions.Sessions(*args)
 
 
 def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
