@@ -120,6 +120,9 @@ class Roster:
         """Take note that a session is over; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
         self.rows.heard[row] = False
+        if row in self.known:
+            # Another life of the vehicle counts steps of its own.
+            self.known[row].goal = self.known[row].detour = None
 
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of one on no grid of its own."""
@@ -153,7 +156,8 @@ class Roster:
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
-            if not observation.takes:
+            # Nor is anything taken that was sent in an earlier session.
+            if not observation.takes or not self.rows.heard[row]:
                 known.sent.clear()
         elif known.in_force is None or known.in_force.step != observation.in_force:
             found = next((each for each in known.sent if each.step == observation.in_force), None)

@@ -331,6 +331,22 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     assert not made.observe(0, observation(30, 10, (4.0, 0.0)))
 
 
+def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
+    """Its steps are smaller, so time would never tell; one that goes on tells by its motion."""
+    made, place = alone()._roster, np.array([4.0, 0.0])
+    for in_force, left in ((NO_HORIZON, 0), (900, 1)):
+        known = made.known[0] = Known()
+        known.in_force = Sent(900, resting(900, place))
+        known.sent.append(Sent(1000, resting(1000, place)))
+        known.nearer_at, known.goal = 990, place
+        made.forget(0)
+        assert known.motions()
+        made.observe(0, observation(3 if in_force < 0 else 1001, in_force, (4.0, 0.0)))
+        assert len(known.sent) == left
+        assert not known.is_stuck(3, place, 0.0)
+        assert known.nearer_at == 3
+
+
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
 def test_a_motion_is_too_near_below_the_distance_and_what_pieces_bend(
     beyond_m: float, is_hit: bool
