@@ -14,24 +14,11 @@ FILES = [
     for folder in ("skytether", "server", "client", "netem", "shared", "tests")
     for file in sorted((ROOT / folder).rglob("*.py"))
 ]
-NOT_YET = {
-    "skytether/lab/benchmarks/footprint.py",
-    "skytether/lab/benchmarks/harness.py",
-    "skytether/lab/benchmarks/missions.py",
-    "skytether/lab/benchmarks/motions.py",
-    "skytether/lab/benchmarks/published.py",
-    "skytether/lab/benchmarks/tick.py",
-    "skytether/lab/benchmarks/together.py",
-    "skytether/lab/benchmarks/versions.py",
-    "skytether/shell/driver.py",
-}
-"""Files whose docstrings are not all rewritten yet; the set may only shrink."""
 NOUN_FIRST = [
     name
     for name in FILES
     if name.startswith("skytether/")
     and name.split("/")[1] not in {"server", "client", "netem", "shared"}
-    and name not in NOT_YET
 ]
 """Files whose docstrings begin with the noun that they describe, or with a verb."""
 PRONOUN = (

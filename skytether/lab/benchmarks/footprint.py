@@ -67,7 +67,7 @@ def measure(options: FootprintOptions) -> dict[str, Any]:
 
 
 def _installed(wheel: Path, extra: str, environment: Path, runs: int) -> dict[str, Any]:
-    """Install an extra so many times, and leave what is there."""
+    """Install an extra a number of times; the last installation stays."""
     what = f"skytether[{extra}] @ {wheel.as_uri()}"
     install = ["install", "--python", str(environment), "-c", "requirements-dev.lock", what]
     spent_s = []

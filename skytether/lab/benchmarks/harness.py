@@ -132,12 +132,12 @@ def without_gc() -> Iterator[None]:
 
 
 def progress(steps: Sequence[Step], title: str) -> Iterable[Step]:
-    """A bar that is drawn between the steps, not by a thread during them."""
+    """Progress bar, drawn between the steps and not by a thread during them."""
     return track(steps, title, console=CONSOLE, transient=True, auto_refresh=False)
 
 
 def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict[str, float]:
-    """Median and p99 [µs], of durations [ns] shared by so many."""
+    """Median and p99 of durations [ns], divided by a number of packets or vehicles [µs]."""
     p50, p99 = np.quantile(durations, [0.5, 0.99]) / 1000.0 / per
     return {"p50_us": float(p50), "p99_us": float(p99)}
 

@@ -4,8 +4,10 @@
 
 Each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and triangles in their way,
 and a network with losses up to one half, bursts up to two seconds and delays up to half a second.
-Goals are such that each vehicle has a way to its own. All that went wrong is told by its seed:
-`--first 17 --missions 1` flies that one again.
+Goals are such that each vehicle has a way to its own. With --harsh every link is also cut again and
+again, often for so long that the server takes the vehicle for gone, and in half of the missions the
+server dies, and begins anew without memory. All that went wrong is told by its seed: `--first 17
+--missions 1` flies that one again.
 """
 
 import sys
@@ -21,7 +23,7 @@ import numpy as np
 import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
-from skytether.lab.benchmarks.together import ARRIVED_M
+from skytether.lab.benchmarks.together import ARRIVED_M, MortalServer, deaths
 from skytether.server.control.routes import Routes
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
@@ -37,6 +39,10 @@ ROOM_M2 = 12.0
 """Area for each vehicle and zone [m²]."""
 GOAL_AT_S = 2.0
 """Time from which on all want to be at their goals [s]."""
+UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
+"""Ranges of the mean times between two cuts of a link, and for which it is cut [s]."""
+MORTAL = 0.5
+"""Share of the harsh missions in which the server dies."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,8 @@ class MissionsOptions:
     """Seed of the first."""
     duration: float = 120.0
     """Length of a flight [s]."""
+    harsh: bool = False
+    """Whether links are cut and servers die."""
     workers: int = 2
     """Number of processes."""
     markdown: Path | None = None
@@ -95,6 +103,9 @@ def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
     table["mission"]["zones"] = text
     table["link"]["connect_s"] = 60.0
     way = _network(rng)
+    if options.harsh:
+        cuts = stream(seed, "cuts")
+        way += f" & outages({cuts.uniform(*UP_S):.1f}, {cuts.uniform(*CUT_S):.1f})"
     table["network"] |= {"uplink": way, "downlink": way}
     return reading.check(table, f"mission {seed}")
 
@@ -159,7 +170,11 @@ def fly(options: MissionsOptions, seed: int) -> FlownMission:
         scenario = mission(options, seed, Path(folder))
         goals, kept = scenario.make_reference(), scenario.zones
         assert isinstance(goals, Mission)
-        record = flight.fly(scenario, vehicles=len(goals.vehicles))
+        count = len(goals.vehicles)
+        server = None
+        if options.harsh and stream(seed, "mortal").random() < MORTAL:
+            server = MortalServer(scenario, count, deaths(seed, options.duration))
+        record = flight.fly(scenario, vehicles=count, server=server)
     told, client = record.figures["client"]["by_vehicle"], record.client
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
@@ -224,7 +239,11 @@ def table(options: MissionsOptions) -> tuple[TextTable, list[FlownMission]]:
         "not all\narrived",
         "last arrival\np50, max [s]",
     ]
-    told = [each for each in flown if each.least_m < asked_m or each.clear_m < 0.0 or each.late]
+    told = [
+        each
+        for each in flown
+        if each.least_m < asked_m or each.clear_m < 0.0 or (each.late and not options.harsh)
+    ]
     return TextTable(headings, rows), told
 
 

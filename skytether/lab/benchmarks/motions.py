@@ -202,7 +202,7 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
 
 
 def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
-    """Vehicles that swap places on a circle."""
+    """Scenario of vehicles that swap places on a circle."""
     made = reading.load("swap")
     reference = msgspec.structs.replace(
         made.reference, shape=f"swap({vehicles})", radius_m=radius_m

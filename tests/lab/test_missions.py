@@ -1,0 +1,25 @@
+"""Random missions: reproducible, and harsh ones with links that are cut and servers that die."""
+
+from pathlib import Path
+
+import pytest
+
+from skytether.lab.benchmarks import missions
+from skytether.lab.benchmarks.missions import MissionsOptions
+
+
+def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
+    """Harsh ones are the same, over links that are cut as well."""
+    drawn = missions.mission(MissionsOptions(), 5, tmp_path)
+    again = missions.mission(MissionsOptions(harsh=True), 5, tmp_path)
+    assert again.mission == drawn.mission
+    assert again.network.uplink.text.startswith(f"{drawn.network.uplink.text} & outages(")
+
+
+@pytest.mark.long
+def test_harsh_missions_keep_apart() -> None:
+    """Who has not arrived there is no fault."""
+    table, told = missions.table(MissionsOptions(missions=6, harsh=True, duration=60.0))
+    assert told == []
+    assert sum(int(row[1]) for row in table.rows) == 6
+    assert all(float(row[2]) > 0.5 for row in table.rows)
