@@ -1,5 +1,6 @@
 """`fuzz`: whatever others send or write, only the documented error comes of it, and bounds hold."""
 
+import math
 from pathlib import Path
 from random import Random
 
@@ -151,6 +152,11 @@ def test_a_reader_that_forgets_an_error_is_found_out(
     monkeypatch.setattr(module, errors, (msgspec.DecodeError, McapError))
     with pytest.raises(raised):
         attack(TARGETS[name](tmp_path), 2_000)
+
+
+def test_figures_without_a_value_are_those_that_were_sent(tmp_path: Path) -> None:
+    """A NaN equals nothing, itself included: read in pieces it is the same all the same."""
+    TARGETS["feed"](tmp_path)(feed.encode(feed.Figures(time_ns=1, figures={"p50": math.nan})))
 
 
 # -- the command -----------------------------------------------------------------------------------
