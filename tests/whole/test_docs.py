@@ -204,6 +204,13 @@ def test_the_documented_pages_are_served(
             assert page.wait(60) in (0, command.INTERRUPTED), said
 
 
+WOKEN_LATE = re.compile(
+    r"vehicle \d+ ((brakes|hovers): its own computer woke it too late"
+    r"|flies a plan: a horizon has come)\n"
+)
+"""Lines of a vehicle whose process had no core for 0.1 s."""
+
+
 @pytest.mark.parametrize("document", ["docs/running.md", "docs/recordings.md", "docs/tour.md"])
 def test_the_documented_recordings_are_made_and_read(
     document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -217,7 +224,9 @@ def test_the_documented_recordings_are_made_and_read(
     for line in lines:
         short = "--duration 20" if "--virtual" in line else "--duration 5 --settle 0"
         made = warm.skytether(*shlex.split(line.replace("--duration 20", short))[1:])
-        assert (made.returncode, made.stderr) == (0, "")
+        # A flight in real time may have been woken late, beside all other tests.
+        said = made.stderr if "--virtual" in line else WOKEN_LATE.sub("", made.stderr)
+        assert (made.returncode, said) == (0, "")
         assert made.stdout.strip()
 
 
