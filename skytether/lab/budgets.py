@@ -32,12 +32,12 @@ from skytether.shared.scenario.schema import Scenario
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both ways and including heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen and flown: those above, and a little less than 0.12 of what
+"""Budgets for which points are chosen and flown: BUDGETS, and a little less than 0.12 of what
 the paper's scheme takes at every step, for the ratios that are asked for (`comparison.CLAIMS`)."""
 CLOSE = 1.05
 """Ratio of two thresholds between which no other is tried."""
 EFFORT_ROOM = 1.05
-"""Factor by which a chosen point may exceed the effort limit of a case."""
+"""Largest ratio of a chosen point's effort to the effort limit of its case."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
     "every step": {"vehicle.report": "always"},
     "by event": {"vehicle.report": "deviation(0.05) | silence(1)"},
@@ -243,7 +243,7 @@ class Plan:
         return {name: each.point for name, each in self._best().items()}
 
     def tuned(self, name: str) -> Scenario:
-        """Points of a contender at the found threshold, reporting at every step."""
+        """Scenario of a contender at the threshold that the search found, reporting at every step."""
         (point,) = (
             each
             for each in self.points

@@ -29,7 +29,8 @@ from skytether.shared.base.units import SECOND_NS
 BATCH_MAX = 128
 """Most datagrams in one call."""
 NEAR_NS, READINGS = 5_000, 4
-"""Time within which two clocks are read together [ns], and how often this is tried."""
+"""Largest time from one reading of a clock to the next for the two to count as simultaneous [ns],
+and number of attempts."""
 SIZE_MAX = 2048
 """Largest payload that `Batch.send` takes [B]: packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
