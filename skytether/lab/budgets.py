@@ -243,7 +243,7 @@ class Plan:
         return {name: each.point for name, each in self._best().items()}
 
     def tuned(self, name: str) -> Scenario:
-        """Scenario of a contender at the threshold that the search found, reporting at every step."""
+        """Scenario of a contender at the threshold found by the search, reporting at every step."""
         (point,) = (
             each
             for each in self.points
