@@ -9,8 +9,9 @@ must follow the braking curve (a: brake_mps2, g: gain):
     |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                               how far that takes it
     |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)            how fast it still is
 
-With feedback aboard, a finished horizon still leads the vehicle to the end point of its braking:
-then only the second line applies, relaxed by 1 m, until the horizon is dropped.
+With feedback aboard, a finished horizon still leads the vehicle to the point where the plan itself
+would stop, which is further ahead by as much as the vehicle lags behind the plan. Until the horizon
+is dropped, only the second line applies, with the distance from the reference at s and 1 m added.
 
 The vehicle must always stay within a disc around the reference, enlarged by 1 m and the stopping
 distance. And it must be near the reference once it flies a plan based on an observation made under
@@ -263,7 +264,7 @@ def _faults(
     time_s = client["step"] * dt
     position, velocity = client["state"][..., 0], client["state"][..., 1]
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
-    # A finished horizon is still in force; the vehicle comes to rest where the horizon leads.
+    # A finished horizon is still in force; the vehicle comes to rest where the plan would.
     led = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
     blind = ~covered & ~led
     begun = _begun(covered, led)
@@ -283,6 +284,7 @@ def _faults(
         return np.exp(-np.maximum(0.0, passed_s) / tau_s)
 
     travelled_m = np.linalg.norm(position - position[begun], axis=1)
+    behind_m = led * (NEAR_M + error_m[begun])  # behind the plan, which leads to the reference
     curve_mps = speed[begun] * left(since_s)
     curve_mps += gain * on_its_way * left(since_s - stopping_s)
     # Newest time under plans that the maker of the plan in force had observed.
@@ -298,7 +300,7 @@ def _faults(
             "it went {:.3g} m without a plan, where braking takes {:.3g} m",
             ~covered,
             travelled_m,
-            stop_m(speed[begun], on_its_way) + pushed_m + NEAR_M * led,
+            stop_m(speed[begun], on_its_way) + pushed_m + behind_m,
         ),
         (
             "it has {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",

@@ -229,19 +229,26 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 
 
 @pytest.mark.parametrize(
-    ("feedback", "is_held", "away_m", "outcome"),
+    ("feedback", "is_held", "behind_m", "away_m", "outcome"),
     [
-        (True, True, 0.9, "hovering"),
-        (True, True, 1.2, "flyaway"),
-        (True, False, 0.9, "flyaway"),
-        (False, True, 0.9, "flyaway"),
+        (True, True, 0.0, 0.9, "hovering"),
+        (True, True, 0.0, 1.2, "flyaway"),
+        (True, True, 0.5, 1.4, "hovering"),
+        (True, True, 0.5, 1.7, "flyaway"),
+        (True, False, 0.0, 0.9, "flyaway"),
+        (True, False, 0.5, 0.9, "flyaway"),
+        (False, True, 0.0, 0.9, "flyaway"),
     ],
 )
 def test_feedback_may_lead_back_after_a_horizon_s_end(
-    *, feedback: bool, is_held: bool, away_m: float, outcome: str
+    *, feedback: bool, is_held: bool, behind_m: float, away_m: float, outcome: str
 ) -> None:
-    """Feedback may move it by a metre while the horizon is held; at the end it is at rest."""
-    state, rest = PATH.copy(), PATH[400, :, 0]
+    """Feedback may move it by a metre, and by as much as it lags behind, while the horizon is held;
+    at the end it is at rest.
+    """
+    state = PATH.copy()
+    state[:, 0, 0] -= behind_m
+    rest = state[400, :, 0].copy()
     state[400:] = np.stack([rest, 0.0 * rest], axis=-1)
     state[500:, 0, 0] += away_m
     inputs = np.where(UNPLANNED[:, None], PATH[..., 1], [0.3, 0.0])
