@@ -22,12 +22,10 @@ from skytether.shared.base.kernel import (
     part,
 )
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SAMPLES, SPACING, Motion
 
 KNOTS = INTERVALS + JOIN_MAX + 1
 """Largest number of knots of a motion."""
-SAMPLES = 4
-"""Number of straight pieces that an interval of a motion is taken for."""
 NEARER_M = 1e-3
 """Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
 
@@ -123,7 +121,7 @@ def too_near(
 ) -> Flags:
     """Motions that may be flown to which another one comes too near, from a step on for ever.
 
-    Distances are those of straight pieces, SAMPLES an interval, which `bend_m` makes up for.
+    Distances are those of straight pieces, SAMPLES an interval, which `motion.bend_m` makes up for.
 
     Args:
         motion: by the steps in common.
@@ -146,11 +144,6 @@ def pieces_of(begin: int, end: int) -> Array:
     """Steps between which motions are taken for straight, until they rest; shape (n,)."""
     count = max(-(-(end - begin) * SAMPLES // SPACING), 1)
     return np.linspace(begin, begin + count * SPACING / SAMPLES, count + 1)
-
-
-def bend_m(acceleration_mps2: float, dt_s: float) -> float:
-    """Largest distance of a motion of at most this acceleration from its straight pieces [m]."""
-    return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
 
 
 class HalfPlanes(NamedTuple):

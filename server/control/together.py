@@ -49,9 +49,6 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 
-MARGIN_M = 0.03
-"""Margin beyond D with which motions are planned apart: for the time between the times at which a
-plan keeps D, and for the solver's tolerance [m]."""
 RESTS_MPS = 0.2
 """Measured speed up to which a vehicle rests [m/s]."""
 ARRIVED_M = 0.02
@@ -98,9 +95,10 @@ class Together:
         self.counts, self.left = roster.counts, roster.left
         self.observed_step = roster.observed_step
         mission = scenario.mission
-        self._apart_m = mission.separation_m + 2.0 * mission.tube_m
-        bend_m = apart.bend_m(float(np.sqrt(terms.axes)) * mission.acceleration_mps2, terms.dt_s)
-        self._tube_m, self._bend_m, self._dt_s = mission.tube_m, bend_m, terms.dt_s
+        clear = self._clear = scenario.clearances
+        self._keep_m = clear.apart_m + 2.0 * clear.bend_m
+        """Distance that straight pieces of motions keep from each other [m]."""
+        self._dt_s = terms.dt_s
         self._lead = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot from which on a motion differs from the one in force."""
         self._again = terms.age_max // 3
@@ -109,17 +107,17 @@ class Together:
         self._zones = scenario.zones
         self._aims = Aims(
             self._zones,
-            self._tube_m,
-            self._apart_m + MARGIN_M,
+            clear.tube_m,
+            clear.planned_apart_m,
             round(DETOUR_S / terms.dt_s),
             stream(scenario.seed, "together"),
         )
         self._repeating: list[Known] = []
         """Vehicles that are sent a motion once more at this step."""
-        kept, keep_m = self._lead // SPACING + 1, self._apart_m + 2.0 * bend_m
+        kept = self._lead // SPACING + 1
         self._scale = roster.flown.scale
         """Factors of the coordinates before distances of vehicles are taken; shape (axes,)."""
-        self._direct = Direct(self._plan, roster.flown, kept, keep_m, STUCK)
+        self._direct = Direct(self._plan, roster.flown, kept, self._keep_m, STUCK)
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
@@ -196,13 +194,13 @@ class Together:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
         for number in sorted(self._roster.absent):
             first = self._roster.begins_at(number)
-            if zone := zones.in_the_way(first[None], self._tube_m):
+            if zone := zones.in_the_way(first[None], self._clear.tube_m):
                 return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._roster.known.items():
             for motion in known.motions():
                 k = self._roster.now + self._roster.ahead(row)
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-                if zone := zones.in_the_way(points, self._tube_m + self._bend_m):
+                if zone := zones.in_the_way(points, self._clear.tube_m + self._clear.bend_m):
                     left_s = max(motion.last - k, 0) * self._dt_s
                     does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
                     number = self._roster.number_of(row)
@@ -310,11 +308,11 @@ class Together:
     def _to_pass(self, left: Aside, home: Array) -> bool:
         """Whether a vehicle has yet to pass the place that one has left for it."""
         way = self._way(left.asker, self._roster.goal(left.asker)) * self._scale
-        return bool(aside.off_way(home[None] * self._scale, way)[0] < self._apart_m + MARGIN_M)
+        return bool(aside.off_way(home[None] * self._scale, way)[0] < self._clear.planned_apart_m)
 
     def _ask(self, row: int, way: Array) -> None:
         """Ask the first vehicle that rests at its goal in another vehicle's way to step aside."""
-        keep_m, ends, homes = self._apart_m + MARGIN_M, list[tuple[int, Array]](), list[int]()
+        keep_m, ends, homes = self._clear.planned_apart_m, list[tuple[int, Array]](), list[int]()
         for other, each in self._roster.known.items():
             if other == row or each.in_force is None or not self._roster.rows.met[other]:
                 continue
@@ -336,7 +334,7 @@ class Together:
             self._scale,
             self._zones,
             self._aims.routes,
-            self._tube_m + MARGIN_M,
+            self._clear.planned_clear_m,
         )
         if free is not None:
             self.counts["asides"] += 1
@@ -389,13 +387,13 @@ class Together:
             plan.reach_m,
             row,
             self._roster.flown,
-            self._apart_m + MARGIN_M + self._roster.known[row].off_m,
+            self._clear.planned_apart_m + self._roster.known[row].off_m,
         )
         if not self._zones:
             return found
-        near = self._zones.planes(held, plan.reach_m + self._tube_m + MARGIN_M)
+        near = self._zones.planes(held, plan.reach_m + self._clear.planned_clear_m)
         # A vehicle that is nearer to a zone already need only come no nearer.
-        least = np.minimum(self._tube_m + MARGIN_M, near.away_m - 1e-4)
+        least = np.minimum(self._clear.planned_clear_m, near.away_m - 1e-4)
         least += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
             np.concatenate([found.at, near.at]),
@@ -424,9 +422,9 @@ class Together:
         common, base = (
             each._replace(first=each.first - ahead) for each in (motion, known.in_force.motion)
         )
-        keep_m = self._apart_m + 2.0 * self._bend_m + known.off_m
+        keep_m = self._keep_m + known.off_m
         hit = apart.too_near(common, base, k - ahead, row, self._roster.flown, keep_m)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-            hit[-1] = (self._zones.along(points) < self._tube_m + self._bend_m).any()
+            hit[-1] = (self._zones.along(points) < self._clear.tube_m + self._clear.bend_m).any()
         return hit

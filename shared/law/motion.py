@@ -17,6 +17,10 @@ INTERVALS = 12
 """Number of intervals that are planned."""
 JOIN_MAX = 3
 """Largest number of intervals before these, in which a motion is the one that is flown already."""
+SAMPLES = 4
+"""Number of straight pieces that an interval of a motion is taken for."""
+MARGIN_M = 0.03
+"""Least margin of a plan, see `Clearances` [m]."""
 
 
 Knots = Annotated[Array, 2]
@@ -60,6 +64,39 @@ class Motion(NamedTuple):
             self.position[knot] + t_s * v0 + 0.5 * t_s * t_s * acceleration,
             v0 + t_s * acceleration,
         )
+
+
+class Clearances(NamedTuple):
+    """Distances that motions of a mission keep [m]."""
+
+    apart_m: float
+    """Distance from each other: the required separation, and the tubes of both."""
+    tube_m: float
+    """Distance from zones: largest distance of a vehicle from its motion."""
+    bend_m: float
+    """Largest distance of a motion from its straight pieces, SAMPLES an interval."""
+
+    @property
+    def margin_m(self) -> float:
+        """Margin of a plan beyond these, between the times at which it keeps them, and for the
+        solver's tolerance [m].
+        """
+        return max(MARGIN_M, 2.0 * self.bend_m + 0.02)
+
+    @property
+    def planned_apart_m(self) -> float:
+        """Distance from each other with which motions are planned, goals included [m]."""
+        return self.apart_m + self.margin_m
+
+    @property
+    def planned_clear_m(self) -> float:
+        """Distance from zones with which motions are planned, goals included [m]."""
+        return self.tube_m + self.margin_m
+
+
+def bend_m(acceleration_mps2: float, dt_s: float) -> float:
+    """Largest distance of a motion of at most this acceleration from its straight pieces [m]."""
+    return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
 
 
 def resting(step: int, position: Array) -> Motion:

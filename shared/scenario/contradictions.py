@@ -161,14 +161,14 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
     except (OSError, ValueError):  # which `_no_reference` tells
         return
     assert isinstance(flown, Mission)
-    apart_m = mission.separation_m + 2.0 * mission.tube_m
+    apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
     for vehicle, place in goals.items():
         named = written({vehicle: place})
         near = [each for each, at in goals.items() if _away_m(mission, at - place) < apart_m]
         if vehicle not in flown.vehicles:
             yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
-        elif zone := scenario.zones.in_the_way(place[None], mission.tube_m):
-            yield "mission.goals", named, f"a place {mission.tube_m:g} m from {zone}"
+        elif zone := scenario.zones.in_the_way(place[None], clear_m):
+            yield "mission.goals", named, f"a place {clear_m:g} m from {zone}"
         elif near[0] != vehicle:
             yield (
                 "mission.goals",
@@ -190,20 +190,20 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
         expected = "false, or a goal of each vehicle at each time that one of them has one"
         yield "mission.allocate", "true", expected
         return
-    zones, room_m = scenario.zones, mission.tube_m
+    zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
     for vehicle in goals.vehicles if zones else ():
         for place in goals.goals(vehicle):
-            if zone := zones.in_the_way(place[None], room_m):
+            if zone := zones.in_the_way(place[None], clear_m):
                 at = ", ".join(f"{each:.3g}" for each in place)
-                expected = f"none within {room_m:g} m of the goal ({at}) of vehicle {vehicle}"
+                expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
                 yield "mission.zones", zone, expected
                 return
-    apart_m = mission.separation_m + 2.0 * mission.tube_m
-    found = goals.nearest(apart_m, mission.height_scale)
+    found = goals.nearest(scenario.clearances.planned_apart_m, mission.height_scale)
     if found:
         one, other, at_s, away_m = found
-        goals_of = f"the goals of vehicles {one} and {other} at {at_s:g} s"
-        expected = f"with 2 · mission.tube_m at most {away_m:.3g} m, as {goals_of}"
+        margin_m = scenario.clearances.margin_m
+        most = f"with 2 · mission.tube_m and {margin_m:g} m at most {away_m:.3g} m"
+        expected = f"{most}, as the goals of vehicles {one} and {other} at {at_s:g} s"
         yield "mission.separation_m", mission.separation_m, expected
 
 

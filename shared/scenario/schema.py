@@ -22,6 +22,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
+from skytether.shared.law.motion import Clearances, bend_m
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import policies, zones
 from skytether.shared.scenario import reference as shapes
@@ -598,6 +599,17 @@ class Scenario(Section, frozen=True):
     def is_mission(self) -> bool:
         """Whether vehicles have goals of their own, and keep apart."""
         return self.reference.shape.partition("(")[0].strip() in MISSIONS
+
+    @property
+    def clearances(self) -> Clearances:
+        """Distances that motions of a mission keep."""
+        mission = self.mission
+        most_mps2 = float(np.sqrt(self.model.axes)) * mission.acceleration_mps2
+        return Clearances(
+            mission.separation_m + 2.0 * mission.tube_m,
+            mission.tube_m,
+            bend_m(most_mps2, self.control.dt),
+        )
 
     @property
     def zones(self) -> Zones:

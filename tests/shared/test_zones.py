@@ -186,7 +186,7 @@ def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n
 @pytest.mark.parametrize(
     ("text", "goals", "said"),
     [
-        ("box(3, 5, -1, 1)", "", "none within 0.2 m of the goal (4, 0) of vehicle 1"),
+        ("box(3, 5, -1, 1)", "", "none within 0.23 m of the goal (4, 0) of vehicle 1"),
         ("fence(-1, 3, -1, 5)", "", "of the goal (4, 0) of vehicle 1"),
         ("geojson(missing.json)", "", "a file that can be read"),
         ("", "1,0,0,0\n2,0,0.5,0\n", "at most 0.5 m, as the goals of vehicles 1 and 2 at 0 s"),

@@ -88,8 +88,7 @@ def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
     half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
     text = " & ".join(_zones(rng, obstacles, half_m))
     file = folder / f"mission{seed}.csv"
-    kept = reading.load("swap").mission
-    apart_m = kept.separation_m + 2.0 * kept.tube_m
+    apart_m = reading.load("swap").clearances.apart_m
     begins, ends = _places(rng, vehicles, half_m, zones.parse(text, 2), apart_m)
     rows = [
         f"{number},{at_s},{x:.4f},{y:.4f}\n"

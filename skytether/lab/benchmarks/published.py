@@ -30,6 +30,7 @@ from skytether.server.control.scheme import Foresight
 from skytether.server.control.together import Together
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.motion import MARGIN_M
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
@@ -139,7 +140,7 @@ def scenario(task: Task, network: str, duration: float, seed: int, folder: Path)
     table["mission"] |= {
         "separation_m": task.separation_m,
         "height_m": task.separation_m * task.stretch,
-        "tube_m": task.tube_m,
+        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # which Skytether plans with besides
         "acceleration_mps2": 1.0,
     }
     table["vehicle"]["wind"] = 0.0
