@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from skytether.server.control.clear import seen
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.zones import Zones
 
@@ -91,8 +92,8 @@ class Graph:
         far = np.full((n, n), np.inf)
         np.fill_diagonal(far, 0.0)
         if n > 1:
-            seen = self.sees(self._nodes[here], self._nodes[there])
-            here, there = here[seen], there[seen]
+            sees = self.sees(self._nodes[here], self._nodes[there])
+            here, there = here[sees], there[sees]
             far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
             far[there, here] = far[here, there]
         after = np.where(np.isfinite(far), np.arange(n), -1)
@@ -120,14 +121,13 @@ class Graph:
 
     def sees(self, here: Array, there: Array) -> Flags:
         """Whether straight lines keep their distance; shape (n,), of two of shape (n, 2)."""
-        clear: Flags = self._zones.along(np.stack([here, there], axis=1)) > self._room_m - TINY_M
-        return clear
+        return seen(self._zones, here, there, self._room_m - TINY_M)
 
     def _lengths(self, here: Array) -> Array:
         """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
         nodes = self._nodes
-        seen = self.sees(np.broadcast_to(here, nodes.shape), nodes)
-        return np.where(seen, np.linalg.norm(nodes - here, axis=1), np.inf)
+        sees = self.sees(np.repeat(here, len(nodes), axis=0), nodes)
+        return np.where(sees, np.linalg.norm(nodes - here, axis=1), np.inf)
 
 
 def _nodes(zones: Zones, off_m: float) -> Array:

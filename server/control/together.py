@@ -35,6 +35,7 @@ from skytether.server.control import apart, aside
 from skytether.server.control.aims import DETOUR_S, TURN_BACK, Aims
 from skytether.server.control.apart import HalfPlanes
 from skytether.server.control.aside import ASIDE_S, Aside
+from skytether.server.control.clear import touches
 from skytether.server.control.direct import Direct
 from skytether.server.control.known import Known
 from skytether.server.control.motionplan import MotionPlan
@@ -192,6 +193,7 @@ class Together:
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
+        room_m = self._clear.tube_m + self._clear.bend_m
         for number in sorted(self._roster.absent):
             first = self._roster.begins_at(number)
             if zone := zones.in_the_way(first[None], self._clear.tube_m):
@@ -200,7 +202,8 @@ class Together:
             for motion in known.motions():
                 k = self._roster.now + self._roster.ahead(row)
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-                if zone := zones.in_the_way(points, self._clear.tube_m + self._clear.bend_m):
+                if touches(zones, points, room_m):
+                    zone = zones.in_the_way(points, room_m)
                     left_s = max(motion.last - k, 0) * self._dt_s
                     does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
                     number = self._roster.number_of(row)
@@ -426,5 +429,5 @@ class Together:
         hit = apart.too_near(common, base, k - ahead, row, self._roster.flown, keep_m)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-            hit[-1] = (self._zones.along(points) < self._clear.tube_m + self._clear.bend_m).any()
+            hit[-1] = touches(self._zones, points, self._clear.tube_m + self._clear.bend_m)
         return hit

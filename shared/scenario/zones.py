@@ -21,6 +21,7 @@ import numpy as np
 
 from skytether.shared.base.hint import hint
 from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.outlines import Outlines, is_near
 from skytether.shared.scenario.calls import calls
 from skytether.shared.scenario.policies import PolicyError
 
@@ -82,8 +83,8 @@ class Zones:
         """Sign of the distance from the border of a point inside."""
         self._low = np.array([zone.low_m for zone in zones])
         self._high = np.array([zone.high_m for zone in zones])
-        self._of = np.repeat(np.arange(len(zones)), sizes)
-        """Zone of each edge."""
+        self.outlines = _outlines(zones)
+        """Zones side by side, for straight pieces of ways."""
 
     def __bool__(self) -> bool:
         return bool(self.zones)
@@ -101,51 +102,18 @@ class Zones:
         signed = self._signed(points[:, :2], away)
         if points.shape[1] < 3:
             return signed
-        return self._with_height(signed, points[:, 2:], points[:, 2:])
-
-    def along(self, points: Array) -> Array:
-        """Least distance from what is forbidden on each straight piece between points [m].
-
-        It is never more than the true one, and 0 or less on a piece that touches a zone.
-
-        Args:
-            points: shape (n, axes), or pieces of shape (n, 2, axes).
-
-        Returns:
-            shape (n - 1,) or (n,); infinite without zones.
-        """
-        pieces = points if points.ndim == 3 else np.stack([points[:-1], points[1:]], axis=1)
-        if not self.zones:
-            return np.full(len(pieces), np.inf)
-        found: Array = self._least(pieces).min(axis=1)
-        return found
+        return self._with_height(signed, points[:, 2:])
 
     def in_the_way(self, points: Array, room_m: float) -> str:
         """Name of a zone that a way through points is nearer to than room_m; empty of none."""
-        if not self.zones:
-            return ""
-        pieces = np.stack([points, np.concatenate([points[1:], points[-1:]])], axis=1)
-        near = (self._least(pieces) < room_m).any(axis=0)
-        return next((self.zones[i].name for i in np.flatnonzero(near)), "")
-
-    def _least(self, pieces: Array) -> Array:
-        """See `along`, by zone; shape (n, zones)."""
-        here, there = pieces[:, 0, :2], pieces[:, 1, :2]
-        _, away = self._nearest(here)
-        _, after = self._nearest(there)
-        way = there - here
-        off = self._begin[None] - here[:, None]
-        t = np.einsum("ijk,ik->ij", off, way) / np.maximum((way**2).sum(axis=1), 1e-18)[:, None]
-        off -= np.clip(t, 0.0, 1.0)[:, :, None] * way[:, None]
-        least = np.minimum(np.minimum(away, after), np.linalg.norm(off, axis=2))
-        least[self._crosses(here, there)] = 0.0
-        each = np.minimum.reduceat(least, self._starts, axis=1)
-        within = (self._signed(here, away) <= 0.0) | (self._signed(there, after) <= 0.0)
-        each[within] = 0.0
-        if pieces.shape[2] > 2:
-            height = pieces[:, :, 2]
-            each = self._with_height(each, height.min(axis=1)[:, None], height.max(axis=1)[:, None])
-        return each
+        places = [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
+        pieces = list(zip(places, [*places[1:], places[-1]], strict=True))
+        for i, zone in enumerate(self.zones):
+            for (x0, y0, z0), (x1, y1, z1) in pieces:
+                low_m, high_m = min(z0, z1), max(z0, z1)
+                if is_near(self.outlines, i, x0, y0, x1, y1, low_m, high_m, room_m):
+                    return zone.name
+        return ""
 
     def planes(self, points: Array, reach_m: Array) -> Planes:
         """Half-planes between points and the zones that are near them.
@@ -209,28 +177,25 @@ class Zones:
         least = np.minimum.reduceat(away, self._starts, axis=1)
         return least * np.where(self._inside(points), self._sign, -self._sign)
 
-    def _crosses(self, here: Array, there: Array) -> Flags:
-        """Whether straight pieces cross edges; shape (n, edges)."""
-        begin, end = self._begin[None], (self._begin + self._along)[None]
-        here, there = here[:, None], there[:, None]
-
-        def side(a: Array, b: Array, c: Array) -> Array:
-            left, right = b - a, c - a
-            turned: Array = left[..., 0] * right[..., 1] - left[..., 1] * right[..., 0]
-            return turned
-
-        found: Flags = (side(here, there, begin) * side(here, there, end) < 0.0) & (
-            side(begin, end, here) * side(begin, end, there) < 0.0
-        )
-        return found
-
-    def _with_height(self, signed: Array, low: Array, high: Array) -> Array:
-        """Distances in space of what reaches from one height to another, by those in the plane."""
-        off = np.maximum(self._low - high, low - self._high)
+    def _with_height(self, signed: Array, height: Array) -> Array:
+        """Distances of points in space, by those in the plane and their heights; (n, zones)."""
+        off = np.maximum(self._low - height, height - self._high)
         apart = np.where(off > 0.0, np.hypot(off, np.maximum(signed, 0.0)), np.maximum(signed, off))
         # Within a fence: as far as from its nearest side, its floor and its ceiling.
-        within = np.minimum(signed, np.minimum(low - self._low, self._high - high))
+        within = np.minimum(signed, np.minimum(height - self._low, self._high - height))
         return np.where(self._sign > 0.0, within, apart)
+
+
+def _outlines(zones: Sequence[Zone]) -> Outlines:
+    """Outlines of zones; those with fewer edges are filled up with ones that do not count."""
+    counts = np.array([len(zone.corners) for zone in zones], dtype=np.float64)
+    edges, boxes = np.zeros((len(zones), int(counts.max(initial=0)), 4)), np.zeros((len(zones), 6))
+    for i, zone in enumerate(zones):
+        corners, n = zone.corners, len(zone.corners)
+        edges[i, :n, :2], edges[i, :n, 2:] = corners, np.roll(corners, -1, axis=0)
+        boxes[i, 0:4:2], boxes[i, 1:4:2] = corners.min(axis=0), corners.max(axis=0)
+        boxes[i, 4:] = zone.low_m, zone.high_m
+    return Outlines(edges, counts, boxes, np.array([float(zone.is_fence) for zone in zones]))
 
 
 def _facing(points: Array, places: Array, at: Indices) -> Planes:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skytether.server.control.clear import touches
 from skytether.server.control.routes import Routes
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, zones
@@ -73,11 +74,40 @@ def test_a_straight_piece_is_no_nearer_than_it_says(
     share = np.linspace(0.0, 1.0, 201)[:, None]
     points = ends[0] + share * (ends[1] - ends[0])
     least = float(kept.clearance(points).min())
-    said = float(kept.along(ends)[0])
-    assert said <= max(least, 0.0) + 1e-9
+    assert touches(kept, ends, max(least, 0.0) + 1e-6)
+    assert bool(kept.in_the_way(ends, least)) == touches(kept, ends, least)
     gap_m = float(np.linalg.norm(ends[1] - ends[0])) / 200.0
     if least > gap_m:
-        assert said >= least - gap_m
+        assert not touches(kept, ends, least - gap_m - 1e-9)
+
+
+@given(
+    st.lists(st.tuples(place, place, st.floats(-1.0, 6.0)), min_size=2, max_size=2),
+    st.floats(0.05, 1.0),
+    st.sampled_from(
+        [
+            "box(1, 2, -1, 1, 0, 3)",
+            "cylinder(0, 0, 1, 2, 3)",
+            "fence(-5, 5, -5, 5) & box(0, 1, 0, 1)",
+        ]
+    ),
+)
+def test_straight_pieces_in_space(
+    ends: list[tuple[float, float, float]], room_m: float, text: str
+) -> None:
+    """Where none of its points is near, the piece is not, unless it passes an edge beside them:
+    it is taken to be at all of its heights at once.
+    """
+    kept, given = zones.parse(text, 3), np.array(ends)
+    level = given.copy()
+    level[:, 2] = given[0, 2]
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    for piece, is_level in ((given, False), (level, True)):
+        least = float(kept.clearance(piece[0] + share * (piece[1] - piece[0])).min())
+        if least < room_m - 1e-9:
+            assert touches(kept, piece, room_m)
+        elif is_level and least > room_m + float(np.linalg.norm(piece[1] - piece[0])) / 200.0:
+            assert not touches(kept, piece, room_m)
 
 
 @given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
@@ -237,7 +267,7 @@ def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) 
     kept, begin = zones.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
     way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
     assert len(way) > 2
-    assert kept.along(way).min() >= 0.2 - 1e-6
+    assert not touches(kept, way, 0.2 - 1e-6)
     assert least_m < length_m(way) < 1.5 * least_m + 1.0
 
 
