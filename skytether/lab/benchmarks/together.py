@@ -11,11 +11,9 @@ from nothing, as vehicles do that fly to their goals by themselves.
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,7 +21,8 @@ import msgspec
 import numpy as np
 import tyro
 
-from skytether.lab.benchmarks.harness import TextTable, progress
+from skytether.lab.benchmarks.harness import TextTable
+from skytether.lab.benchmarks.kept import flights
 from skytether.server.control.known import Known
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
@@ -35,6 +34,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 from skytether.shared.telemetry.summary import least_separation
+from skytether.shell import command
 from skytether.sim import flight
 
 NETWORKS = {
@@ -76,6 +76,8 @@ class TogetherOptions:
     """Length of a flight [s]."""
     workers: int = 2
     """Number of processes."""
+    out: Path | None = None
+    """Folder that keeps the flights: after Ctrl-C, or with more, the same command goes on."""
     markdown: Path | None = None
     """File for the table as Markdown."""
 
@@ -85,8 +87,8 @@ class Swap(NamedTuple):
 
     least_m: float
     """Smallest distance between two vehicles [m]."""
-    arrived_s: float
-    """Time at which the last vehicle was at its goal for good [s]; NaN if one never was."""
+    arrived_s: float | None
+    """Time at which the last vehicle was at its goal for good [s]; None if one never was."""
     packets: float
     """Packets a second both ways, of a vehicle."""
     left: int
@@ -223,42 +225,49 @@ def fly(options: TogetherOptions, cell: tuple[str, str, int]) -> Swap:
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
     assert least is not None
-    arrived_s = []
+    arrived_s, is_late = [], False
     for rows, began in zip(each, began_s, strict=True):
         goal = goals.of(int(rows["vehicle"][0]))(np.array(options.duration))[:, 0]
         away = np.flatnonzero(np.linalg.norm(rows["state"][:, :, 0] - goal, axis=1) > ARRIVED_M)
-        last = int(away.max(initial=-1))
-        arrived_s.append(began + (last + 1) * dt_s if last + 1 < len(rows) else np.nan)
+        last = int(away.max(initial=-1)) + 1
+        arrived_s.append(began + last * dt_s)
+        is_late |= last == len(rows)
     packets = sum(record.figures["netem"][way]["packets"] for way in ("uplink", "downlink"))
     left = record.figures["server"]["counts"].get("left_tube", 0)
     share = options.vehicles * options.duration
-    return Swap(least, float(np.max(arrived_s) - min(began_s)), packets / share, left)
+    return Swap(least, None if is_late else max(arrived_s) - min(began_s), packets / share, left)
 
 
 def table(options: TogetherOptions) -> TextTable:
     """Fly every cell."""
     planners = list(PLANNERS)[: 1 if options.guaranteed else None]
-    kinds = list(product(planners, NETWORKS))
+    kinds = [(network, planner) for planner in planners for network in NETWORKS]
+    # By seeds first, so that more flights only add to the end.
+    cells = [(*kind, seed) for seed in range(1, options.flights + 1) for kind in kinds]
+    settings = {
+        "guaranteed": options.guaranteed,
+        "shape": options.shape,
+        "vehicles": options.vehicles,
+        "duration": options.duration,
+    }
+    done = flights(partial(fly, options), cells, Swap, settings, options.out, options.workers)
+    asked = reading.load(options.shape).mission.separation_m
     rows = []
-    with ProcessPoolExecutor(options.workers) as pool:
-        for planner, network in progress(kinds, "cells"):
-            cells = [(network, planner, seed) for seed in range(1, options.flights + 1)]
-            flown = list(pool.map(partial(fly, options), cells))
-            least = np.array([each.least_m for each in flown])
-            arrived = np.array([each.arrived_s for each in flown])
-            asked = reading.load(options.shape).mission.separation_m
-            done = arrived[np.isfinite(arrived)]
-            rows.append(
-                [
-                    f"{planner}, {network}",
-                    f"{least.min():.3f}",
-                    f"{int((least < asked).sum())} of {len(flown)}",
-                    f"{len(done)}",
-                    f"{np.median(done):.0f}, {done.max():.0f}" if len(done) else "-",
-                    f"{np.mean([each.packets for each in flown]):.2f}",
-                    f"{sum(each.left for each in flown)}",
-                ]
-            )
+    for i, (network, planner) in enumerate(kinds):
+        flown = done[i :: len(kinds)]
+        least = np.array([each.least_m for each in flown])
+        arrived = [each.arrived_s for each in flown if each.arrived_s is not None]
+        rows.append(
+            [
+                f"{planner}, {network}",
+                f"{least.min():.3f}",
+                f"{int((least < asked).sum())} of {len(flown)}",
+                f"{len(arrived)}",
+                f"{np.median(arrived):.0f}, {max(arrived):.0f}" if arrived else "-",
+                f"{np.mean([each.packets for each in flown]):.2f}",
+                f"{sum(each.left for each in flown)}",
+            ]
+        )
     headings = [
         "kept apart from, network",
         "least separation\n[m]",
@@ -271,15 +280,14 @@ def table(options: TogetherOptions) -> TextTable:
     return TextTable(headings, rows)
 
 
-def main() -> int:
+def main(argv: Sequence[str]) -> None:
     """Fly as the command line says, and print a table."""
-    options = tyro.cli(TogetherOptions, description=__doc__)
+    options = tyro.cli(TogetherOptions, args=argv, description=__doc__)
     found = table(options)
     found.show(f"{options.vehicles} vehicles swap places, {options.flights} flights a cell")
     if options.markdown:
         options.markdown.write_text(found.markdown())
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command.main(main, sys.argv[1:], "together"))
