@@ -162,14 +162,18 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
+    # Where others end: who is allocated which goal, the server alone finds out.
+    others = () if mission.allocate else flown.vehicles
+    ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     for vehicle, place in goals.items():
         named = written({vehicle: place})
-        near = [each for each, at in goals.items() if _away_m(mission, at - place) < apart_m]
+        near = [each for each, at in ends.items() if _away_m(mission, at - place) < apart_m]
+        ends[vehicle] = place
         if vehicle not in flown.vehicles:
             yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
         elif zone := scenario.zones.in_the_way(place[None], clear_m):
             yield "mission.goals", named, f"a place {clear_m:g} m from {zone}"
-        elif near[0] != vehicle:
+        elif near:
             yield (
                 "mission.goals",
                 named,

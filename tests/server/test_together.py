@@ -881,6 +881,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
             "goal(1, 7, 7) & goal(2, 7, 7.5)",
             "got goal(2, 7, 7.5), expected a place 0.93 m from the goal of vehicle 1",
         ),
+        ("goal(1, 3.2, 0)", "expected a place 0.93 m from the goal of vehicle 2"),
         ("goal(1, 1.1, 0)", "expected a place 0.23 m from box(-1, 1, -1, 1)"),
     ],
 )
