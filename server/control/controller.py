@@ -44,7 +44,7 @@ BLOCK = 128
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
 _PACKAGE = __name__.rpartition(".")[0]
-_MISSION = ("apart", "direct", "dual", "knots", "motionplan", "roster")
+_MISSION = ("apart", "clear", "direct", "dual", "knots", "motionplan", "roster")
 _SCHEMES = {
     "predictive": ("predictive", "planner", "exact"),
     "none": ("predictive", "planner", "exact"),
