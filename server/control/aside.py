@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.server.control.clear import touches
 from skytether.server.control.routes import Routes
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.zones import Zones
@@ -97,7 +98,7 @@ def place(
                 break
             there = found[i]
             near_m = np.linalg.norm((others - there) * scale, axis=1).min(initial=np.inf)
-            if near_m < apart_m or zones.in_the_way(there[None], room_m):
+            if near_m < apart_m or touches(zones, np.stack([there, there]), room_m):
                 continue
             back = np.concatenate([home[None], routes.way(home, there)])
             is_free = off_way(way[:1] * scale, back * scale)[0] > apart_m

@@ -196,7 +196,8 @@ class Together:
         room_m = self._clear.tube_m + self._clear.bend_m
         for number in sorted(self._roster.absent):
             first = self._roster.begins_at(number)
-            if zone := zones.in_the_way(first[None], self._clear.tube_m):
+            if touches(zones, np.stack([first, first]), self._clear.tube_m):
+                zone = zones.in_the_way(first[None], self._clear.tube_m)
                 return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._roster.known.items():
             for motion in known.motions():

@@ -196,12 +196,14 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
         return
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
     for vehicle in goals.vehicles if zones else ():
-        for place in goals.goals(vehicle):
-            if zone := zones.in_the_way(place[None], clear_m):
-                at = ", ".join(f"{each:.3g}" for each in place)
-                expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
-                yield "mission.zones", zone, expected
-                return
+        places = goals.goals(vehicle)
+        near = np.argwhere(zones.clearance(places) < clear_m)
+        if len(near):
+            goal, zone = near[0]
+            at = ", ".join(f"{each:.3g}" for each in places[goal])
+            expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
+            yield "mission.zones", zones.zones[zone].name, expected
+            return
     found = goals.nearest(scenario.clearances.planned_apart_m, mission.height_scale)
     if found:
         one, other, at_s, away_m = found
