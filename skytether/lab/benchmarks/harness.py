@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
@@ -179,8 +180,12 @@ def _version(package: str) -> str | None:
         return None
 
 
+@cache
 def _commit() -> str | None:
-    """Commit of the checkout, with a + where something has changed since; None without git."""
+    """Commit of the checkout, with a + where something has changed since; None without git.
+
+    It is asked once: a benchmark that writes down its figures changes the checkout.
+    """
     here = Path(__file__).parent
     try:
         done = subprocess.run(

@@ -10,6 +10,7 @@ turns with this one, and writes nothing.
 """
 
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -32,6 +33,8 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 MB = 1_000_000
+POLL_S = 0.01
+"""Interval at which the memory of a command is read that will end [s]."""
 
 
 class Start(NamedTuple):
@@ -142,7 +145,7 @@ def started(python: str, command: str, environment: Mapping[str, str]) -> StartC
         assert process.stdout is not None
         stack.enter_context(process.stdout)
         if ends:
-            process.stdout.read()
+            memory_bytes = _peak_bytes(process)
             _, status, used = os.wait4(process.pid, 0)
             process.returncode = os.waitstatus_to_exitcode(status)
             if process.returncode:
@@ -155,11 +158,27 @@ def started(python: str, command: str, environment: Mapping[str, str]) -> StartC
             sink.recv(1)
         wall_s = (time.monotonic_ns() - began_ns) / SECOND_NS
         if ends:
-            return StartCost(wall_s, used.ru_utime + used.ru_stime, 1024.0 * used.ru_maxrss)
+            return StartCost(wall_s, used.ru_utime + used.ru_stime, memory_bytes)
         there = Path(f"/proc/{process.pid}")
         spent_ns = sum(int(each.read_text().split()[0]) for each in there.glob("task/*/schedstat"))
         pages = int((there / "statm").read_text().split()[1])
         return StartCost(wall_s, spent_ns / SECOND_NS, pages * os.sysconf("SC_PAGE_SIZE"))
+
+
+def _peak_bytes(process: subprocess.Popen[bytes]) -> float:
+    """Most memory that a process has until it closes its output [B].
+
+    What the kernel tells of a process that has ended counts the memory of the one that started it,
+    which the two shared before `exec`.
+    """
+    assert process.stdout is not None
+    output, status, most_kb = process.stdout.fileno(), Path(f"/proc/{process.pid}/status"), 0
+    while True:
+        ready, _, _ = select.select([output], [], [], POLL_S)
+        told = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        most_kb = max(most_kb, int(told.get("VmHWM", "0 kB").split()[0]))
+        if ready and not os.read(output, 1 << 16):
+            return 1024.0 * most_kb
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
