@@ -4,7 +4,7 @@ One that is stuck finds its way around vehicles at rest as well for a while, and
 round, at last in directions that are drawn: so vehicles that meet pass each other.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -23,6 +23,8 @@ step back once it moves [rad]."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
 """Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
 long it does so [s]."""
+CLOSED_M = 0.6
+"""Distance ahead of a vehicle at which its way is closed; with wide tubes three of them [m]."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
 """Corners of an octagon around 0, of radius 1; shape (8, 2)."""
 TRIES = 5
@@ -44,6 +46,7 @@ class Aims:
         self, zones: Zones, tube_m: float, apart_m: float, detours: int, rng: np.random.Generator
     ) -> None:
         self._tube_m, self._apart_m, self._detours, self._rng = tube_m, apart_m, detours, rng
+        self._closed_m = max(CLOSED_M, 3.0 * tube_m)
         self.change_zones(zones)
 
     def change_zones(self, zones: Zones) -> None:
@@ -67,7 +70,7 @@ class Aims:
             goal: shape (axes,).
             rests: gives the places at which others rest [m]; shape (axes,) each.
         """
-        detour = known.detour if k < known.detour_until else None
+        detour = known.detour if k < known.detour_until or known.closed else None
         way = (detour or self.routes).way(place, goal)
         if not known.turned:
             if len(way) > 1:
@@ -75,7 +78,8 @@ class Aims:
             yield way[0]
             known.turned = TURN
             # Stuck: from now on, for a while, around those as well that rest on the way.
-            known.detour, known.detour_until = self._detour(place, goal, rests()), k + self._detours
+            known.detour = self._detour(place, goal, rests(), known.closed)
+            known.detour_until = k + self._detours
             way = known.detour.way(place, goal)
             yield _along(place, way, AHEAD_M)
         ahead = way[0, :2] - place[:2]
@@ -93,15 +97,50 @@ class Aims:
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
 
-    def _detour(self, place: Array, goal: Array, rests: Sequence[Array]) -> Routes:
-        """Ways around zones and the vehicles that rest near a place, but for those at the goal."""
+    def close(self, known: Known, place: Array, goal: Array) -> None:
+        """Take the way ahead of a vehicle for closed, until it has another goal.
+
+        Ways keep `tube_m` from zones, and motions a margin more: between two zones there may be
+        room for a way and not for a motion.
+
+        Args:
+            known: the vehicle.
+            place: where its plan begins [m]; shape (axes,).
+            goal: shape (axes,).
+        """
+        way = (known.detour or self.routes).way(place, goal)
+        known.closed.append(_along(place, way, self._closed_m))
+        known.detour = self._detour(place, goal, (), known.closed)
+
+    def _detour(
+        self, place: Array, goal: Array, rests: Iterable[Array], closed: Iterable[Array]
+    ) -> Routes:
+        """Ways around zones, closed places, and the vehicles that rest near a place, but for those
+        at the goal.
+        """
         zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m
         for at in rests:
             near_m = float(np.linalg.norm(at - place))
             if near_m < DETOUR_M and np.linalg.norm(at - goal) > self._apart_m:
-                radius_m = min(keep_m, near_m - self._tube_m) / np.cos(np.pi / len(AROUND))
-                zones.append(Zone("a vehicle", at[:2] + radius_m * AROUND))
+                radius_m = min(keep_m, near_m - self._tube_m)
+                zones.append(_octagon("a vehicle", at, radius_m, place))
+        for at in closed:
+            near_m = min(float(np.linalg.norm(at - each)) for each in (place, goal))
+            if near_m > 2.0 * self._tube_m:
+                radius_m = min(self._closed_m, near_m) - self._tube_m
+                zones.append(_octagon("a closed place", at, radius_m, place))
         return Routes(Zones(zones), self._tube_m)
+
+
+def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:
+    """Octagon around a circle, one side of it facing a place: seen from there, a corner in front of
+    the circle would be too near.
+    """
+    half = np.pi / len(AROUND)
+    x, y = seen_from[:2] - at[:2]
+    c, s = np.cos(np.arctan2(y, x) + half), np.sin(np.arctan2(y, x) + half)
+    corners = AROUND @ np.array([[c, s], [-s, c]])
+    return Zone(name, at[:2] + radius_m / np.cos(half) * corners)
 
 
 def _along(place: Array, way: Array, far_m: float) -> Array:

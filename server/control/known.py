@@ -5,6 +5,7 @@ or its acknowledgement that is lost costs the time until an observation says so,
 can be planned; so after such a loss the next ones are sent twice, and then three times.
 """
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ COPY_STEPS = 4
 """Steps from one time to the next."""
 PATIENCE = 120
 """Steps without coming nearer to its goal after which a vehicle asks another to step aside."""
+CLOSED_MAX = 8
+"""Largest number of places that are taken for closed."""
 NEARER_M = 0.3
 """Distance that counts as having come nearer [m]."""
 PROMPT = 8
@@ -54,6 +57,8 @@ class Known:
         """Ways around others that rest where it was stuck; None before it ever was."""
         self.detour_until = 0
         """Step up to which it takes them."""
+        self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
+        """Places on ways to its goal between zones that leave too little room [m]."""
         self.goal: Array | None = None
         """Goal to which it flew last [m]; shape (axes,); None before the first."""
         self.left_m = 0.0
@@ -80,6 +85,11 @@ class Known:
             flown.append(self.next)
         return flown
 
+    def forget_ways(self) -> None:
+        """Forget what was found out about ways to its goal."""
+        self.detour = None
+        self.closed.clear()
+
     def learn(self, prompt: bool) -> None:
         """Send motions more often where one, or its acknowledgement, was lost; less often later.
 
@@ -100,7 +110,10 @@ class Known:
             goal: where it flies to [m]; shape (axes,).
             left_m: length of the way that is left [m].
         """
-        if self.goal is None or (goal != self.goal).any() or left_m < self.left_m - NEARER_M:
+        if self.goal is None or (goal != self.goal).any():
+            self.forget_ways()
+            self.left_m = math.inf
+        if left_m < self.left_m - NEARER_M:
             self.goal, self.left_m, self.nearer_at = goal, left_m, step
         elif step - self.nearer_at >= PATIENCE:
             self.nearer_at = step

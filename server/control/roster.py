@@ -122,7 +122,8 @@ class Roster:
         self.rows.heard[row] = False
         if row in self.known:
             # Another life of the vehicle counts steps of its own.
-            self.known[row].goal = self.known[row].detour = None
+            self.known[row].goal = None
+            self.known[row].forget_ways()
 
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of one on no grid of its own."""

@@ -58,6 +58,8 @@ ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
+ZONE = "a zone"
+"""What a vehicle waits for that a zone holds back."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -190,6 +192,8 @@ class Together:
         """Keep out of other zones from now on, to which `objection` has nothing to say."""
         self._zones = zones
         self._aims.change_zones(zones)
+        for known in self._roster.known.values():
+            known.forget_ways()
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
@@ -281,6 +285,9 @@ class Together:
         if is_stuck:
             self._ask(row, way)
         self._find(row, known, k, goal)
+        if is_stuck and known.next is None and known.waits == ZONE:
+            self.counts["closed"] += 1
+            self._aims.close(known, place, goal)
 
     def _fly_straight(self, straight: list[Straight]) -> None:
         """Find motions of vehicles that may fly straight, one after the other; none are left."""
@@ -416,7 +423,7 @@ class Together:
         index, often = np.unique(binding, return_counts=True)
         most = int(index[often.argmax()])
         if most == self._roster.flown.count:
-            return "a zone"
+            return ZONE
         return f"vehicle {self._roster.number_of(int(self._roster.flown.of[most]))}"
 
     def _hit(self, row: int, motion: Motion, k: int) -> Flags:

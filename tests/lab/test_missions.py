@@ -6,6 +6,7 @@ import pytest
 
 from skytether.lab.benchmarks import missions
 from skytether.lab.benchmarks.missions import MissionsOptions
+from skytether.server.control.aims import Aims
 
 
 def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
@@ -23,3 +24,13 @@ def test_harsh_missions_keep_apart() -> None:
     assert told == []
     assert sum(int(row[1]) for row in table.rows) == 6
     assert all(float(row[2]) > 0.5 for row in table.rows)
+
+
+@pytest.mark.long
+def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A way fits through it and a motion does not. Ablation: else one vehicle stays before it."""
+    assert missions.fly(MissionsOptions(), 31463).late == 0
+    monkeypatch.setattr(Aims, "close", lambda *_: None)
+    assert missions.fly(MissionsOptions(), 31463).late == 1

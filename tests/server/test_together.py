@@ -19,7 +19,7 @@ from skytether.client.reporting import Reporter
 from skytether.lab.benchmarks import published
 from skytether.lab.benchmarks.together import MortalServer
 from skytether.server import sessions
-from skytether.server.control import apart, aside, motionplan
+from skytether.server.control import aims, apart, aside, motionplan
 from skytether.server.control import known as known_vehicles
 from skytether.server.control.aims import Aims
 from skytether.server.control.apart import FlownMotions
@@ -777,6 +777,19 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     assert left_over_m() < 0.3
     monkeypatch.setattr(Aims, "_detour", lambda self, *_: self.routes)
     assert left_over_m() > 1.0
+
+
+@given(st.floats(0.0, 2.0 * np.pi), st.floats(0.05, 3.0), st.floats(0.05, 1.0))
+def test_a_way_begins_where_an_octagon_faces_a_place(
+    angle: float, radius_m: float, room_m: float
+) -> None:
+    """However it lies, the place is as far from it as from the circle within."""
+    at = np.array([1.0, -2.0])
+    place = at + (radius_m + room_m) * np.array([np.cos(angle), np.sin(angle)])
+    zone = aims._octagon("a vehicle", at, radius_m, place)
+    assert Zones([zone]).clearance(place[None])[0, 0] == pytest.approx(room_m)
+    around = np.stack([np.cos(turns := np.linspace(0.0, 6.28, 50)), np.sin(turns)], axis=1)
+    assert Zones([zone]).clearance(at + radius_m * around).max() < 1e-9
 
 
 def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
