@@ -10,12 +10,12 @@ from nothing, as vehicles do that fly to their goals by themselves.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -29,7 +29,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Event
-from skytether.shared.law.motion import Motion
+from skytether.shared.law.motion import Clearances, Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
@@ -51,11 +51,8 @@ MORTAL = "10 %, a server that dies"
 """Network with which the server dies."""
 DEATHS, DOWN_S = 3, (0.5, 20.0)
 """Number of times that the server dies, and shortest and longest time that it is down [s]."""
-PLANNERS: dict[str, Callable[[list[Motion]], list[Motion]]] = {
-    "all that may be flown": lambda motions: motions,
-    "the newest alone": lambda motions: motions[-1:],
-    "nothing": lambda _: [],
-}
+ALL, NEWEST, NOTHING = "all that may be flown", "the newest alone", "nothing"
+PLANNERS = (ALL, NEWEST, NOTHING)
 """Motions of others that each planner keeps apart from."""
 ARRIVED_M = 0.3
 """Distance from its goal at which a vehicle has arrived [m]."""
@@ -180,16 +177,23 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 @contextmanager
 def planning(planner: str) -> Iterator[None]:
     """Have the server keep apart from some motions alone."""
-    real, some = Known.motions, PLANNERS[planner]
+    motions, clearances = Known.motions, cast(property, Scenario.clearances)
 
-    def motions(self: Known) -> list[Motion]:
-        return some(real(self))
+    def newest(self: Known) -> list[Motion]:
+        return motions(self)[-1:]
 
-    Known.motions = motions  # type: ignore[method-assign]
+    def touching(self: Scenario) -> Clearances:
+        return cast(Clearances, clearances.__get__(self))._replace(apart_m=-1.0)
+
+    known, scenario = cast(Any, Known), cast(Any, Scenario)
+    if planner == NEWEST:
+        known.motions = newest
+    if planner == NOTHING:
+        scenario.clearances = property(touching)
     try:
         yield
     finally:
-        Known.motions = real  # type: ignore[method-assign]
+        known.motions, scenario.clearances = motions, clearances
 
 
 def scenario(network: str, options: TogetherOptions, seed: int) -> Scenario:
@@ -240,7 +244,7 @@ def fly(options: TogetherOptions, cell: tuple[str, str, int]) -> Swap:
 
 def table(options: TogetherOptions) -> TextTable:
     """Fly every cell."""
-    planners = list(PLANNERS)[: 1 if options.guaranteed else None]
+    planners = PLANNERS[: 1 if options.guaranteed else None]
     kinds = [(network, planner) for planner in planners for network in NETWORKS]
     # By seeds first, so that more flights only add to the end.
     cells = [(*kind, seed) for seed in range(1, options.flights + 1) for kind in kinds]
