@@ -174,9 +174,11 @@ def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.
         page.get_by_role("option", name="sends the vehicle").click()
 
         def sent() -> bool:
-            """Whether a click on the map was taken; the first may be too early."""
+            """Whether a click on the map was taken; the first may be too early, or choose a vehicle
+            that is just there.
+            """
             page.mouse.click(720, 250)
-            return "goal(1, " in page.content()
+            return "mission.goals is " in page.content()
 
         until(sent, "the vehicle is sent there")
         picture(page, PICTURES / "mission-dark-wide.png")
