@@ -24,7 +24,8 @@ DETOUR_M, DETOUR_S = 5.0, 20.0
 """Distance up to which vehicles at rest are flown around by one that was stuck [m], and for how
 long it does so [s]."""
 CLOSED_M = 0.6
-"""Distance ahead of a vehicle at which its way is closed; with wide tubes three of them [m]."""
+"""Least distance ahead of a vehicle at which its way is closed [m]; it is three tubes where these
+are wider."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
 """Corners of an octagon around 0, of radius 1; shape (8, 2)."""
 TRIES = 5
@@ -70,8 +71,7 @@ class Aims:
             goal: shape (axes,).
             rests: gives the places at which others rest [m]; shape (axes,) each.
         """
-        detour = known.detour if k < known.detour_until or known.closed else None
-        way = (detour or self.routes).way(place, goal)
+        way = self._ways_of(known, k).way(place, goal)
         if not known.turned:
             if len(way) > 1:
                 yield _along(place, way, AHEAD_M)
@@ -97,7 +97,12 @@ class Aims:
             if known.turned > TURN_MAX:
                 known.turned = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
 
-    def close(self, known: Known, place: Array, goal: Array) -> None:
+    def _ways_of(self, known: Known, k: int) -> Routes:
+        """Ways that a vehicle takes at a step: around what it was stuck at, or around zones."""
+        is_taken = k < known.detour_until or known.closed
+        return known.detour if known.detour and is_taken else self.routes
+
+    def close(self, known: Known, k: int, place: Array, goal: Array) -> None:
         """Take the way ahead of a vehicle for closed, until it has another goal.
 
         Ways keep `tube_m` from zones, and motions a margin more: between two zones there may be
@@ -105,10 +110,11 @@ class Aims:
 
         Args:
             known: the vehicle.
+            k: its step.
             place: where its plan begins [m]; shape (axes,).
             goal: shape (axes,).
         """
-        way = (known.detour or self.routes).way(place, goal)
+        way = self._ways_of(known, k).way(place, goal)
         known.closed.append(_along(place, way, self._closed_m))
         known.detour = self._detour(place, goal, (), known.closed)
 

@@ -60,7 +60,8 @@ class Known:
         self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
         """Places on ways to its goal between zones that leave too little room [m]."""
         self.goal: Array | None = None
-        """Goal to which it flew last [m]; shape (axes,); None before the first."""
+        """Goal to which it flew last [m]; shape (axes,); None before the first, and where nothing
+        that was found out about ways to it holds any more."""
         self.left_m = 0.0
         """Shortest way that was ever left to that [m]."""
         self.nearer_at = 0
@@ -85,11 +86,6 @@ class Known:
             flown.append(self.next)
         return flown
 
-    def forget_ways(self) -> None:
-        """Forget what was found out about ways to its goal."""
-        self.detour = None
-        self.closed.clear()
-
     def learn(self, prompt: bool) -> None:
         """Send motions more often where one, or its acknowledgement, was lost; less often later.
 
@@ -111,7 +107,8 @@ class Known:
             left_m: length of the way that is left [m].
         """
         if self.goal is None or (goal != self.goal).any():
-            self.forget_ways()
+            self.detour = None
+            self.closed.clear()
             self.left_m = math.inf
         if left_m < self.left_m - NEARER_M:
             self.goal, self.left_m, self.nearer_at = goal, left_m, step

@@ -123,7 +123,6 @@ class Roster:
         if row in self.known:
             # Another life of the vehicle counts steps of its own.
             self.known[row].goal = None
-            self.known[row].forget_ways()
 
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of one on no grid of its own."""

@@ -59,7 +59,7 @@ ROUNDS = 5
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
 ZONE = "a zone"
-"""What a vehicle waits for that a zone holds back."""
+"""Reason why a vehicle waits that a zone holds back."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -193,7 +193,7 @@ class Together:
         self._zones = zones
         self._aims.change_zones(zones)
         for known in self._roster.known.values():
-            known.forget_ways()
+            known.goal = None  # what was found out about ways to it holds no more
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
@@ -287,7 +287,7 @@ class Together:
         self._find(row, known, k, goal)
         if is_stuck and known.next is None and known.waits == ZONE:
             self.counts["closed"] += 1
-            self._aims.close(known, place, goal)
+            self._aims.close(known, k, place, goal)
 
     def _fly_straight(self, straight: list[Straight]) -> None:
         """Find motions of vehicles that may fly straight, one after the other; none are left."""

@@ -85,12 +85,12 @@ class Clearances(NamedTuple):
 
     @property
     def planned_apart_m(self) -> float:
-        """Distance from each other with which motions are planned, goals included [m]."""
+        """Distance from each other that planned motions and goals keep [m]."""
         return self.apart_m + self.margin_m
 
     @property
     def planned_clear_m(self) -> float:
-        """Distance from zones with which motions are planned, goals included [m]."""
+        """Distance from zones that planned motions and goals keep [m]."""
         return self.tube_m + self.margin_m
 
 

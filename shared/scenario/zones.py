@@ -84,7 +84,7 @@ class Zones:
         self._low = np.array([zone.low_m for zone in zones])
         self._high = np.array([zone.high_m for zone in zones])
         self.outlines = _outlines(zones)
-        """Zones side by side, for straight pieces of ways."""
+        """Outlines of all zones, which straight pieces of ways are held against."""
 
     def __bool__(self) -> bool:
         return bool(self.zones)

@@ -19,7 +19,7 @@ def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_harsh_missions_keep_apart() -> None:
-    """Who has not arrived there is no fault."""
+    """Vehicles that have not arrived are no fault there."""
     table, told = missions.table(MissionsOptions(missions=6, harsh=True, duration=60.0))
     assert told == []
     assert sum(int(row[1]) for row in table.rows) == 6

@@ -40,7 +40,7 @@ ear = partial(Hearing, 2 * SECOND_NS, DT_NS, None)
     ids=["twice", "heartbeats are given", "as long as it remembers", "as the vehicle asks"],
 )
 def test_the_server_waits_longer_than_the_vehicle(link: LinkConfig, patience_s: float) -> None:
-    """Where heartbeats follow the loss, and no longer than it remembers a vehicle."""
+    """Twice as long where heartbeats follow the loss, but no longer than it remembers a vehicle."""
     assert link.patience_ns == round(patience_s * SECOND_NS)
 
 

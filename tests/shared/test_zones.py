@@ -95,8 +95,8 @@ def test_a_straight_piece_is_no_nearer_than_it_says(
 def test_straight_pieces_in_space(
     ends: list[tuple[float, float, float]], room_m: float, text: str
 ) -> None:
-    """Where none of its points is near, the piece is not, unless it passes an edge beside them:
-    it is taken to be at all of its heights at once.
+    """A piece is near if one of its points is. One that is not level may be taken for nearer, as if
+    it were at all of its heights at once.
     """
     kept, given = zones.parse(text, 3), np.array(ends)
     level = given.copy()

@@ -478,7 +478,7 @@ def test_two_crowded_sockets_are_heard_in_the_order_of_arrival() -> None:
 
 
 def test_a_quiet_socket_beside_a_crowded_one_shows_no_earlier_time() -> None:
-    """What came to the crowded one before, but is read later, is shown as come now."""
+    """A datagram that came to the crowded one before, but is read later, is shown as come now."""
     endpoint = send_to_both([[0] * 20, [0, 0, 0, 0, 1, 0, 0, 0, 0], [0] * 5 + [1, 1] + [0] * 5])
     assert {each.socket for each in endpoint.heard} == {0, 1}
     assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns

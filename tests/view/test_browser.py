@@ -174,8 +174,8 @@ def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.
         page.get_by_role("option", name="sends the vehicle").click()
 
         def sent() -> bool:
-            """Whether a click on the map was taken; the first may be too early, or choose a vehicle
-            that is just there.
+            """Whether a click on the map has sent a vehicle; the first click may be too early, or
+            choose another vehicle that happens to be there.
             """
             page.mouse.click(720, 250)
             return "mission.goals is " in page.content()
