@@ -25,6 +25,9 @@ DIRECTIONS = 12
 FURTHER = (1.2, 1.8, 2.7, 4.0)
 """Distances of such places from that goal, in those that vehicles keep."""
 
+NO_NEARER_M = 1e-4
+"""Distance by which one that is to come no nearer may, for its motion is followed in pieces [m]."""
+
 
 class Aside(NamedTuple):
     """Place of a vehicle that has stepped aside."""
@@ -40,20 +43,32 @@ class Aside(NamedTuple):
 def first_on(way: Array, homes: Array, apart_m: float) -> int | None:
     """Index of the first of some places that a way passes too near to; None where it passes none.
 
+    A place that is too near where the way begins is passed only if the way comes nearer to it.
+
     Args:
         way: where it begins, its corners and its end [m]; shape (n, axes).
         homes: the places [m]; shape (m, axes).
         apart_m: distance that vehicles keep [m].
     """
-    passed_m = 0.0
+    passed_m, least_m = 0.0, _least(homes, way[0], apart_m)
     for here, there in pairwise(way):
         if passed_m > AHEAD_M:
             break
-        near = np.flatnonzero(off_way(homes, np.stack([here, there])) < apart_m)
+        near = np.flatnonzero(off_way(homes, np.stack([here, there])) < least_m)
         if len(near):
             return int(near[np.linalg.norm(homes[near] - here, axis=1).argmin()])
         passed_m += float(np.linalg.norm(there - here))
     return None
+
+
+def _least(places: Array, at: Array, apart_m: float) -> Array:
+    """Distances that are kept between vehicles at some places and one at another [m]; shape (n,).
+
+    Plans keep a margin more than motions must: vehicles at rest may be nearer than that, and then
+    they need only come no nearer.
+    """
+    least: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
+    return least
 
 
 def off_way(places: Array, way: Array) -> Array:
@@ -88,6 +103,7 @@ def place(
         room_m: distance that is kept from zones [m].
     """
     turn = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    (from_asker_m,) = _least(home[None] * scale, way[0] * scale, apart_m)
     around = np.zeros((DIRECTIONS, len(home)))
     around[:, 0], around[:, 1] = np.cos(turn), np.sin(turn)
     for further in FURTHER:
@@ -101,7 +117,7 @@ def place(
             if near_m < apart_m or touches(zones, np.stack([there, there]), room_m):
                 continue
             back = np.concatenate([home[None], routes.way(home, there)])
-            is_free = off_way(way[:1] * scale, back * scale)[0] > apart_m
+            is_free = off_way(way[:1] * scale, back * scale)[0] > from_asker_m
             if is_free and routes.reaches(home, there):
                 return there
     return None

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgspec
 import numpy as np
@@ -36,7 +37,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import ChangeRefused, SessionEnded
-from skytether.shared.law.model import Indices
+from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.scenario import reading, zones
@@ -836,7 +837,7 @@ def test_a_place_to_step_aside_to_is_off_the_way(seed: int, axes: int) -> None:
 
 
 def test_the_first_vehicle_on_a_way_is_asked() -> None:
-    """Not one beside it, nor one that is far ahead."""
+    """Not one beside it, nor one that is far ahead, nor one that it leads away from."""
     way = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 9.0]])
     homes = np.array([[2.5, 1.0], [1.5, 0.5], [1.0, -1.5]])
     assert aside.off_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
@@ -847,6 +848,24 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
     assert aside.first_on(way, homes[2:], 0.9) is None
     assert aside.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
     assert aside.first_on(way, homes[:0], 0.9) is None
+    around = np.array([[-0.5, 0.5], [-0.5, -0.5], [0.6, 0.6]])
+    assert aside.first_on(way, around, 0.9) == 2
+
+
+def test_one_that_is_too_near_already_steps_aside_away_from_the_other() -> None:
+    """Vehicles at rest may be nearer than plans keep. Ablation: no place would be found for it."""
+    free = zones.Zones([])
+    home, way = np.array([0.91, 0.0]), np.array([[0.0, 0.0], [5.0, 0.0]])
+
+    def place() -> Array | None:
+        ones = np.ones(2)
+        return aside.place(home, way, way[:1], 0.93, ones, free, Routes(free, 0.2), 0.2)
+
+    found = place()
+    assert found is not None
+    assert aside.off_way(way[:1], np.stack([home, found]))[0] == pytest.approx(0.91)
+    with mock.patch.object(aside, "_least", lambda places, *_: np.full(len(places), 0.93)):
+        assert place() is None
 
 
 # -- missions --------------------------------------------------------------------------------------
