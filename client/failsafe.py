@@ -132,7 +132,7 @@ class Failsafe:
         armed: whether horizons may be flown at all, see `armed`.
         timeout_ns: time of silence after which the link is lost, and without a newer horizon after
             which the vehicle coasts [ns].
-        land_after_ns: time of hovering with a lost link after which it lands [ns].
+        land_after_ns: time of hovering with a lost link after which it lands [ns]; 0: never.
         changed: called whenever mode or reason have changed, with those before, the cause, and the
             time.
     """
@@ -284,7 +284,7 @@ class Failsafe:
             self.meet(Reason.OLD, now_ns=now_ns)
         if self.mode is not Mode.HOVER or not lost:
             self._alone_ns = now_ns
-        elif now_ns - self._alone_ns >= self._land_after_ns:
+        elif 0 < self._land_after_ns <= now_ns - self._alone_ns:
             self.meet(Reason.ALONE, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:

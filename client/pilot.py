@@ -21,7 +21,7 @@ from skytether.client.reporting import Reporter
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import MICROSECOND_NS
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
@@ -38,8 +38,6 @@ from skytether.shared.wire.protocol import (
 
 LAND_MPS = 0.5
 """Speed at which the vehicle descends to land [m/s]."""
-ALTITUDE = 2
-"""Axis of the altitude, where there is one."""
 STOPPED = (Mode.FAULT, Mode.MANUAL)
 """Modes in which nothing but zero is flown, at once."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})

@@ -3,6 +3,10 @@
 Distances along the third axis may count less than those in the plane: all are of coordinates that
 are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, higher than it is wide,
 as downwash asks for.
+
+In space a vehicle that hears nothing lands after a while. From the first step at which it may, it
+may be anywhere between its motion, which is at rest by then, and the ground. So in the end any two
+motions have to be apart side by side.
 """
 
 from collections.abc import Sequence
@@ -21,11 +25,13 @@ from skytether.shared.base.kernel import (
     making_part,
     part,
 )
-from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SAMPLES, SPACING, Motion
 
 KNOTS = INTERVALS + JOIN_MAX + 1
 """Largest number of knots of a motion."""
+NEVER = 2**62
+"""Step at which a vehicle lands that never does."""
 NEARER_M = 1e-3
 """Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
 
@@ -39,6 +45,8 @@ class Flown(NamedTuple):
     """Number of knots; shape (room,)."""
     of: I1
     """Row of the vehicle; shape (room,)."""
+    lands: I1
+    """First step at which it may begin to land; shape (room,)."""
     wide: F1
     """Distance to be kept beyond that from others [m]; shape (room,)."""
     position: F3
@@ -63,27 +71,30 @@ class FlownMotions:
         self.count = 0
         self.scale, self.dt_s = scale, dt_s
         room, axes = 64, len(scale)
-        numbers, widths = np.zeros((3, room), dtype=np.int64), np.zeros(room)
+        numbers, widths = np.zeros((4, room), dtype=np.int64), np.zeros(room)
         knots, corners = np.zeros((2, room, KNOTS, axes)), np.zeros((2, room, axes))
         self.arrays = Flown._make([*numbers, widths, *knots, *corners])
 
-    def replace(self, row: int, motions: Sequence[Motion], ahead: int, wide_m: float) -> None:
+    def replace(
+        self, row: int, motions: Sequence[Motion], ahead: int, lands: int, wide_m: float
+    ) -> None:
         """Replace all motions of a vehicle; see `add`."""
         self.count = _remove(self.arrays, self.count, row)
         for motion in motions:
-            self.add(row, motion, ahead, wide_m)
+            self.add(row, motion, ahead, lands, wide_m)
 
-    def add(self, row: int, motion: Motion, ahead: int, wide_m: float) -> None:
+    def add(self, row: int, motion: Motion, ahead: int, lands: int, wide_m: float) -> None:
         """Add a motion.
 
         Args:
             row: of the vehicle.
             motion: by the steps of its vehicle.
             ahead: number of steps by which that is ahead of those in common.
+            lands: first of those in common at which it may begin to land, or NEVER.
             wide_m: distance to be kept from it beyond that from others [m].
         """
         self.make_room(1)
-        _add(self.arrays, self.count, row, motion, ahead, wide_m, self.scale, self.dt_s)
+        _add(self.arrays, self.count, row, motion, ahead, lands, wide_m, self.scale, self.dt_s)
         self.count += 1
 
     def make_room(self, more: int) -> None:
@@ -117,7 +128,13 @@ def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, 
 
 
 def too_near(
-    motion: Motion, base: Motion, begin: int, row: int, flown: FlownMotions, keep_m: float
+    motion: Motion,
+    base: Motion,
+    begin: int,
+    row: int,
+    lands: int,
+    flown: FlownMotions,
+    keep_m: float,
 ) -> Flags:
     """Motions that may be flown to which another one comes too near, from a step on for ever.
 
@@ -129,6 +146,7 @@ def too_near(
             NEARER_M: it may always fly away.
         begin: step from which on.
         row: the vehicle's, whose own motions do not count.
+        lands: first step at which it may begin to land, or NEVER.
         flown: motions of all.
         keep_m: distance that is kept from them [m].
 
@@ -136,7 +154,8 @@ def too_near(
         shape (flown.count + 1,); the last, which is for zones, is False.
     """
     hit = np.zeros(flown.count + 1, dtype=np.bool_)
-    _too_near(motion, base, begin, row, flown.arrays, flown.scale, flown.dt_s, keep_m, hit)
+    those = flown.arrays, flown.scale, flown.dt_s
+    _too_near(motion, base, begin, row, lands, *those, keep_m, hit)
     return hit
 
 
@@ -165,7 +184,13 @@ class HalfPlanes(NamedTuple):
 
 
 def half_planes(
-    times: Array, held: Array, reach_m: Array, row: int, flown: FlownMotions, apart_m: float
+    times: Array,
+    held: Array,
+    reach_m: Array,
+    row: int,
+    lands: int,
+    flown: FlownMotions,
+    apart_m: float,
 ) -> HalfPlanes:
     """Half-planes normal to the lines from the others' motions to the one in force.
 
@@ -174,6 +199,7 @@ def half_planes(
         held: positions of the one in force then [m]; shape (n, axes).
         reach_m: distance from there within which the plan stays [m]; shape (n,).
         row: the vehicle's, whose own motions do not count.
+        lands: first step at which it may begin to land, or NEVER.
         flown: motions of all.
         apart_m: distance that is kept [m]; less where the one in force is nearer already.
     """
@@ -185,7 +211,7 @@ def half_planes(
         np.empty(most, dtype=np.int64),
     )
     those = flown.arrays, flown.count, flown.scale, flown.dt_s
-    n = _half_planes(times, held, reach_m, row, *those, apart_m, found)
+    n = _half_planes(times, held, reach_m, row, lands, *those, apart_m, found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
@@ -229,8 +255,8 @@ def flown_one(flown: Flown, m: int) -> Motion:
 
 
 @part
-def bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
-    """Fill in two corners of a box around a motion, scaled [m]."""
+def bound(motion: Motion, lands: int, scale: F1, dt_s: float, low: F1, high: F1) -> None:
+    """Fill in two corners of a box around a motion, and the landing behind it, scaled [m]."""
     position, velocity = motion.position, motion.velocity
     for x in range(len(scale)):
         low[x], high[x], turn = np.inf, -np.inf, 0.0
@@ -242,6 +268,8 @@ def bound(motion: Motion, scale: F1, dt_s: float, low: F1, high: F1) -> None:
         # Between two knots, T apart, a parabola is off the straight line by Δv T / 8 at most.
         bend = turn * SPACING * dt_s / 8.0
         low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
+        if x == ALTITUDE and lands < NEVER:
+            low[x] = min(low[x], 0.0)
 
 
 @part
@@ -256,11 +284,12 @@ def _is_far(flown: Flown, m: int, low: F1, high: F1, keep: float) -> bool:
 
 @part
 def _write(
-    flown: Flown, m: int, row: int, first: int, position: F2, velocity: F2, wide: float
+    flown: Flown, m: int, row: int, first: int, position: F2, velocity: F2, lands: int, wide: float
 ) -> None:
     """Write a motion down at a place, but for its box."""
     n, axes = position.shape
-    flown.first[m], flown.knots[m], flown.of[m], flown.wide[m] = first, n, row, wide
+    flown.first[m], flown.knots[m], flown.of[m] = first, n, row
+    flown.lands[m], flown.wide[m] = lands, wide
     for knot in range(n):
         for x in range(axes):
             flown.position[m, knot, x] = position[knot, x]
@@ -274,9 +303,9 @@ def _remove(flown: Flown, count: int, row: int) -> int:
         if flown.of[m] != row:
             continue
         count -= 1
-        n, wide = flown.knots[count], flown.wide[count]
+        n, lands, wide = flown.knots[count], flown.lands[count], flown.wide[count]
         position, velocity = flown.position[count, :n], flown.velocity[count, :n]
-        _write(flown, m, flown.of[count], flown.first[count], position, velocity, wide)
+        _write(flown, m, flown.of[count], flown.first[count], position, velocity, lands, wide)
         for x in range(flown.low.shape[1]):
             flown.low[m, x], flown.high[m, x] = flown.low[count, x], flown.high[count, x]
     return count
@@ -289,12 +318,13 @@ def _add(
     row: int,
     motion: Motion,
     ahead: int,
+    lands: int,
     wide: float,
     scale: F1,
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
-    write_down(flown, m, row, motion, ahead, wide, scale, dt_s)
+    write_down(flown, m, row, motion, ahead, lands, wide, scale, dt_s)
 
 
 @part
@@ -304,35 +334,81 @@ def write_down(
     row: int,
     motion: Motion,
     ahead: int,
+    lands: int,
     wide: float,
     scale: F1,
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
     first, position, velocity = motion.first - ahead, motion.position, motion.velocity
-    _write(flown, m, row, first, position, velocity, wide)
-    bound(motion, scale, dt_s, flown.low[m], flown.high[m])
+    _write(flown, m, row, first, position, velocity, lands, wide)
+    bound(motion, lands, scale, dt_s, flown.low[m], flown.high[m])
+
+
+@part
+def _is_down(lands: int, step: float, rest: bool) -> bool:
+    """Whether a vehicle may be on its way down.
+
+    Args:
+        lands: first step at which it may begin to land, or NEVER.
+        step: the present one.
+        rest: whether that is after all that is flown, and all have landed that ever do.
+    """
+    return step >= lands or (rest and lands < NEVER)
+
+
+@part
+def _above(away: float, one_lands: bool, other_lands: bool) -> float:
+    """Height of one vehicle above another that counts, each of which may be on its way down.
+
+    Args:
+        away: height of the motion of the first above that of the second; negative below it [m].
+        one_lands, other_lands: whether each may be landing, and so anywhere below its motion.
+    """
+    if (one_lands and away > 0.0) or (other_lands and away < 0.0):
+        return 0.0
+    return away
 
 
 @part
 def _least_apart(
-    one: Motion, other: Motion, begin: int, scale: F1, dt_s: float, here: F1, there: F1
+    one: Motion,
+    other: Motion,
+    begin: int,
+    one_lands: int,
+    other_lands: int,
+    scale: F1,
+    dt_s: float,
+    here: F1,
+    there: F1,
 ) -> float:
     """Least distance of two motions from a step on, of straight pieces [m].
 
     Args:
+        one_lands, other_lands: first step at which each vehicle may begin to land, or NEVER.
         here, there: scratch; shape (axes,).
     """
     longest = max(
         len(one.position) * SPACING + one.first, len(other.position) * SPACING + other.first
     )
     pieces = max(-(-(longest - SPACING - begin) * SAMPLES // SPACING), 1)
-    nearest = np.inf
-    for i in range(pieces + 1):
+    nearest, height = np.inf, 0.0
+    # One piece more than they fly: in the end both may have landed that ever do.
+    for i in range(pieces + 2):
         step = begin + i * (SPACING / SAMPLES)
+        one_down = _is_down(one_lands, step + SPACING / SAMPLES, i > pieces)
+        other_down = _is_down(other_lands, step + SPACING / SAMPLES, i > pieces)
         for x in range(len(scale)):
             away = _place(one, x, step, dt_s) - _place(other, x, step, dt_s)
+            passes = False
+            if x == ALTITUDE:
+                # Who passes the height of the other in this piece may do so anywhere in it.
+                passes = (one_down or other_down) and height * away < 0.0
+                height = away
+                away = 0.0 if passes else _above(away, one_down, other_down)
             here[x], there[x] = there[x] if i else scale[x] * away, scale[x] * away
+            if passes:
+                here[x] = 0.0
         way, off = 0.0, 0.0
         for x in range(len(scale)):
             way += (there[x] - here[x]) ** 2
@@ -353,6 +429,7 @@ def _too_near(
     base: Motion,
     begin: int,
     row: int,
+    lands: int,
     flown: Flown,
     scale: F1,
     dt_s: float,
@@ -361,10 +438,10 @@ def _too_near(
 ) -> None:
     """Fill in `too_near`."""
     scratch = np.empty((4, len(scale)))
-    bound(motion, scale, dt_s, scratch[2], scratch[3])
+    bound(motion, lands, scale, dt_s, scratch[2], scratch[3])
     for m in range(len(hit) - 1):
         if flown.of[m] != row:
-            hit[m] = is_hit(motion, base, begin, flown, m, scale, dt_s, keep, scratch)
+            hit[m] = is_hit(motion, base, begin, lands, flown, m, scale, dt_s, keep, scratch)
 
 
 @making_part
@@ -372,6 +449,7 @@ def is_hit(
     motion: Motion,
     base: Motion,
     begin: int,
+    lands: int,
     flown: Flown,
     m: int,
     scale: F1,
@@ -389,11 +467,12 @@ def is_hit(
     keep_m = keep + flown.wide[m]
     if _is_far(flown, m, low, high, keep_m):
         return False
-    other = flown_one(flown, m)
-    least = _least_apart(motion, other, begin, scale, dt_s, here, there)
+    other, down = flown_one(flown, m), flown.lands[m]
+    least = _least_apart(motion, other, begin, lands, down, scale, dt_s, here, there)
     if least >= keep_m:
         return False
-    return least < _least_apart(base, other, begin, scale, dt_s, here, there) - NEARER_M
+    held = _least_apart(base, other, begin, lands, down, scale, dt_s, here, there)
+    return least < held - NEARER_M
 
 
 @making_kernel
@@ -402,6 +481,7 @@ def _half_planes(
     held: F2,
     reach: F1,
     row: int,
+    lands: int,
     flown: Flown,
     count: int,
     scale: F1,
@@ -414,16 +494,24 @@ def _half_planes(
     place, off, low, high = np.empty((4, axes))
     for x in range(axes):
         low[x], high[x] = scale[x] * held[:, x].min(), scale[x] * held[:, x].max()
+        if x == ALTITUDE and lands < NEVER:
+            low[x] = min(low[x], 0.0)
     for m in range(count):
         keep = apart + flown.wide[m]
         if flown.of[m] == row or _is_far(flown, m, low, high, keep + reach.max()):
             continue
         other = flown_one(flown, m)
         for i in range(len(times)):
+            # At the last time all are at rest, and in the end down that ever land.
+            down = _is_down(lands, times[i], i == len(times) - 1)
+            other_down = _is_down(flown.lands[m], times[i], i == len(times) - 1)
             square = 0.0
             for x in range(axes):
                 place[x] = _place(other, x, times[i], dt_s)
-                off[x] = scale[x] * (held[i, x] - place[x])
+                away = held[i, x] - place[x]
+                if x == ALTITUDE:
+                    away = _above(away, down, other_down)
+                off[x] = scale[x] * away
                 square += off[x] * off[x]
             away = np.sqrt(square)
             # Out of reach, the constraint could never be active; at the very same place it has no

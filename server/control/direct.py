@@ -130,12 +130,12 @@ def _fly_direct(
         if math.sqrt(moved) < stuck * min(math.sqrt(far), 2.0) + NEAR:
             return i
         motion = Motion(begin, position[i], velocity[i])
-        bound(motion, scale, dt_s, scratch[2], scratch[3])
-        wide = flown.wide[own]
+        lands, wide = flown.lands[own], flown.wide[own]
+        bound(motion, lands, scale, dt_s, scratch[2], scratch[3])
         for m in range(total):
             if flown.of[m] != row and is_hit(
-                motion, base, begin, flown, m, scale, dt_s, keep + wide, scratch
+                motion, base, begin, lands, flown, m, scale, dt_s, keep + wide, scratch
             ):
                 return i
-        write_down(flown, total, row, motion, 0, wide, scale, dt_s)
+        write_down(flown, total, row, motion, 0, lands, wide, scale, dt_s)
     return len(rows)

@@ -10,16 +10,16 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from skytether.server.control.apart import FlownMotions
+from skytether.server.control.apart import NEVER, FlownMotions
 from skytether.server.control.known import Known, Sent, repeats_after
 from skytether.shared.base.kernel import B1, I1, making_kernel
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import NO_HORIZON, Observation
+from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
@@ -41,6 +41,8 @@ class VehicleRows(NamedTuple):
     """Number of the vehicle that was observed last."""
     observed_step: I1
     """Step of its newest observation; -1 before any."""
+    lands: I1
+    """First step at which it may begin to land, or NEVER."""
     unknown_until: I1
     """Step from which on a motion is over that another server has sent."""
     sent_step: I1
@@ -54,7 +56,10 @@ class VehicleRows(NamedTuple):
         ahead, number, sent_step, repeats_for = np.zeros((4, capacity), dtype=np.int64)
         met, heard = np.zeros((2, capacity), dtype=np.bool_)
         observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
-        return cls(ahead, met, heard, number, observed_step, unknown_until, sent_step, repeats_for)
+        lands = np.full(capacity, NEVER)
+        return cls(
+            ahead, met, heard, number, observed_step, lands, unknown_until, sent_step, repeats_for
+        )
 
 
 class Roster:
@@ -93,6 +98,8 @@ class Roster:
         self.absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
         """Numbers of vehicles on the mission that were not yet at rest where it begins."""
         self._tube_m, self._dt_s, self._join = scenario.mission.tube_m, terms.dt_s, terms.join
+        self._land_after = terms.land_after if scenario.lands else NEVER
+        """Steps of hovering in silence after which a vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """Time constant and deceleration with which it comes to rest without a motion [s, m/s²]."""
         self.now = 0
@@ -105,7 +112,7 @@ class Roster:
         """Scratch of `meet`: what is to be done for each vehicle, DECIDES and REPEATS; steps by
         which it is ahead; and the step of each that is known to be on the grid."""
         scale = np.ones(terms.axes)
-        scale[2:] = scenario.mission.height_scale
+        scale[ALTITUDE:] = scenario.mission.height_scale
         self.flown = FlownMotions(scale, terms.dt_s)
         """All motions that may be flown, but for those of rows that changed since `gather`."""
         self._changed: set[int] = set()
@@ -127,6 +134,11 @@ class Roster:
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of one on no grid of its own."""
         return int(self.rows.ahead[row])
+
+    def lands(self, row: int) -> int:
+        """First step in common at which a vehicle may begin to land, or NEVER."""
+        lands = int(self.rows.lands[row])
+        return lands if lands == NEVER else lands - self.ahead(row)
 
     def sent(self, row: int, step: int, motion: Motion) -> None:
         """Take note of a motion that is sent with the packet of a step."""
@@ -167,6 +179,7 @@ class Roster:
             known.in_force = found
         if k <= self.rows.unknown_until[row]:
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
+        self._expect_landing(row, observation)
         newest, motion = known.in_force
         self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
         while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
@@ -182,6 +195,20 @@ class Roster:
         self._changed.add(row)
         known.again = None
         self.rows.sent_step[row], self.rows.repeats_for[row] = known.repeats
+
+    def _expect_landing(self, row: int, observation: Observation) -> None:
+        """Take note of the first step at which a vehicle may begin to land."""
+        k, lands = observation.step, self.rows.lands
+        if self._land_after == NEVER:
+            return
+        match observation.mode:
+            case Mode.HOVER if lands[row] < NEVER:
+                # It may have hovered in silence for long, but not since before an earlier step.
+                lands[row] = max(lands[row], k)
+            case Mode.HOVER | Mode.LAND | Mode.MANUAL | Mode.FAULT:
+                lands[row] = k
+            case _:
+                lands[row] = k + self._land_after
 
     def _measure(self, row: int, known: Known, expected: Array) -> None:
         """Take note of how far a vehicle may be from where its motion has it."""
@@ -227,7 +254,7 @@ class Roster:
         for row in self._changed & self.known.keys():
             each = self.known[row]
             # All that may be flown, also those whose acknowledgement is still under way.
-            self.flown.replace(row, each.motions(), self.ahead(row), each.off_m)
+            self.flown.replace(row, each.motions(), self.ahead(row), self.lands(row), each.off_m)
         self._changed.clear()
 
     def goal(self, row: int) -> Array:

@@ -43,7 +43,7 @@ from skytether.server.control.moves import FIGURES, Figures
 from skytether.server.control.roster import DECIDES, REPEATS, Roster
 from skytether.server.control.scheme import Foresight
 from skytether.shared.base.chance import stream
-from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import SPACING, Motion
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import Scenario
@@ -118,8 +118,10 @@ class Together:
         self._repeating: list[Known] = []
         """Vehicles that are sent a motion once more at this step."""
         kept = self._lead // SPACING + 1
-        self._scale = roster.flown.scale
-        """Factors of the coordinates before distances of vehicles are taken; shape (axes,)."""
+        self._scale = roster.flown.scale.copy()
+        self._scale[ALTITUDE:] = scenario.rest_scale
+        """Factors of the coordinates before distances of vehicles at rest are taken; shape
+        (axes,)."""
         self._direct = Direct(self._plan, roster.flown, kept, self._keep_m, STUCK)
 
     def forget(self, row: int) -> None:
@@ -307,7 +309,8 @@ class Together:
         if known.next is None:
             self.counts["stuck"] += 1
         else:
-            self._roster.flown.add(row, known.next, self._roster.ahead(row), known.off_m)
+            ahead, lands = self._roster.ahead(row), self._roster.lands(row)
+            self._roster.flown.add(row, known.next, ahead, lands, known.off_m)
 
     def _way(self, row: int, goal: Array) -> Array:
         """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
@@ -397,6 +400,7 @@ class Together:
             held,
             plan.reach_m,
             row,
+            self._roster.lands(row),
             self._roster.flown,
             self._clear.planned_apart_m + self._roster.known[row].off_m,
         )
@@ -434,7 +438,8 @@ class Together:
             each._replace(first=each.first - ahead) for each in (motion, known.in_force.motion)
         )
         keep_m = self._keep_m + known.off_m
-        hit = apart.too_near(common, base, k - ahead, row, self._roster.flown, keep_m)
+        lands, flown = self._roster.lands(row), self._roster.flown
+        hit = apart.too_near(common, base, k - ahead, row, lands, flown, keep_m)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             hit[-1] = touches(self._zones, points, self._clear.tube_m + self._clear.bend_m)

@@ -23,6 +23,8 @@ Indices = NDArray[np.int64]
 """Rows of vehicles or step indices, one per vehicle; shape (n,)."""
 Flags = NDArray[np.bool_]
 """Flag of each vehicle; shape (n,)."""
+ALTITUDE = 2
+"""Axis of the altitude, where there is one."""
 
 
 class Axis(NamedTuple):

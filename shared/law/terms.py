@@ -54,6 +54,8 @@ class Terms(NamedTuple):
     """Largest age of the observation behind an input [s]."""
     join_s: float
     """Time after its first knot up to which a trajectory is taken [s]; 0: at any time."""
+    land_after_s: float
+    """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     shape: str
     """Shape of the desired trajectory."""
     radius_m: float
@@ -121,6 +123,11 @@ class Terms(NamedTuple):
     def join(self) -> int:
         """Steps after its first knot up to which a trajectory is taken; 0: at any time."""
         return seconds_to_ns(self.join_s) // self.dt_ns
+
+    @property
+    def land_after(self) -> int:
+        """Steps of hovering with a silent server after which the vehicle lands; 0: never."""
+        return seconds_to_ns(self.land_after_s) // self.dt_ns
 
     @property
     def brake(self) -> float:

@@ -18,7 +18,6 @@ from skytether.shared.scenario.schema import (
     TABLES,
     ControlConfig,
     DirectionConfig,
-    MissionConfig,
     Scenario,
 )
 from skytether.shared.scenario.triggers import make_trigger
@@ -165,9 +164,10 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
     # Where others end: who is allocated which goal, the server alone finds out.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
+    beside = " to the side" if scenario.lands else ""
     for vehicle, place in goals.items():
         named = written({vehicle: place})
-        near = [each for each, at in ends.items() if _away_m(mission, at - place) < apart_m]
+        near = [each for each, at in ends.items() if _away_m(scenario, at - place) < apart_m]
         ends[vehicle] = place
         if vehicle not in flown.vehicles:
             yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
@@ -177,13 +177,13 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
             yield (
                 "mission.goals",
                 named,
-                f"a place {apart_m:g} m from the goal of vehicle {near[0]}",
+                f"a place {apart_m:g} m{beside} from the goal of vehicle {near[0]}",
             )
 
 
-def _away_m(mission: MissionConfig, off: Array) -> float:
-    """Distance of two goals as `mission.height_m` has it [m]."""
-    return math.hypot(*off[:2], *(mission.height_scale * off[2:]))
+def _away_m(scenario: Scenario, off: Array) -> float:
+    """Distance of two goals as `mission.height_m` and landing have it [m]."""
+    return math.hypot(*off[:2], *(scenario.rest_scale * off[2:]))
 
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
@@ -204,12 +204,14 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
             expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
             yield "mission.zones", zones.zones[zone].name, expected
             return
-    found = goals.nearest(scenario.clearances.planned_apart_m, mission.height_scale)
+    found = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)
     if found:
         one, other, at_s, away_m = found
         margin_m = scenario.clearances.margin_m
         most = f"with 2 · mission.tube_m and {margin_m:g} m at most {away_m:.3g} m"
         expected = f"{most}, as the goals of vehicles {one} and {other} at {at_s:g} s"
+        if scenario.lands:
+            expected += " side by side, for both may land (vehicle.land_after_s = 0: never)"
         yield "mission.separation_m", mission.separation_m, expected
 
 

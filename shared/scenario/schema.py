@@ -220,8 +220,8 @@ class VehicleConfig(Section, frozen=True):
     slew_mps2: OfVehicle[Factor] = 50.0
     """Fastest change of the desired velocity on an axis [m/s²]; no limit where `exhausted` is
     `hold`."""
-    land_after_s: OfVehicle[Duration] = 10.0
-    """Time of hovering with a silent server after which the vehicle lands [s]."""
+    land_after_s: Term[Duration] = 10.0
+    """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     tau_s: OfVehicle[tuple[Factor, ...]] = ()
     """True time constant [s], one for all axes, or one each; left out: the model's."""
     gain: OfVehicle[Factors] = ()
@@ -562,6 +562,7 @@ class Scenario(Section, frozen=True):
             brake_mps2=vehicle.brake_mps2,
             age_max_s=self.link.age_max_s,
             join_s=self.link.join_s,
+            land_after_s=vehicle.land_after_s,
             shape=self._shape(),
             radius_m=reference.radius_m,
             period_s=reference.period_s,
@@ -612,13 +613,24 @@ class Scenario(Section, frozen=True):
         )
 
     @property
+    def lands(self) -> bool:
+        """Whether vehicles of a mission in space land by themselves when they hear nothing."""
+        return self.is_mission and self.model.axes > 2 and self.vehicle.land_after_s > 0.0
+
+    @property
+    def rest_scale(self) -> float:
+        """Factor of distances along the third axis where vehicles rest: 0 if they may land."""
+        return 0.0 if self.lands else self.mission.height_scale
+
+    @property
     def zones(self) -> Zones:
-        """Zones of a mission.
+        """Zones of a mission; nobody who may land is above one.
 
         Raises:
             PolicyError, OSError: there are none such.
         """
-        return zones.parse(self.mission.zones, self.model.axes)
+        found = zones.parse(self.mission.zones, self.model.axes)
+        return found.to_the_sky() if self.lands else found
 
     def entries(self) -> Iterator[Entry]:
         """Policies and shape that the scenario names."""

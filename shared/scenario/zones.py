@@ -89,6 +89,12 @@ class Zones:
     def __bool__(self) -> bool:
         return bool(self.zones)
 
+    def to_the_sky(self) -> "Zones":
+        """These zones, those to keep out of without an upper end: nobody is above them either."""
+        high = [math.inf if not zone.is_fence else zone.high_m for zone in self.zones]
+        raised = zip(self.zones, high, strict=True)
+        return Zones([zone._replace(high_m=high_m) for zone, high_m in raised])
+
     def clearance(self, points: Array) -> Array:
         """Distance of points from what is forbidden, negative within it [m].
 

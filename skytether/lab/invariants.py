@@ -18,12 +18,12 @@ import numpy as np
 
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.link import ClientLink
-from skytether.client.pilot import ALTITUDE, LAND_MPS
+from skytether.client.pilot import LAND_MPS
 from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
 from skytether.server.gate import Call, Gate, WayBack
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario

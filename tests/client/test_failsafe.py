@@ -384,6 +384,16 @@ def test_ten_seconds_of_hovering_alone_end_in_landing_for_good() -> None:
     assert hand.changes[-1] == ("land", "the server has been silent for long")
 
 
+def test_a_vehicle_that_never_lands_hovers_on() -> None:
+    """With `vehicle.land_after_s` 0; it flies again once the server is back."""
+    hand = tracking(vehicle={"land_after_s": 0.0})
+    hand.fly(40.0, beats=False)
+    assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
+    hand.fly(1.2)
+    hand.fly(0.2, plans=True)
+    assert hand.mode is Mode.TRACK
+
+
 def test_in_the_plane_landing_is_staying() -> None:
     """There is no down."""
     hand = tracking()

@@ -23,7 +23,7 @@ from skytether.server import sessions
 from skytether.server.control import aims, apart, aside, motionplan
 from skytether.server.control import known as known_vehicles
 from skytether.server.control.aims import Aims
-from skytether.server.control.apart import FlownMotions
+from skytether.server.control.apart import NEVER, FlownMotions, HalfPlanes
 from skytether.server.control.clock import ClockMap
 from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
@@ -234,13 +234,13 @@ def test_planned_together_or_one_by_one_motions_are_the_same(
 # -- distances of motions --------------------------------------------------------------------------
 
 
-def drawn(rng: np.random.Generator, knots: int) -> Motion:
+def drawn(rng: np.random.Generator, knots: int, axes: int = 2) -> Motion:
     """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
     T = SPACING * DT_S
-    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, 2)), axis=0)
+    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, axes)), axis=0)
     velocity[-1] = 0.0
     moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
-    position = rng.uniform(-4.0, 4.0, 2) + np.vstack([np.zeros((1, 2)), moved])
+    position = rng.uniform(-4.0, 4.0, axes) + np.vstack([np.zeros((1, axes)), moved])
     return Motion(int(rng.integers(10)) * SPACING, position, velocity)
 
 
@@ -252,9 +252,9 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
     motion, base, *others = (drawn(rng, int(rng.integers(1, 17))) for _ in range(12))
     flown = FlownMotions(scale, DT_S)
     for row, other in enumerate(others):
-        flown.replace(row, [drawn(rng, 5)], 0, 0.0)  # which is replaced by others
-        flown.replace(row, [other, other], 0, 0.1 * row)
-    flown.replace(3, [], 0, 0.0)
+        flown.replace(row, [drawn(rng, 5)], 0, NEVER, 0.0)  # which is replaced by others
+        flown.replace(row, [other, other], 0, NEVER, 0.1 * row)
+    flown.replace(3, [], 0, NEVER, 0.0)
 
     def least_m(one: Motion, other: Motion) -> float:
         steps = apart.pieces_of(begin, max(one.last, other.last))
@@ -264,11 +264,57 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
         t = np.clip(-(away[:-1] * along).sum(axis=1) / square, 0.0, 1.0)
         return float(np.linalg.norm(away[:-1] + t[:, None] * along, axis=1).min())
 
-    hit = apart.too_near(motion, base, begin, 1, flown, keep_m)
+    hit = apart.too_near(motion, base, begin, 1, NEVER, flown, keep_m)
     assert sorted(flown.of) == sorted([0, 1, 2, 4, 5, 6, 7, 8, 9] * 2)
     for row, is_hit in zip(flown.of, hit[:-1], strict=True):
         least, already = least_m(motion, others[row]), least_m(base, others[row])
         assert is_hit == (row != 1 and least < min(keep_m + 0.1 * row, already - 1e-3))
+
+
+@given(st.integers(0, 2**31), st.integers(0, 150), st.integers(0, 150))
+def test_vehicles_that_may_land_come_too_near_below_their_motions(
+    seed: int, lands: int, others_land: int
+) -> None:
+    """From the step on at which each may begin to, and in the end wherever they are."""
+    rng, scale, keep_m = np.random.default_rng(seed), np.array([1.0, 1.0, 0.5]), 1.0
+    up, each = np.array([0.0, 0.0, 9.0]), (drawn(rng, 13, 3), drawn(rng, 13, 3))
+    motion, other = (low._replace(position=low.position + up) for low in each)
+    flown = FlownMotions(scale, DT_S)
+    flown.add(1, other, 0, others_land, 0.0)
+    far = resting(0, np.array([100.0, 0.0, 0.0]))
+    hit = apart.too_near(motion, far, 0, 0, lands, flown, keep_m)[0]
+
+    def least_m(early: int) -> float:
+        steps = np.append(np.arange(0.0, 240.0, 0.25), 1e6)
+        away = motion.at(steps, DT_S)[0] - other.at(steps, DT_S)[0]
+        down = (away[:, 2] > 0) & (steps >= lands - early)
+        others_down = (away[:, 2] < 0) & (steps >= others_land - early)
+        away[down | others_down, 2] = 0.0
+        return float(np.linalg.norm(away * scale, axis=1).min())
+
+    if least_m(0) < keep_m - 1e-3:
+        assert hit
+    if hit:
+        # A piece is 2.5 steps long, in which one of them may have passed the other's height.
+        assert least_m(3) < keep_m + 0.25
+
+
+def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
+    """It would pass 3 m below; in the end it is to rest beside it, also if neither lands yet."""
+    above, times = resting(0, np.array([0.0, 0.0, 4.0])), np.arange(0.0, 121.0, 5.0)
+    held = np.tile([1.5, 0.0, 1.0], (len(times), 1))
+    flown, reach_m = FlownMotions(np.ones(3), DT_S), np.full(len(times), 9.0)
+
+    def planes(lands: int, others_land: int) -> HalfPlanes:
+        flown.replace(1, [above], 0, others_land, 0.0)
+        return apart.half_planes(times, held, reach_m, 0, lands, flown, 0.9)
+
+    assert np.abs(planes(NEVER, NEVER).normal[:, 2]).min() > 0.5
+    found = planes(200, 60)
+    level = np.abs(found.normal[:, 2]) < 1e-12
+    assert times[found.at[level]].tolist() == [t for t in times.tolist() if t >= 60]
+    found = planes(200, 200)
+    assert times[found.at[np.abs(found.normal[:, 2]) < 1e-12]].tolist() == [120.0]
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.5])
@@ -668,13 +714,8 @@ def mission_of(name: str) -> Mission:
 def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
     """For downwash; a zone is flown around at its own heights alone."""
     rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
-    (tmp_path / "goals.csv").write_text(f"vehicle,t,x,y,z\n{rows}")
-    table = reading.to_table(reading.load("swap"))
-    table |= {"duration": 30.0}
-    table["model"]["axes"] = 3
-    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
-    table["mission"] |= {"height_m": 1.0, "zones": "box(-1, 1, -4, 1, 1.8, 3)"}
-    high = reading.check(table, "high")
+    table = in_space(tmp_path, rows, height_m=1.0, zones="box(-1, 1, -4, 1, 1.8, 3)")
+    high = reading.check(table | {"duration": 30.0}, "high")
     flown = flight.fly(high, vehicles=2)
     one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
     steps = min(len(one), len(other))
@@ -885,6 +926,122 @@ def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
     file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n")
     with pytest.raises(ConfigError, match=r"mission\.allocate: .* a goal of each vehicle at each"):
         reading.check(table, "mission")
+
+
+# -- landing ---------------------------------------------------------------------------------------
+
+
+def in_space(folder: Path, rows: str, **mission: Any) -> dict[str, Any]:
+    """Table of a scenario of vehicles in space; their goals are put into a folder."""
+    (folder / "goals.csv").write_text(f"vehicle,t,x,y,z\n{rows}")
+    table = reading.to_table(reading.load("swap"))
+    table["model"]["axes"] = 3
+    table["reference"] |= {"shape": "mission", "file": str(folder / "goals.csv")}
+    table["mission"] |= mission
+    return table
+
+
+class CutOff(Server):
+    """A server that neither hears nor reaches vehicle 1 after its first five seconds."""
+
+    since_s = 0.0
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`; the times are those of the day at whose midnight the flight begins."""
+        self.since_s = now_ns / SECOND_NS % 86_400
+        if datagram.peer[1] != 1 or self.since_s < 5.0:
+            super().receive(datagram, now_ns=now_ns)
+
+    def outbox(self) -> list[Datagram]:
+        """See `Endpoint`."""
+        sent = super().outbox()
+        return [each for each in sent if each.peer[1] != 1 or self.since_s < 5.0]
+
+
+def test_nobody_is_below_a_vehicle_that_lands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It hears nothing and lands, while another one is to pass below. Ablation: they meet."""
+    goals = "1,0,0,0,4\n2,0,-4,0,1\n2,43.2,4,0,1\n"
+    passing = reading.check(in_space(tmp_path, goals) | {"duration": 65.0}, "passing")
+
+    def fly() -> tuple[float, Rows, Rows]:
+        server = CutOff(passing, boot_id=1, entropy=stream(1, "entropy").bytes, room=2)
+        flown = flight.fly(passing, vehicles=2, server=server)
+        one, other = each_of(flown)
+        assert (one["mode"] == Mode.LAND).any()
+        assert one["state"][-1, 2, 0] < 0.1
+        assert np.linalg.norm(other["state"][-1, :, 0] - [4.0, 0.0, 1.0]) < 0.3
+        return separation_m(flown), one, other
+
+    kept_m, _, other = fly()
+    assert kept_m > 0.5
+    assert np.abs(other["state"][:, 1, 0]).max() > 0.8
+    monkeypatch.setattr(Roster, "_expect_landing", lambda *_: None)
+    kept_m, _, other = fly()
+    assert kept_m < 0.4
+    assert np.abs(other["state"][:, 1, 0]).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("before", "mode", "lands"),
+    [
+        (None, Mode.TRACK, 700),
+        (None, Mode.BRAKE, 700),
+        (None, Mode.HOVER, 500),
+        (Mode.TRACK, Mode.HOVER, 600),
+        (Mode.TRACK, Mode.LAND, 500),
+        (Mode.HOVER, Mode.MANUAL, 500),
+    ],
+)
+def test_when_a_vehicle_may_begin_to_land(
+    before: Mode | None, mode: Mode, lands: int, tmp_path: Path
+) -> None:
+    """10 s of hovering in silence after it was seen to do something else; at once if it hovers."""
+    flown = reading.check(in_space(tmp_path, "1,0,0,0,2\n"), "hover")
+    goals = flown.make_reference()
+    assert isinstance(goals, Mission)
+    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+    assert roster.lands(0) == NEVER
+    state = np.zeros((3, 2))
+    for k, does in ((400, before), (500, mode)):
+        if does is not None:
+            said = Observation(1, 1, k, NO_HORIZON, 0, 0, 0, does, 1, state, NO_INPUT)
+            assert roster.observe(0, said)
+    assert roster.lands(0) == lands
+    roster.rows.ahead[0] = 40
+    assert roster.lands(0) == lands - 40
+
+
+@pytest.mark.parametrize(
+    ("goals", "zones_text", "said"),
+    [
+        ("1,0,0,0,1\n2,0,0.5,0,9\n", "", "at 0 s side by side, for both may land (vehicle.land_"),
+        ("1,0,0,0,9\n", "box(-1, 1, -1, 1, 0, 2)", "expected none within 0.23 m of the goal"),
+    ],
+)
+def test_nobody_may_rest_above_what_it_must_not_land_on(
+    goals: str, zones_text: str, said: str, tmp_path: Path
+) -> None:
+    """A vehicle or a zone; where nobody ever lands, they may."""
+    table = in_space(tmp_path, goals, zones=zones_text)
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        reading.check(table, "above")
+    table["vehicle"]["land_after_s"] = 0.0
+    reading.check(table, "above")
+
+
+def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
+    """Where vehicles may land."""
+    table = in_space(tmp_path, "1,0,0,0,1\n2,0,5,0,1\n", goals="goal(2, 0.5, 0, 9)")
+    said = "expected a place 0.93 m to the side from the goal of vehicle 1"
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        reading.check(table, "above")
+    table["vehicle"]["land_after_s"] = 0.0
+    reading.check(table, "above")
+
+
+# -- goals in flight -------------------------------------------------------------------------------
 
 
 def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:

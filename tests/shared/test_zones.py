@@ -125,6 +125,17 @@ def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, 
         assert ((corners - planes.border[0]) @ planes.normal[0]).max() < 1e-9
 
 
+def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
+    """Below it they may be; a fence stays as it is."""
+    kept = zones.parse("box(0, 1, 0, 1, 2, 3) & fence(-5, 5, -5, 5)", 3)
+    points = np.array([[0.5, 0.5, 1.0], [0.5, 0.5, 9.0]])
+    assert kept.clearance(points)[:, 0].tolist() == [1.0, 6.0]
+    raised = kept.to_the_sky()
+    assert raised.clearance(points)[:, 0].tolist() == [1.0, -0.5]
+    assert [zone.is_fence for zone in raised.zones] == [False, True]
+    assert raised.clearance(points)[:, 1].tolist() == kept.clearance(points)[:, 1].tolist()
+
+
 # -- what is written -------------------------------------------------------------------------------
 
 

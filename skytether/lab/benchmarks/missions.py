@@ -6,8 +6,9 @@ Each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and tri
 and a network with losses up to one half, bursts up to two seconds and delays up to half a second.
 Goals are such that each vehicle has a way to its own. With --harsh every link is also cut again and
 again, often for so long that the server takes the vehicle for gone, and in half of the missions the
-server dies, and begins anew without memory. All that went wrong is told by its seed: `--first 17
---missions 1` flies that one again.
+server dies, and begins anew without memory. With --space they fly at any height, some zones end
+below or begin above them, and whoever hears nothing for 40 s lands. All that went wrong is told by
+its seed: `--first 17 --missions 1` flies that one again.
 """
 
 import sys
@@ -42,6 +43,8 @@ GOAL_AT_S = 2.0
 """Time from which on all want to be at their goals [s]."""
 UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
 """Ranges of the mean times between two cuts of a link, and for which it is cut [s]."""
+HIGH_M = 6.0
+"""Greatest height of a goal in space [m]; the least is a sixth of it."""
 MORTAL = 0.5
 """Share of the harsh missions in which the server dies."""
 
@@ -57,6 +60,8 @@ class MissionsOptions:
     """Length of a flight [s]."""
     harsh: bool = False
     """Whether links are cut and servers die."""
+    space: bool = False
+    """Whether vehicles fly in space."""
     workers: int = 2
     """Number of processes."""
     out: Path | None = None
@@ -81,6 +86,8 @@ class FlownMission(NamedTuple):
     """Time from the goals to the last arrival [s]; None if one has not."""
     left: int
     """Observations of a vehicle outside its tube."""
+    landed: int = 0
+    """Number of vehicles that have landed."""
 
 
 def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
@@ -89,20 +96,26 @@ def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
     vehicles = int(rng.integers(2, 33))
     obstacles = int(rng.integers(0, 7))
     half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
-    text = " & ".join(_zones(rng, obstacles, half_m))
+    shapes = list(_zones(rng, obstacles, half_m))
     file = folder / f"mission{seed}.csv"
     apart_m = reading.load("swap").clearances.apart_m
-    begins, ends = _places(rng, vehicles, half_m, zones.parse(text, 2), apart_m)
+    kept = zones.parse(" & ".join(shapes), 2)
+    places, columns = _places(rng, vehicles, half_m, kept, apart_m), "vehicle,t,x,y"
+    if options.space:
+        heights = stream(seed, "heights")
+        shapes = [_between(heights, each) for each in shapes]
+        high_m = heights.uniform(HIGH_M / 6.0, HIGH_M, (2, vehicles, 1))
+        places, columns = np.concatenate([places, high_m], axis=2), f"{columns},z"
     rows = [
-        f"{number},{at_s},{x:.4f},{y:.4f}\n"
-        for number, both in enumerate(zip(begins, ends, strict=True), start=1)
-        for at_s, (x, y) in zip((0.0, GOAL_AT_S), both, strict=True)
+        ",".join([str(number), str(at_s), *(f"{each:.4f}" for each in place)])
+        for number, both in enumerate(places.swapaxes(0, 1), start=1)
+        for at_s, place in zip((0.0, GOAL_AT_S), both, strict=True)
     ]
-    file.write_text("vehicle,t,x,y\n" + "".join(rows))
-    table = reading.to_table(reading.load("swap"))
+    file.write_text("\n".join([columns, *rows, ""]))
+    table = reading.to_table(reading.load("sphere" if options.space else "swap"))
     table |= {"seed": seed, "duration": options.duration, "settle": 1.0}
     table["reference"] |= {"shape": "mission", "file": str(file)}
-    table["mission"]["zones"] = text
+    table["mission"]["zones"] = " & ".join(shapes)
     table["link"]["connect_s"] = 60.0
     way = _network(rng)
     if options.harsh:
@@ -128,10 +141,17 @@ def _zones(rng: np.random.Generator, count: int, half_m: float) -> Iterator[str]
                 yield f"polygon({', '.join(f'{each:.2f}' for each in corners.ravel())})"
 
 
+def _between(heights: np.random.Generator, shape: str) -> str:
+    """A box or cylinder between two heights; any other zone as it is."""
+    low_m, thick_m = heights.uniform(0.0, HIGH_M), heights.uniform(0.5, 3.0)
+    is_high = shape.startswith(("box", "cylinder"))
+    return f"{shape[:-1]}, {low_m:.2f}, {low_m + thick_m:.2f})" if is_high else shape
+
+
 def _places(
     rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
-) -> tuple[Array, Array]:
-    """Starts and goals of the vehicles [m]; two of shape (vehicles, 2)."""
+) -> Array:
+    """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
     room_m = 0.75 * apart_m  # from zones: past a vehicle at its goal there is a way
     routes, found = Routes(kept, room_m), list[Array]()
     while len(found) < 2:
@@ -149,7 +169,7 @@ def _places(
                 break
         else:
             found.clear()  # too full: begin anew
-    return found[0], found[1]
+    return np.stack(found)
 
 
 def _network(rng: np.random.Generator) -> str:
@@ -189,7 +209,7 @@ def _flown(options: MissionsOptions, seed: int) -> FlownMission:
     told, client = record.figures["client"]["by_vehicle"], record.client
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
-    least = least_separation(each, began_s, scenario.control.dt)
+    least = least_separation(each, began_s, scenario.control.dt, scenario.mission.height_scale)
     assert least is not None
     arrived_s, clear_m, late = [], [], 0
     for rows in each:
@@ -210,13 +230,19 @@ def _flown(options: MissionsOptions, seed: int) -> FlownMission:
         late,
         None if late else max(arrived_s),
         record.figures["server"]["counts"].get("left_tube", 0),
+        sum(bool((rows["mode"] == Mode.LAND).any()) for rows in each),
     )
 
 
 def table(options: MissionsOptions) -> tuple[TextTable, list[FlownMission]]:
     """Fly all; what was seen, and those of which something is to be told."""
     seeds = range(options.first, options.first + options.missions)
-    settings = {"first": options.first, "duration": options.duration, "harsh": options.harsh}
+    settings = {
+        "first": options.first,
+        "duration": options.duration,
+        "harsh": options.harsh,
+        "space": options.space,
+    }
     work = partial(fly, options)
     flown = flights(work, seeds, FlownMission, settings, options.out, options.workers)
     asked_m = reading.load("swap").mission.separation_m
@@ -235,6 +261,7 @@ def table(options: MissionsOptions) -> tuple[TextTable, list[FlownMission]]:
                 f"{min(each.clear_m for each in those):.3f}",
                 str(sum(each.clear_m < 0.0 for each in those)),
                 str(sum(each.left for each in those)),
+                str(sum(each.landed for each in those)),
                 str(len(those) - len(done)),
                 f"{np.median(done):.0f}, {max(done):.0f}" if done else "-",
             ]
@@ -247,6 +274,7 @@ def table(options: MissionsOptions) -> tuple[TextTable, list[FlownMission]]:
         "least distance\nfrom a zone [m]",
         "in a zone",
         "out of a tube",
+        "landed",
         "not all\narrived",
         "last arrival\np50, max [s]",
     ]

@@ -143,7 +143,8 @@ def scenario(task: Task, network: str, duration: float, seed: int, folder: Path)
         "tube_m": task.tube_m - 0.5 * MARGIN_M,  # which Skytether plans with besides
         "acceleration_mps2": 1.0,
     }
-    table["vehicle"]["wind"] = 0.0
+    # Places one above the other are no places to land from.
+    table["vehicle"] |= {"wind": 0.0, "land_after_s": 0.0}
     table["sensor"] |= {"position_noise_m": 0.00228682, "velocity_noise_mps": 0.0109302}
     way, table["link"]["join_s"] = NETWORKS[network]
     table["network"] |= {"uplink": way, "downlink": way}
