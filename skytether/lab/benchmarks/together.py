@@ -4,9 +4,10 @@
 
 Each cell is so many flights of the scenario `swap` in virtual time: how near two vehicles came, how
 often nearer than asked for, and when the last arrived. In one the server dies three times a flight,
-for 0.5 to 20 s, and begins anew without memory. Beside it fly two planners that forget what may be
-flown: one keeps apart from the newest motion of each vehicle, as if every packet arrived, and one
-from nothing, as vehicles do that fly to their goals by themselves.
+for 0.5 to 20 s, and begins anew without memory. Beside it flies a planner for vehicles that, when
+they hear nothing, may brake anywhere on their way, and need not fly it to its end. Two more forget
+what may be flown: one keeps apart from the newest motion of each vehicle, as if every packet
+arrived, and one from nothing, as vehicles do that fly to their goals by themselves.
 """
 
 import sys
@@ -23,13 +24,17 @@ import tyro
 
 from skytether.lab.benchmarks.harness import TextTable
 from skytether.lab.benchmarks.kept import flights
+from skytether.server.control.apart import KNOTS
+from skytether.server.control.direct import Direct
 from skytether.server.control.known import Known
+from skytether.server.control.together import Together
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Event
-from skytether.shared.law.motion import Clearances, Motion
+from skytether.shared.law.model import Flags
+from skytether.shared.law.motion import SPACING, Clearances, Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
@@ -51,9 +56,12 @@ MORTAL = "10 %, a server that dies"
 """Network with which the server dies."""
 DEATHS, DOWN_S = 3, (0.5, 20.0)
 """Number of times that the server dies, and shortest and longest time that it is down [s]."""
-ALL, NEWEST, NOTHING = "all that may be flown", "the newest alone", "nothing"
-PLANNERS = (ALL, NEWEST, NOTHING)
+ALL, BRAKING = "all that may be flown", "the same, braked anywhere"
+NEWEST, NOTHING = "the newest alone", "nothing"
+PLANNERS = (ALL, BRAKING, NEWEST, NOTHING)
 """Motions of others that each planner keeps apart from."""
+SWAP = reading.load("swap")
+"""Scenario that is flown."""
 ARRIVED_M = 0.3
 """Distance from its goal at which a vehicle has arrived [m]."""
 
@@ -178,14 +186,27 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 def planning(planner: str) -> Iterator[None]:
     """Have the server keep apart from some motions alone."""
     motions, clearances = Known.motions, cast(property, Scenario.clearances)
+    hits, straight = Together._hit, Direct.motions
 
     def newest(self: Known) -> list[Motion]:
         return motions(self)[-1:]
+
+    def braked_too(self: Known) -> list[Motion]:
+        found, since = motions(self), self.in_force.step if self.in_force else 0
+        return found + [stop for motion in found for stop in stops(motion, since)]
+
+    def also_braked(self: Together, row: int, motion: Motion, k: int) -> Flags:
+        each = (motion, *stops(motion, k))
+        return np.logical_or.reduce([hits(self, row, flown, k) for flown in each])
 
     def touching(self: Scenario) -> Clearances:
         return cast(Clearances, clearances.__get__(self))._replace(apart_m=-1.0)
 
     known, scenario = cast(Any, Known), cast(Any, Scenario)
+    together, direct = cast(Any, Together), cast(Any, Direct)
+    if planner == BRAKING:
+        known.motions, together._hit = braked_too, also_braked
+        direct.motions = lambda *_: []  # of a vehicle that is not braked
     if planner == NEWEST:
         known.motions = newest
     if planner == NOTHING:
@@ -194,6 +215,25 @@ def planning(planner: str) -> Iterator[None]:
         yield
     finally:
         known.motions, scenario.clearances = motions, clearances
+        together._hit, direct.motions = hits, straight
+
+
+def stops(motion: Motion, since: int) -> list[Motion]:
+    """Motions of a vehicle that brakes on its way, from each knot after a step on.
+
+    A failsafe takes about as far, with the time constant and the deceleration of the scenario.
+    """
+    dt_s, found = SWAP.control.dt, []
+    T, slower = SPACING * dt_s, SPACING * dt_s * SWAP.mission.acceleration_mps2
+    for knot in range(max(-(-(since - motion.first) // SPACING), 0), len(motion.position) - 1):
+        position, velocity = [*motion.position[: knot + 1]], [*motion.velocity[: knot + 1]]
+        while velocity[-1].any():
+            v = np.sign(velocity[-1]) * np.maximum(np.abs(velocity[-1]) - slower, 0.0)
+            position.append(position[-1] + 0.5 * T * (velocity[-1] + v))
+            velocity.append(v)
+        if motion.velocity[knot].any() and len(position) <= KNOTS:
+            found.append(Motion(motion.first, np.array(position), np.array(velocity)))
+    return found
 
 
 def scenario(network: str, options: TogetherOptions, seed: int) -> Scenario:

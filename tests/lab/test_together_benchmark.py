@@ -1,0 +1,40 @@
+"""Planners beside the one that keeps apart from all motions that may be flown."""
+
+import numpy as np
+
+from skytether.lab.benchmarks import together
+from skytether.lab.benchmarks.together import ALL, BRAKING, SWAP, TogetherOptions
+from skytether.server.control.together import Together
+from skytether.shared.law.motion import SPACING, Motion
+
+
+def test_a_vehicle_may_brake_from_each_knot_on() -> None:
+    """It flies its way up to there, slows down as fast as it may, and rests."""
+    T, slower = SPACING * SWAP.control.dt, SPACING * SWAP.control.dt * 0.6
+    velocity = np.array([[0.0, 0.0], [0.3, -0.2], [0.5, -0.2], [0.2, 0.0], [0.0, 0.0]])
+    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
+    motion = Motion(20, np.vstack([np.zeros(2), moved]), velocity)
+    found = together.stops(motion, 31)
+    assert [len(stop.position) for stop in found] == [5, 5]
+    for knot, stop in zip((2, 3), found, strict=True):
+        assert stop.first == 20
+        assert (stop.velocity[: knot + 1] == velocity[: knot + 1]).all()
+        assert (stop.position[: knot + 1] == motion.position[: knot + 1]).all()
+        assert (stop.velocity[-1] == 0.0).all()
+        assert np.abs(np.diff(stop.velocity[knot:], axis=0)).max() <= slower + 1e-12
+        rest = stop.at(np.array([1e3]), SWAP.control.dt)[0]
+        assert (rest == stop.position[-1]).all()
+    assert together.stops(motion, 60) == []
+
+
+def test_vehicles_that_may_brake_anywhere_take_longer() -> None:
+    """They block their whole ways for the others; afterwards the usual planner is back."""
+    before = Together._hit
+    options = TogetherOptions(vehicles=6, duration=60.0)
+    usual, braked = (
+        together.fly(options, ("no loss", planner, 1)).arrived_s for planner in (ALL, BRAKING)
+    )
+    assert usual is not None
+    assert braked is not None
+    assert braked > 1.2 * usual
+    assert Together._hit is before
