@@ -1,8 +1,10 @@
-"""Planners beside the one that keeps apart from all motions that may be flown."""
+"""Planners and solvers beside those that keep vehicles apart."""
 
 import numpy as np
+import pytest
 
-from skytether.lab.benchmarks import together
+from skytether.lab.benchmarks import motions, together
+from skytether.lab.benchmarks.motions import MotionsOptions
 from skytether.lab.benchmarks.together import ALL, BRAKING, SWAP, TogetherOptions
 from skytether.server.control.together import Together
 from skytether.shared.law.motion import SPACING, Motion
@@ -38,3 +40,14 @@ def test_vehicles_that_may_brake_anywhere_take_longer() -> None:
     assert braked is not None
     assert braked > 1.2 * usual
     assert Together._hit is before
+
+
+def test_solvers_agree_on_the_problems_of_a_flight() -> None:
+    """As far as their tolerances go; those that are not installed take no part."""
+    table = motions.solvers(MotionsOptions(problems=5, duration=4.0))
+    found = {row[0]: float(row[3]) for row in table.rows}
+    assert {"ours, dual active set", "OSQP", "DAQP"} <= set(found)
+    assert found.pop("ours, dual active set") == 0.0
+    # OSQP stops at 1e-4 of its residuals.
+    assert max(found.values()) < 0.5
+    assert found["DAQP"] == pytest.approx(0.0, abs=1e-2)

@@ -4,8 +4,10 @@
 
 The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. All
 solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
-given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog is
-given the Hessian's factor, DAQP and PIQP the dense problem; those that are installed take part.
+given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing; Clarabel
+alike, with its own tolerances. quadprog is given the Hessian's factor, DAQP and PIQP the dense
+problem; those that are installed take part. HPIPM takes none: it wants the problem in stages, each
+with its own half-planes, of which there is another number in each problem.
 Ticks are of swaps in virtual time: all vehicles are heard and planned for by one thread.
 
 The last table has ticks of fleets of which a share is near others: pairs that change places again
@@ -121,6 +123,18 @@ def kept(problems: list[MotionProblem]) -> Iterator[None]:
         plan.solve, direct.motions = real, straight
 
 
+def filled_up(problem: MotionProblem) -> tuple[Any, Array]:
+    """Constraints and their bounds, to the next multiple of ROWS."""
+    variables, count = problem.columns.shape
+    rows = -(-count // ROWS) * ROWS
+    least, columns = np.full(rows, -1.0), np.zeros((rows, variables))
+    least[:count] = problem.least
+    columns[:count] = problem.columns.T
+    dense = sparse.csc_matrix(np.ones(columns.shape))
+    dense.data = columns.T.ravel()  # every entry, so that the pattern stays the same
+    return dense, least
+
+
 class MotionOsqp:
     """OSQP for problems with one Hessian."""
 
@@ -130,15 +144,9 @@ class MotionOsqp:
 
     def solve(self, problem: MotionProblem) -> Array:
         """The minimum, at its tolerance."""
-        given, (variables, count) = len(problem.least), problem.columns.shape
-        rows = -(-count // ROWS) * ROWS
-        least, most = np.full(rows, -1.0), np.full(rows, np.inf)
-        least[:given] = problem.least
+        dense, least = filled_up(problem)
+        rows, most = len(least), np.full(len(least), np.inf)
         most[: problem.equal] = least[: problem.equal]
-        columns = np.zeros((rows, variables))
-        columns[:count] = problem.columns.T
-        dense = sparse.csc_matrix(np.ones(columns.shape))
-        dense.data = columns.T.ravel()  # every entry, so that the pattern stays the same
         solver = self._made.get(rows)
         if solver is None:
             solver = self._made[rows] = osqp.OSQP()
@@ -158,6 +166,32 @@ class MotionOsqp:
             solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
         found: Array = np.asarray(solver.solve(raise_error=False).x)
         return found
+
+
+class MotionClarabel:
+    """Clarabel for problems with one Hessian."""
+
+    def __init__(self, hessian: Array) -> None:
+        self._hessian = sparse.csc_matrix(np.triu(hessian))
+        self._made: dict[tuple[int, int], Any] = {}
+
+    def solve(self, problem: MotionProblem) -> Array:
+        """The minimum, at its tolerance."""
+        import clarabel
+
+        dense, least = filled_up(problem)
+        kind, changed = (len(least), problem.equal), (-problem.linear, -dense, -least)
+        solver = self._made.get(kind)
+        if solver is None:
+            settings = clarabel.DefaultSettings()
+            settings.verbose = settings.presolve_enable = settings.input_sparse_dropzeros = False
+            bounded = clarabel.NonnegativeConeT(len(least) - problem.equal)
+            cones = [clarabel.ZeroConeT(problem.equal), bounded]
+            solver = clarabel.DefaultSolver(self._hessian, *changed, cones, settings)
+            self._made[kind] = solver
+        else:
+            solver.update(q=changed[0], A=changed[1], b=changed[2])
+        return np.asarray(solver.solve().x)
 
 
 def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
@@ -184,6 +218,8 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
             return result
 
         found["quadprog"] = of_quadprog
+    if find_spec("clarabel"):
+        found["Clarabel"] = MotionClarabel(hessian).solve
     if find_spec("piqp"):
         import piqp
 
@@ -194,7 +230,7 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
             solver.setup(
                 hessian, -problem.linear, rows[:n], problem.least[:n], rows[n:], problem.least[n:]
             )
-            solver.solve(raise_error=False)
+            solver.solve()
             return np.asarray(solver.result.x)
 
         found["PIQP"] = of_piqp
