@@ -11,9 +11,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from skytether.lab.benchmarks.browser import (
     CHROMIUM,
@@ -158,8 +161,26 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
             process.wait(timeout=30)
 
 
-def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.Browser") -> None:
-    """One that a vehicle is in is not taken; another is, and is what the page shows."""
+def arrow(page: "sync_api.Page") -> tuple[float, float] | None:
+    """Where the arrow is by which a handle is dragged along x [pixels]; None without one."""
+    left, width = 400, 640  # of the map, between the panels
+    clip: sync_api.FloatRect = {"x": left, "y": 0, "width": width, "height": 900}
+    seen = imread(BytesIO(page.screenshot(clip=clip))) * 255.0
+    red, green, blue = seen[:, :, 0], seen[:, :, 1], seen[:, :, 2]
+    pink = np.argwhere((red - blue > 80.0) & (blue - green > 30.0) & (green < 90.0))
+    near = (np.abs(pink[:, None] - pink) <= 12).all(axis=2).sum(axis=1)
+    if near.max(initial=0) < 20:
+        return None
+    y, x = pink[near.argmax()].tolist()
+    return left + x, y
+
+
+def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
+    browser: "sync_api.Browser",
+) -> None:
+    """A zone that a vehicle is in is not taken; another is, and is what the page shows. The chosen
+    vehicle is sent along x by its handle, and elsewhere by a click.
+    """
     argv = ("fleet", "--mission", "warehouse", "--duration", "300", "--page", "127.0.0.1:0")
     with served(*argv) as address, opened(browser, address) as page:
         until(lambda: "nearest other vehicle" in status(page), "the mission is shown")
@@ -170,15 +191,28 @@ def test_zones_of_a_mission_are_changed_and_refused_in_words(browser: "sync_api.
         put(page, "Zones", "fence(-9, 9, -9, 9)")
         page.get_by_role("button", name="Change the zones").click()
         until(lambda: page.get_by_text("mission.zones").count(), "it is said")
+        until(lambda: arrow(page), "there is a handle")
+        x, y = arrow(page) or (0.0, 0.0)
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 30.0, y, steps=10)
+        page.wait_for_timeout(2000)  # longer than it waits for an answer
+        assert page.get_by_text("mission.goals is").count() == 0  # it is still held
+        page.mouse.up()
+        until(lambda: page.get_by_text('mission.goals is "goal(').count(), "it is sent there")
+        page.mouse.move(x, 800.0)  # its arrow has another colour under the mouse
+        page.wait_for_timeout(2000)  # by then the handle is where the goal is known to be
+        moved = pytest.approx((x + 30.0, y), abs=12.0)
+        until(lambda: arrow(page) == moved, "the handle is there")
         page.get_by_label("A click").click()
         page.get_by_role("option", name="sends the vehicle").click()
 
-        def sent() -> bool:
+        def sent() -> int:
             """Whether a click on the map has sent a vehicle; the first click may be too early, or
             choose another vehicle that happens to be there.
             """
             page.mouse.click(720, 250)
-            return "mission.goals is " in page.content()
+            return page.get_by_text('from now on, it was "goal(').count()
 
         until(sent, "the vehicle is sent there")
         picture(page, PICTURES / "mission-dark-wide.png")

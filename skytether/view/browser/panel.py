@@ -39,6 +39,8 @@ CLICKS = ("looks", GUIDES, DRAWS)
 CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
+GOAL_AGE_S = 5.0
+"""The same of a target that is led about [s]."""
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -398,6 +400,9 @@ class _Mission:
             self._text = gui.add_text("Zones", self._known, hint=ZONES)
             apply = gui.add_button("Change the zones")
             self._clicks = gui.add_dropdown("A click", CLICKS, hint=CLICKED)
+            gui.add_html(words.note("Drag the handle: it is the chosen vehicle's goal."))
+        self._axes = self._state.scenario.model.axes
+        self._handle = _Handle(client, "/goal", self._axes, self._drag)
 
         @apply.on_click
         async def _(_: Any) -> None:
@@ -413,18 +418,26 @@ class _Mission:
             if direction[2] * origin[2] < 0:  # otherwise the sky was clicked
                 at = (origin - direction * origin[2] / direction[2])[:2]
                 if self._clicks.value == GUIDES:
-                    self._guide(at)
+                    here = self._goal()
+                    self._guide(np.append(at, here[2:] if here is not None else [0.0]))
                 elif self._clicks.value == DRAWS:
                     self._draw(at)
 
-    def _guide(self, at: NDArray[Any]) -> None:
-        """Send the chosen vehicle to a point; in 3-D at its goal's height."""
-        number, axes = self._vehicle(), self._state.scenario.model.axes
-        track = self._state.vehicles.get(number)
-        here = track.goal(GOAL_S) if track else None
+    def _goal(self) -> NDArray[Any] | None:
+        """The chosen vehicle's goal [m; shape (axes,)]; None where it is not known."""
+        track = self._state.vehicles.get(self._vehicle())
+        return track.goal(GOAL_S) if track else None
+
+    def _drag(self, place: NDArray[Any], held: bool) -> None:
+        """Send the chosen vehicle to where its goal is let go."""
+        if not held:
+            self._guide(place)
+
+    def _guide(self, place: NDArray[Any]) -> None:
+        """Send the chosen vehicle to a place [m; shape (axes,) at least]."""
         values = self._flight.values.get("server", {})
-        goals = given(values.get(GUIDED, ""), axes)
-        goals[number] = np.append(np.round(at, 2), here[2:] if here is not None else [0.0])[:axes]
+        goals = given(values.get(GUIDED, ""), self._axes)
+        goals[self._vehicle()] = np.round(place[: self._axes], 2)
         self._ask({GUIDED: written(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
@@ -437,10 +450,67 @@ class _Mission:
             self._ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
 
     def show(self) -> None:
-        """Show the zones after they have changed."""
+        """Show the zones after they have changed, and the chosen vehicle's goal."""
+        self._handle.show(self._goal())
         if self._state.zones != self._known:
             self._known = self._state.zones
             assign(self._text, self._known)
+
+
+class _Handle:
+    """Handle in the scene that this browser can drag.
+
+    Args:
+        client: the browser.
+        name: of the handle.
+        axes: axes along which it can be dragged.
+        moved: is called with the place to which it was dragged [m; shape (3,)], and whether it is
+            still held.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        name: str,
+        axes: int,
+        moved: Callable[[NDArray[Any], bool], None],
+    ) -> None:
+        self._held, self._free_s = False, -np.inf
+        self._handle = client.scene.add_transform_controls(
+            name,
+            scale=0.6,
+            active_axes=(True, True, axes > 2),
+            disable_rotations=True,
+            depth_test=False,
+        )
+
+        @self._handle.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._held = event.phase != "end"
+                self.stay()
+                moved(self.place, self._held)
+
+    @property
+    def place(self) -> NDArray[Any]:
+        """Where it is [m]; shape (3,)."""
+        return np.asarray(self._handle.position)
+
+    def stay(self) -> None:
+        """Stay where it is for a while: the answer is still under way."""
+        self._free_s = time.monotonic() + HELD_S
+
+    def put(self, place: NDArray[Any]) -> None:
+        """Move to a place [m; shape (3,)]."""
+        self._handle.position = place
+
+    def show(self, goal: NDArray[Any] | None) -> None:
+        """Follow a goal [m; shape (axes,)], unless it is held."""
+        if goal is None or self._held or time.monotonic() < self._free_s:
+            return
+        place = in_space(goal[None])[0]
+        if np.abs(place - self.place).max() > MOVED_M:
+            self.put(place)
 
 
 class _Lead:
@@ -449,43 +519,24 @@ class _Lead:
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights
         self._axes = flights[0].state.scenario.model.axes
-        self._held_s = -np.inf
-        flat = self._axes == 2
-        self._handle = client.scene.add_transform_controls(
-            "/lead",
-            scale=0.6,
-            active_axes=(True, True, not flat),
-            disable_rotations=True,
-            depth_test=False,
-        )
+        self._handle = _Handle(client, "/lead", self._axes, lambda place, _: self._move(place))
         client.gui.add_html(words.note("Drag the target, or click where it shall be."))
-
-        @self._handle.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self._move(np.asarray(self._handle.position))
 
         @client.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            height = self._handle.position[2] - origin[2]
+            height = self._handle.place[2] - origin[2]
             if direction[2] * height > 0:  # otherwise the sky was clicked
-                point = origin + direction * height / direction[2]
-                self._handle.position = point
-                self._move(point)
+                place = origin + direction * height / direction[2]
+                self._handle.put(place)
+                self._handle.stay()
+                self._move(place)
 
-    def _move(self, point: Any) -> None:
-        self._held_s = time.monotonic()
+    def _move(self, place: NDArray[Any]) -> None:
         for flight in self._flights:
-            flight.ask("server", {LED: [np.round(point[: self._axes], 3).tolist()]})
+            flight.ask("server", {LED: [np.round(place[: self._axes], 3).tolist()]})
 
     def show(self) -> None:
         """Move the handle to the target, unless it is being dragged."""
-        if time.monotonic() - self._held_s < HELD_S:
-            return
         for track in list(self._flights[0].state.vehicles.values())[:1]:
-            goal = track.goal(5.0)
-            if goal is not None:
-                place = in_space(goal[None])[0]
-                if np.abs(place - self._handle.position).max() > MOVED_M:
-                    self._handle.position = place
+            self._handle.show(track.goal(GOAL_AGE_S))
