@@ -90,7 +90,7 @@ class Zones:
         return bool(self.zones)
 
     def to_the_sky(self) -> "Zones":
-        """These zones, those to keep out of without an upper end: nobody is above them either."""
+        """Zones alike, but nobody is above those to keep out of: these have no upper end."""
         high = [math.inf if not zone.is_fence else zone.high_m for zone in self.zones]
         raised = zip(self.zones, high, strict=True)
         return Zones([zone._replace(high_m=high_m) for zone, high_m in raised])

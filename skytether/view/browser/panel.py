@@ -40,7 +40,7 @@ CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corne
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
 GOAL_AGE_S = 5.0
-"""The same of a target that is led about [s]."""
+"""Age up to which a target that is led about is shown as known [s]."""
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -493,7 +493,7 @@ class _Handle:
 
     @property
     def place(self) -> NDArray[Any]:
-        """Where it is [m]; shape (3,)."""
+        """Place of the handle [m]; shape (3,)."""
         return np.asarray(self._handle.position)
 
     def stay(self) -> None:
