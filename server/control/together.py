@@ -107,7 +107,7 @@ class Together:
         self._again = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._plan = MotionPlan(terms, mission.acceleration_mps2, mission.speed_mps)
-        self._zones = scenario.zones
+        self._zones, self._lands = scenario.zones, scenario.lands
         self._aims = Aims(
             self._zones,
             clear.tube_m,
@@ -212,7 +212,8 @@ class Together:
                 if touches(zones, points, room_m):
                     zone = zones.in_the_way(points, room_m)
                     left_s = max(motion.last - k, 0) * self._dt_s
-                    does = f"may fly into for {left_s:.1f} s more" if left_s else "hovers in"
+                    hovers = "hovers in or above" if self._lands else "hovers in"
+                    does = f"may fly into for {left_s:.1f} s more" if left_s else hovers
                     number = self._roster.number_of(row)
                     return f"{zone}, which vehicle {number} {does}, tube included"
         return ""

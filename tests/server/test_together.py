@@ -1031,6 +1031,21 @@ def test_nobody_may_rest_above_what_it_must_not_land_on(
     reading.check(table, "above")
 
 
+def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Path) -> None:
+    """Where it never lands, there may be one."""
+    table = in_space(tmp_path, "1,0,0,0,4\n") | {"duration": 12.0}
+    changes = [(9.0, {"mission.zones": "box(-1, 1, -1, 1, 0, 2)"})]
+
+    def refused() -> list[str]:
+        flown = flight.fly(reading.check(table, "above"), changes=changes)
+        return [event.reason for *_, event in flown.events if isinstance(event, ChangeRefused)]
+
+    (reason,) = refused()
+    assert "which vehicle 1 hovers in or above, tube included" in reason
+    table["vehicle"]["land_after_s"] = 0.0
+    assert refused() == []
+
+
 def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
     """Where vehicles may land."""
     table = in_space(tmp_path, "1,0,0,0,1\n2,0,5,0,1\n", goals="goal(2, 0.5, 0, 9)")
