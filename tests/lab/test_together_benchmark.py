@@ -29,6 +29,7 @@ def test_a_vehicle_may_brake_from_each_knot_on() -> None:
     assert together.stops(motion, 60) == []
 
 
+@pytest.mark.long
 def test_vehicles_that_may_brake_anywhere_take_longer() -> None:
     """They block their whole ways for the others; afterwards the usual planner is back."""
     before = Together._hit
