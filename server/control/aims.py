@@ -102,8 +102,9 @@ class Aims:
         is_taken = k < known.detour_until or known.closed
         return known.detour if known.detour and is_taken else self.routes
 
-    def close(self, known: Known, k: int, place: Array, goal: Array) -> None:
-        """Take the way ahead of a vehicle for closed, until it has another goal.
+    def close(self, known: Known, k: int, place: Array, goal: Array) -> bool:
+        """Take the way ahead of a vehicle for closed, until it has another goal, if there is
+        another way; whether there is.
 
         Ways keep `tube_m` from zones, and motions a margin more: between two zones there may be
         room for a way and not for a motion.
@@ -115,8 +116,13 @@ class Aims:
             goal: shape (axes,).
         """
         way = self._ways_of(known, k).way(place, goal)
-        known.closed.append(_along(place, way, self._closed_m))
-        known.detour = self._detour(place, goal, (), known.closed)
+        ahead = _along(place, way, self._closed_m)
+        detour = self._detour(place, goal, (), (*known.closed, ahead))
+        if not detour.reaches(place, goal):
+            return False
+        known.closed.append(ahead)
+        known.detour = detour
+        return True
 
     def _detour(
         self, place: Array, goal: Array, rests: Iterable[Array], closed: Iterable[Array]

@@ -66,6 +66,8 @@ class Known:
         """Shortest way that was ever left to that [m]."""
         self.nearer_at = 0
         """Step at which it was that near first, or asked another to step aside last."""
+        self.barred = False
+        """Whether a zone has held it back since it was found stuck last."""
         self.aside: Aside | None = None
         """Place it has stepped aside to; None if it flies to its own goal."""
         self.waits = ""

@@ -285,12 +285,12 @@ class Together:
             return
         # A plan reckons with all that were decided before it.
         self._fly_straight(straight)
-        if is_stuck:
-            self._ask(row, way)
+        asked = is_stuck and self._ask(row, way)
         self._find(row, known, k, goal)
-        if is_stuck and known.next is None and known.waits == ZONE:
-            self.counts["closed"] += 1
-            self._aims.close(known, k, place, goal)
+        if is_stuck:
+            if known.barred and not asked and self._aims.close(known, k, place, goal):
+                self.counts["closed"] += 1
+            known.barred = False
 
     def _fly_straight(self, straight: list[Straight]) -> None:
         """Find motions of vehicles that may fly straight, one after the other; none are left."""
@@ -325,8 +325,10 @@ class Together:
         way = self._way(left.asker, self._roster.goal(left.asker)) * self._scale
         return bool(aside.off_way(home[None] * self._scale, way)[0] < self._clear.planned_apart_m)
 
-    def _ask(self, row: int, way: Array) -> None:
-        """Ask the first vehicle that rests at its goal in another vehicle's way to step aside."""
+    def _ask(self, row: int, way: Array) -> bool:
+        """Ask the first vehicle that rests at its goal in another vehicle's way to step aside;
+        whether it does.
+        """
         keep_m, ends, homes = self._clear.planned_apart_m, list[tuple[int, Array]](), list[int]()
         for other, each in self._roster.known.items():
             if other == row or each.in_force is None or not self._roster.rows.met[other]:
@@ -339,7 +341,7 @@ class Together:
         places = np.array([self._roster.goal(other) for other in homes]).reshape(-1, way.shape[1])
         first = aside.first_on(way * self._scale, places * self._scale, keep_m)
         if first is None:
-            return
+            return False
         asked, others = homes[first], [end for other, end in ends if other != homes[first]]
         free = aside.place(
             places[first],
@@ -355,6 +357,7 @@ class Together:
             self.counts["asides"] += 1
             until = self._roster.now + round(ASIDE_S / self._dt_s)
             self._roster.known[asked].aside = Aside(free, row, until)
+        return free is not None
 
     def _toward(self, row: int, known: Known, k: int, goal: Array) -> Motion | None:
         """A motion from the one in force towards a goal, apart from all; None where none is found.
@@ -388,6 +391,7 @@ class Together:
                 return motion
             if held:
                 known.waits = known.waits or self._blocker(solved, held)
+                known.barred |= known.waits == ZONE
             self.counts["refused"] += bool(hit.any())
         return None
 
