@@ -266,6 +266,7 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         for at_s in (30, 12, 20):
             put(page, "Time [s]", at_s)
             until(lambda at_s=at_s: abs(flown_s(page) - at_s) <= 2, f"{at_s} s is shown")
+        page.wait_for_timeout(1500)  # until the last seconds up to there are shown as well
         paused_s = flown_s(page)
         page.wait_for_timeout(1500)
         assert flown_s(page) == paused_s
