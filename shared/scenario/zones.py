@@ -84,7 +84,7 @@ class Zones:
         self._low = np.array([zone.low_m for zone in zones])
         self._high = np.array([zone.high_m for zone in zones])
         self.outlines = _outlines(zones)
-        """Outlines of all zones, which straight pieces of ways are held against."""
+        """Outlines of all zones, with which straight pieces of ways are compared."""
 
     def __bool__(self) -> bool:
         return bool(self.zones)

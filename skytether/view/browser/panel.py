@@ -39,7 +39,7 @@ CLICKS = ("looks", GUIDES, DRAWS)
 CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
-GOAL_AGE_S = 5.0
+LEAD_S = 5.0
 """Age up to which a target that is led about is shown as known [s]."""
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
@@ -505,7 +505,7 @@ class _Handle:
         self._handle.position = place
 
     def show(self, goal: NDArray[Any] | None) -> None:
-        """Follow a goal [m; shape (axes,)], unless it is held."""
+        """Move the handle to a goal [m; shape (axes,)], unless the user holds the handle."""
         if goal is None or self._held or time.monotonic() < self._free_s:
             return
         place = in_space(goal[None])[0]
@@ -539,4 +539,4 @@ class _Lead:
     def show(self) -> None:
         """Move the handle to the target, unless it is being dragged."""
         for track in list(self._flights[0].state.vehicles.values())[:1]:
-            self._handle.show(track.goal(GOAL_AGE_S))
+            self._handle.show(track.goal(LEAD_S))
