@@ -81,7 +81,7 @@ def emulate(argv: Sequence[str]) -> None:
     """
     gc.set_threshold(COLLECT_AFTER)
     options = _with_directions(
-        command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__)
+        command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__, is_final=False)
     )
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
@@ -114,13 +114,14 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     """Options with the network that --uplink and --downlink describe.
 
     Raises:
-        CommandError: they describe none.
+        ConfigError: the scenario cannot be flown with it.
     """
-    if options.uplink is None and options.downlink is None:
-        return options
-    directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
-    laid = reading.with_directions(options.config, directions)
-    return replace(options, config=reading.check(reading.to_table(laid), "the command line"))
+    laid = options.config
+    if not (options.uplink is None and options.downlink is None):
+        directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
+        laid = reading.with_directions(laid, directions)
+    source = f"{options.scenario} and the command line"
+    return replace(options, config=reading.check(reading.to_table(laid), source))
 
 
 def _flows(given: int | None) -> int:

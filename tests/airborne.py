@@ -1,7 +1,9 @@
 """A flight with a scripted autopilot in virtual time: server, netem, client and autopilot."""
 
 import io
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -35,6 +37,13 @@ FIGURE = {
     "altitude_m": 2.0,
 }
 NONE = {"delay": "none", "loss": 0.0}
+
+
+def documented() -> str:
+    """The scenario `field.toml` of docs/fly-a-real-one.md."""
+    document = (Path(__file__).parents[1] / "docs" / "fly-a-real-one.md").read_text()
+    (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    return str(table)
 
 
 def scenario(**table: Any) -> Scenario:

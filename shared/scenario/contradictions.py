@@ -351,7 +351,8 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
     low, high, radius = inner(scenario)
     drawn = max(margins(scenario))
     wind = f"fence.wind_mps = {fence.wind_mps:g}"
-    slowest = min(*scenario.model.u_max, fence.speed_mps or math.inf)
+    fastest = scenario.u_max * scenario.model_gain
+    slowest = min(*fastest.tolist(), fence.speed_mps or math.inf)
     if fence.wind_mps >= slowest:
         yield "fence.wind_mps", fence.wind_mps, f"less than {slowest:g}, the vehicle's speed"
     if any(least >= most for least, most in zip(low, high, strict=True)):

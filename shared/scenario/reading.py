@@ -8,9 +8,8 @@ import math
 import re
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -23,7 +22,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import zones
 from skytether.shared.scenario.air import path as air
-from skytether.shared.scenario.contradictions import contradictions
+from skytether.shared.scenario.contradictions import Contradiction, contradictions
 from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 
@@ -71,8 +70,20 @@ def load(name: str) -> Scenario:
     Raises:
         ConfigError: it does not exist, or something in it is wrong.
     """
+    return _without_contradictions(load_base(name), name)
+
+
+def load_base(name: str) -> Scenario:
+    """Scenario that flags are laid over, by its name or path as for `load`.
+
+    Every value is checked by itself. Contradictions are left to `check`, which judges the final
+    values: a flag may end one that the file has.
+
+    Raises:
+        ConfigError: it does not exist, or a value in it is wrong.
+    """
     try:
-        return check(_read(name), name)
+        return convert(_read(name), name)
     except RecursionError:
         raise ConfigError(f"{name}: nested too deeply") from None
 
@@ -88,16 +99,41 @@ def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = 
     Raises:
         ConfigError: the first thing that is wrong.
     """
-    where = f"{source}: " if source else ""
+    return _without_contradictions(convert(raw, source), source, known=known)
+
+
+def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
+    """The scenario in a table of plain values, each checked by itself; see `check`.
+
+    Raises:
+        ConfigError: the first value that is wrong.
+    """
     raw = _with_directions(raw)
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}{_explain(str(error), raw)}") from None
-    wrong = chain(_infinite(to_table(scenario)), contradictions(scenario, known))
-    for key, given, expected in wrong:
-        raise ConfigError(f"{where}{key}: got {_short(str(given))}, expected {expected}")
+        raise ConfigError(f"{_where(source)}{_explain(str(error), raw)}") from None
+    _refuse_first(_infinite(to_table(scenario)), source)
     return scenario
+
+
+def _without_contradictions(
+    scenario: Scenario, source: str, *, known: Scenario | None = None
+) -> Scenario:
+    """Scenario as given, refused unless its values are possible together; see `check`."""
+    _refuse_first(contradictions(scenario, known), source)
+    return scenario
+
+
+def _refuse_first(wrong: Iterator[Contradiction], source: str) -> None:
+    """Raise the first of these contradictions, if there is one, as a ConfigError."""
+    for key, given, expected in wrong:
+        raise ConfigError(f"{_where(source)}{key}: got {_short(str(given))}, expected {expected}")
+
+
+def _where(source: str) -> str:
+    """Beginning of a message about a source."""
+    return f"{source}: " if source else ""
 
 
 def with_directions(scenario: Scenario, directions: Mapping[str, str]) -> Scenario:
@@ -282,7 +318,7 @@ def _choices(kind: Any) -> str:
     return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
 
 
-def _infinite(value: object, key: str = "") -> typing.Iterator[tuple[str, object, str]]:
+def _infinite(value: object, key: str = "") -> Iterator[Contradiction]:
     """Numbers that TOML knows and no flight has a use for: key, given, expected."""
     if isinstance(value, float) and not math.isfinite(value):
         yield key, value, "a finite number"

@@ -531,6 +531,11 @@ class Scenario(Section, frozen=True):
         return self._per_axis(self.model.u_max)
 
     @property
+    def model_gain(self) -> Array:
+        """The model's gains; shape (axes,)."""
+        return self._per_axis(self.model.gain)
+
+    @property
     def true_gain(self) -> Array:
         """The vehicle's gains; shape (axes,)."""
         return self._per_axis(self.model.gain if self.vehicle.gain == () else self.vehicle.gain)
@@ -553,7 +558,7 @@ class Scenario(Section, frozen=True):
             horizon=control.horizon,
             axes=self.model.axes,
             tau_s=tuple(self.tau_s.tolist()),
-            gain=tuple(self._per_axis(self.model.gain).tolist()),
+            gain=tuple(self.model_gain.tolist()),
             dead_time_s=tuple(self._per_axis(self.model.dead_time_s).tolist()),
             u_max=tuple(self.u_max.tolist()),
             scheme=control.scheme,

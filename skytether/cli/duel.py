@@ -83,9 +83,9 @@ def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
     """
     given = {"duration": options.duration, "seed": options.seed}
     asked = {key: value for key, value in given.items() if value is not None}
-    one = msgspec.structs.replace(reading.load(options.one), **asked)
+    one = msgspec.structs.replace(reading.load_base(options.one), **asked)
     same = {key: getattr(one, key) for key in ("duration", "seed", "settle", "network")}
-    other = msgspec.structs.replace(reading.load(options.other), **same)
+    other = msgspec.structs.replace(reading.load_base(options.other), **same)
     return checked(one, options.one), checked(other, options.other)
 
 

@@ -195,7 +195,8 @@ def _beside(options: FlyOptions) -> Scenario | None:
         return None
     same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
     try:
-        return msgspec.structs.replace(reading.load(options.beside), **same)
+        laid = msgspec.structs.replace(reading.load_base(options.beside), **same)
+        return reading.check(reading.to_table(laid), options.beside)
     except ConfigError as error:
         raise CommandError(str(error), command.CONFIGURATION) from None
 

@@ -137,7 +137,7 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
         name, given = scenario.title, scenario
     elif isinstance(scenario, str | PathLike):
         name = fspath(scenario)
-        given = reading.load(name)
+        given = reading.load_base(name)
     else:
         expected = "expected the name of a scenario, a .toml file or a Scenario"
         raise TypeError(f"scenario: got {scenario!r}, {expected}")

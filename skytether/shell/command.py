@@ -80,9 +80,17 @@ O = TypeVar("O", bound=Options)  # noqa: E741 - the options of one command
 
 
 def parse(
-    defaults: O, argv: Sequence[str], prog: str, help_: str | None, *, leads: bool = True
+    defaults: O,
+    argv: Sequence[str],
+    prog: str,
+    help_: str | None,
+    *,
+    leads: bool = True,
+    is_final: bool = True,
 ) -> O:
     """Parse a command line; returns its options, laid over the scenario it names.
+
+    Contradictions are looked for once, in the final values: a flag may end one that the file has.
 
     Args:
         defaults: options where nothing is given.
@@ -90,6 +98,8 @@ def parse(
         prog: its name.
         help_: what it does.
         leads: whether an argument without a flag, at the front, is the scenario's name.
+        is_final: whether the scenario is flown as the flags leave it; else the command itself
+            changes more keys, and checks it after that.
 
     Raises:
         CommandError: an output file cannot be written.
@@ -101,13 +111,15 @@ def parse(
     name = argv[0] if named else defaults.scenario
     argv, directions = _directions(argv)
     while True:
-        config = reading.with_directions(reading.load(name), directions)
+        config = reading.with_directions(base := reading.load_base(name), directions)
         default = replace(defaults, scenario=name, config=config)  # type: ignore[type-var]
         options = read(default, argv, prog, help_)
         if options.scenario == name:
             break
         name = options.scenario
-    checked = reading.check(reading.to_table(options.config), f"{name} and the command line")
+    read_scenario = reading.check if is_final else reading.convert
+    source = name if options.config == base else f"{name} and the command line"
+    checked = read_scenario(reading.to_table(options.config), source)
     for option in OUTPUTS:
         check_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]

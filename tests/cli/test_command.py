@@ -307,6 +307,60 @@ def test_flags_lie_over_the_scenario(tmp_path: Path) -> None:
     assert ratios[1] < 0.8
 
 
+@pytest.fixture
+def contradictory(tmp_path: Path) -> str:
+    """File of a scenario whose loss of 40 % asks for a longer horizon than it has."""
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'extends = "demo-committed"\ncontrol.horizon = 12\nduration = 2.0\n'
+        'network.uplink = "constant(0.1) & loss(0.4)"\nnetwork.downlink = "constant(0.1)"\n'
+    )
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["fly", "--virtual", "--control.horizon", "40"],
+        ["fly", "--virtual", "--network.uplink", "constant(0.1)"],
+        ["fleet", "--virtual", "--vehicles", "2", "--control.horizon", "40"],
+        pytest.param(
+            ["sweep", "--runs", "1", "--grid", "control.horizon=30,40", "--out", "swept"],
+            marks=pytest.mark.long,
+        ),
+        ["identify", "--scenario", "mine.toml", "--control.horizon", "40", "--repeats", "1"],
+    ],
+)
+def test_a_flag_may_end_a_contradiction_of_the_file(
+    argv: list[str],
+    contradictory: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Only the final values are judged; without the flag the file is refused, and named."""
+    monkeypatch.chdir(Path(contradictory).parent)
+    name, *flags = argv
+    place = ["simulated"] if name == "identify" else [contradictory]
+    assert main([name, *place, *flags]) == 0, capfd.readouterr().err
+    assert main(["fly", contradictory, "--virtual"]) == 2
+    assert "mine.toml: control.horizon: got 12" in capfd.readouterr().err
+
+
+def test_a_second_scenario_is_judged_as_it_is_flown(
+    contradictory: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A longer flight of the other one leads it over its own fence."""
+    fenced = Path(contradictory).with_name("fenced.toml")
+    fenced.write_text(
+        'extends = "demo"\nduration = 2.0\nsettle = 0.0\nfence.radius_m = 6.0\n'
+        'reference.shape = "waypoints"\nreference.points_m = [[0, 0], [9, 0]]\n'
+    )
+    assert main(["fly", str(fenced), "--virtual"]) == 0
+    flown = ["fly", "demo", "--virtual", "--duration", "20", "--beside", str(fenced)]
+    assert main(flown) == 2
+    assert "fenced.toml: fence.radius_m: got 6.0, expected more" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(("given", "bound"), [("0.55", 0.55), ("auto", "auto")])
 def test_a_flag_may_be_a_number_or_a_word(given: str, bound: float | str, tmp_path: Path) -> None:
     """Over a scenario that has another."""

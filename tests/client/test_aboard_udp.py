@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from airborne import FIGURE, SAFE, scenario
+from airborne import FIGURE, SAFE, documented, scenario
 from skytether.autopilot.flavours import FlavourName
 from skytether.cli.processes import Child, started
 from skytether.shared.core.aboard import AutopilotMode, ParametersSet, ParametersUnsafe
@@ -130,8 +130,7 @@ async def test_a_figure_eight_over_the_papers_network(flavour: FlavourName, tmp_
 def field_in(folder: Path) -> list[str]:
     """Commands of docs/fly-a-real-one.md, whose scenario is `field.toml` in the folder now."""
     document = (Path(__file__).parents[2] / "docs" / "fly-a-real-one.md").read_text()
-    (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    (folder / "field.toml").write_text(table)
+    (folder / "field.toml").write_text(documented())
     commands: list[str] = re.findall(r"```sh\n(.*?)```", document, re.DOTALL)
     return commands
 

@@ -109,6 +109,12 @@ def test_what_leads_over_the_fence_is_refused(fence: dict[str, Any], said: str) 
         scenario(fence=fence)
 
 
+def test_wind_that_a_weak_vehicle_cannot_fly_against_is_refused() -> None:
+    """Its speed is the largest input times the model's gain."""
+    with pytest.raises(ConfigError, match=r"fence.wind_mps.*less than 0.8, the vehicle's speed"):
+        scenario(fence={"radius_m": 20.0, "wind_mps": 1.0}, model={"u_max": [1.6], "gain": 0.5})
+
+
 def test_near_a_bound_the_speed_towards_it_is_the_distance_over_t() -> None:
     """T = τ + 2 Δt: without τ in it, a vehicle of a larger inertia would come too close."""
     flown = scenario(fence={"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]})

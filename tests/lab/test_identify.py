@@ -16,9 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from airborne import SAFE
+from airborne import SAFE, Air, documented
 from helpers import packaged
 from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.flavours import FlavourName
 from skytether.client import vehicles
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.lab.commands import identify as command_of
@@ -387,15 +388,8 @@ def test_a_flight_that_is_broken_off_closes_the_line() -> None:
     assert len(endpoint.experiment.steps) == 2
 
 
-@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_an_autopilot_is_identified(flavour: Any) -> None:
-    """Over MAVLink, by the clock of a client that is not the autopilot's; then it is down."""
-    asked = scenario(
-        model={"u_max": [3.0]},
-        reference={"radius_m": 5.0},
-        vehicle=CALM | {"kind": "mavlink", "address": "udpout:autopilot:0"},
-    )
-    plan = ExperimentPlan((1.0, 1.0), 3.0, 1)
+def over_mavlink(asked: Scenario, flavour: FlavourName, plan: ExperimentPlan) -> Identifying:
+    """A complete identification of a simulated autopilot, in virtual time."""
     within = fenced(asked, plan)
     autopilot = Autopilot(asked, flavour, ready_s=1.0)
     autopilot.flight.parameters |= SAFE[flavour]
@@ -406,6 +400,45 @@ def test_an_autopilot_is_identified(flavour: Any) -> None:
     world.run(lambda: endpoint.finished, limit_ns=300 * 10**9)
     assert (endpoint.finished, endpoint.why) == (True, "")
     assert not autopilot.flight.armed
+    return endpoint
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_the_documented_field_flies_at_once_with_the_model_identified(
+    flavour: FlavourName, tmp_path: Path
+) -> None:
+    """That of docs/fly-a-real-one.md, with steps of the default size inside its own fence."""
+    file = tmp_path / "field.toml"
+    file.write_text(documented())
+    loaded = reading.load(str(file))
+    line = msgspec.structs.replace(loaded.vehicle, address="udpout:autopilot:0")
+    asked = msgspec.structs.replace(loaded, vehicle=line)
+    speeds = default_speeds(asked)
+    endpoint = over_mavlink(asked, flavour, ExperimentPlan(speeds, default_hold_s(asked), 1))
+    axes = [
+        outcome.AxisOutcome(speed, 0, [], each)
+        for speed, each in zip(speeds, fits(endpoint), strict=True)
+    ]
+    text = outcome.scenario_text(asked, str(file), loaded, axes)
+    assert text is not None
+    (tmp_path / "scenario.toml").write_bytes(text)
+    written = reading.load(str(tmp_path / "scenario.toml"))
+    assert (written.u_max * written.model_gain > written.fence.wind_mps).all()
+    air = Air(flavour, **reading.to_table(written))
+    air.fly()
+    air.run(20.0)
+    assert air.rmse(settle_s=10.0) < 0.2
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_an_autopilot_is_identified(flavour: Any) -> None:
+    """Over MAVLink, by the clock of a client that is not the autopilot's; then it is down."""
+    asked = scenario(
+        model={"u_max": [3.0]},
+        reference={"radius_m": 5.0},
+        vehicle=CALM | {"kind": "mavlink", "address": "udpout:autopilot:0"},
+    )
+    endpoint = over_mavlink(asked, flavour, ExperimentPlan((1.0, 1.0), 3.0, 1))
     expected = {"ardupilot": (0.97, 0.46, 0.28), "px4": (0.75, 0.44, 0.14)}[flavour]
     for each in fits(endpoint):
         assert each is not None

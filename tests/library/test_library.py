@@ -141,6 +141,15 @@ def test_a_scenario_is_loaded_from_a_path(tmp_path: Path) -> None:
     assert skytether.load(file) == skytether.load(str(file)) == skytether.load("demo", duration=12)
 
 
+def test_a_key_may_end_a_contradiction_of_the_file(tmp_path: Path) -> None:
+    """Only the final values are judged, as on the command line."""
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "demo"\nfence.radius_m = 20\nfence.wind_mps = 5.0\n')
+    with pytest.raises(skytether.ConfigError, match=r"mine.toml: fence.wind_mps: got 5.0"):
+        skytether.load(file)
+    assert skytether.load(file, **{"fence.wind_mps": 0.5}).fence.wind_mps == 0.5
+
+
 def test_a_scenario_made_by_hand_is_checked() -> None:
     """It may be an object or tables, and is also checked before a flight."""
     assert skytether.check({"duration": 3, "model": {"axes": 3}}).model.axes == 3

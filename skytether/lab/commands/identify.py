@@ -116,7 +116,12 @@ def identify(argv: Sequence[str]) -> None:
     starting point. Ctrl-C makes the vehicle land; its measurements are kept.
     """
     options = command.parse(
-        IdentifyOptions(), argv, "skytether identify", identify.__doc__, leads=False
+        IdentifyOptions(),
+        argv,
+        "skytether identify",
+        identify.__doc__,
+        leads=False,
+        is_final=False,
     )
     scenario, plans = _asked(options)
     flies = vehicles.make(scenario, NUMBER)
@@ -352,7 +357,7 @@ def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlo
     Raises:
         CommandError: there is no model, or the scenario cannot be flown.
     """
-    base = reading.load(options.scenario)
+    base = reading.load_base(options.scenario)
     text = outcome.scenario_text(scenario, options.scenario, base, flown.axes)
     if text is None:
         missing = [n for n, axis in zip(AXES, flown.axes, strict=False) if axis.fit is None]

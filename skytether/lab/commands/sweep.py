@@ -56,7 +56,9 @@ def sweep(argv: Sequence[str]) -> None:
     Ctrl-C or a crash, the same command continues. The resulting tables are equal, byte for byte,
     for any number of workers.
     """
-    options = command.parse(SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__)
+    options = command.parse(
+        SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__, is_final=False
+    )
     command.check_count("--runs", options.runs, 100_000)
     options.pool.check()
     axes = [parse_axis(text) for text in options.grid]

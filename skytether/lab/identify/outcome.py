@@ -21,7 +21,7 @@ AXES = "xyz"
 BEYOND = 1.5
 """Largest allowed input over the largest step; the response to larger inputs was not measured."""
 FASTER = 1.25
-"""Required input over the desired trajectory's speed, so that the vehicle can catch up."""
+"""Required speed over the desired trajectory's, to catch up, and over the fence's wind."""
 DIGITS = 4
 """Significant digits of written numbers."""
 
@@ -110,7 +110,8 @@ def scenario_text(
         f"{made} first order with dead time",
         "that answers them alike; with 95 % intervals.",
         *(f"{name}: {describe(axis)}" for name, axis in zip(AXES, axes, strict=False)),
-        f"u_max: up to {BEYOND:g} times the size of the steps, for nobody has seen larger ones.",
+        f"u_max: {BEYOND:g} times the size of the steps, for nobody has seen larger ones, or what",
+        f"{FASTER:g} times the desired trajectory's speed and the fence's wind need.",
     ]
     return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(told).encode()
 
@@ -133,8 +134,11 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: no more than was tested, and enough for the desired trajectory."""
-    wanted = reference_speeds(flown)
+    """Bounds of the input [m/s]: no more than was tested, and enough for the desired trajectory
+    and against the fence's wind.
+    """
+    wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0
+    wanted = [max(speed, wind_mps) for speed in reference_speeds(flown)]
     most = flown.u_max.tolist()
     each = zip(axes, numbers, wanted, most, strict=True)
     return [
