@@ -18,7 +18,7 @@ from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Event
+from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse
@@ -140,6 +140,7 @@ class Air:
         host: name of the autopilot's host; "line" is that of a line of bytes.
         ready_s: time until the autopilot can be armed [s].
         drift_ppm: drift of the client's clock.
+        autopilot_ppm: drift of the autopilot's clock, which its whole simulation follows.
         table: keys of the scenario.
     """
 
@@ -153,6 +154,7 @@ class Air:
         host: str = "autopilot",
         ready_s: float = 1.0,
         drift_ppm: float = 0.0,
+        autopilot_ppm: float = 0.0,
         **table: Any,
     ) -> None:
         self.scenario = scenario(**table)
@@ -184,7 +186,7 @@ class Air:
             recorder=Recorder(columns, self._sink),
         )
         clock = Clock(OFFSET_NS, round(1000 * drift_ppm))
-        self.world.add(host, self.tap)
+        self.world.add(host, self.tap, clock=Clock(0, round(1000 * autopilot_ppm)))
         self.world.add("netem", Proxy(self.scenario, server=("server", 0), flows=1))
         self.world.add("client", self.client, clock=clock)
         server = Server(self.scenario, boot_id=2**60, entropy=bytes)
@@ -261,3 +263,8 @@ class Air:
         """The client's events, as a program reads them."""
         told = [event for _, name, event in self.events if name == "client"]
         return [msgspec.json.decode(msgspec.json.encode(event)) for event in told]
+
+
+def modes(air: Air) -> list[tuple[str, str]]:
+    """Modes of the failsafe and their reasons, as far as they are told."""
+    return [(each.after, each.reason) for each in air.of(ModeChanged)]

@@ -4,8 +4,14 @@
     offset = (t₁ + t₂) / 2 - b, wrong by no more than (t₂ - t₁) / 2
 
 Answers that took much longer than the quickest of the window are left out; a line through the rest
-has offset and drift. It is moved to where no answer contradicts it: each says between which two
-numbers the offset was, and since then the clocks have drifted by no more than `DRIFT_MAX`.
+has offset and drift. Any two answers bound the drift between them:
+
+    drift = (offset₂ - offset₁) / (t₂ - t₁), wrong by no more than the mean of both round trips
+            / (t₂ - t₁)
+
+In the first seconds, in which a fit would follow the noise, the drift is the least one within these
+bounds. The line is moved to where no answer contradicts it: each bounds the offset at its time, and
+since then the clocks have drifted within the bounds.
 """
 
 from collections import deque
@@ -26,8 +32,12 @@ SPREAD_NS = MILLISECOND_NS
 """Time beyond the least round trip, and half of that, up to which an answer counts [ns]."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
 """Time between the first and the last answer from which on drift is fitted [ns]."""
-DRIFT_MAX = 500e-6
-"""Largest drift that two clocks have."""
+DRIFT_MAX = 0.02
+"""Largest drift that is followed: PX4's own simulator runs 0.9 % slow."""
+WANDER = 500e-6
+"""Largest change of the drift within the window: a crystal that warms up, a busy simulator."""
+RATED = 8
+"""Newest answers from which the rate of a clock that cannot be followed is found."""
 JUMP_NS = 100 * MILLISECOND_NS
 """Time beyond the round trip by which an answer is off where a clock has jumped [ns]."""
 JUMPS = 3
@@ -58,6 +68,8 @@ class BootClock:
         self._round_trip_max_ns = round_trip_max_ns
         self._asked: deque[int] = deque(maxlen=ASKED_MAX)
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
+        self._taken = 0
+        """Number of answers taken since the clock was begun."""
         self._odd: list[Sample] = []
         """Newest answers in a row that are off."""
         self._line = (0, 0.0, 0.0)
@@ -66,13 +78,29 @@ class BootClock:
         """Least round trip of the window [ns]."""
         self.drift = 0.0
         """Rate at which the client's clock gains on the autopilot's."""
+        self._heard: deque[tuple[int, int]] = deque(maxlen=RATED)
+        """Newest answers, whether or not the line goes through them: time of the client's clock and
+        time since boot [ns]."""
         self.jumps = 0
         """Times that the autopilot's clock was begun anew, as after a reboot."""
 
     @property
     def is_known(self) -> bool:
         """Whether enough answers have come."""
-        return len(self._samples) >= KNOWN
+        return self._taken >= KNOWN
+
+    @property
+    def wrong_rate(self) -> float | None:
+        """Speed of the autopilot's clock, 1 for ours, where it cannot be followed; else None."""
+        if len(self._heard) < KNOWN:
+            return None
+        (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._heard[0], self._heard[-1]
+        passed_ns, told_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
+        # The bounds of two answers as below, and of a reboot there is nothing to say.
+        doubt_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
+        if told_ns <= 0 or abs(told_ns - passed_ns) <= DRIFT_MAX * passed_ns + doubt_ns:
+            return None
+        return told_ns / passed_ns
 
     def ask(self, *, now_ns: int) -> int:
         """Stamp of a question that is sent now."""
@@ -95,6 +123,7 @@ class BootClock:
             return False
         local_ns = stamp_ns + round_trip_ns // 2
         sample = Sample(local_ns, local_ns - boot_ns, round_trip_ns)
+        self._heard.append((local_ns, boot_ns))
         if self._samples and abs(sample.offset_ns - self._offset(local_ns)) > (
             JUMP_NS + round_trip_ns
         ):
@@ -103,43 +132,46 @@ class BootClock:
                 return False
             self._samples.clear()
             self._samples.extend(self._odd[:-1])
+            self._taken = len(self._samples)
             self.jumps += 1
         self._odd.clear()
         self._samples.append(sample)
+        self._taken += 1
         self._fit()
         return True
 
     def _fit(self) -> None:
-        """Put a line through the answers that came quickly."""
+        """Put a line through the answers that came quickly, and agree with the newest of them."""
         least = min(sample.round_trip_ns for sample in self._samples)
         most = least + least // 2 + SPREAD_NS
         quick = [sample for sample in self._samples if sample.round_trip_ns <= most]
         self.round_trip_ns = least
+        agreeing, least_drift, most_drift = _agreeing(quick)
+        if len(agreeing) < len(quick):
+            while self._samples[0] != agreeing[0]:
+                self._samples.popleft()
         newest = self._samples[-1].local_ns
-        times = [float(sample.local_ns - newest) for sample in quick]
-        base = quick[-1].offset_ns
-        offsets = [float(sample.offset_ns - base) for sample in quick]
-        if times[-1] - times[0] < DRIFT_SPAN_NS:
-            offset, self.drift = median(offsets), 0.0
-        else:
-            middle, mean = fmean(times), fmean(offsets)
-            spread = sum((time - middle) ** 2 for time in times)
-            pairs = zip(times, offsets, strict=True)
-            slope = sum((time - middle) * (offset - mean) for time, offset in pairs) / spread
-            self.drift = max(-DRIFT_MAX, min(DRIFT_MAX, slope))
-            offset = mean - self.drift * middle
-        self._line = newest, self._within(base + offset), self.drift
+        span_ns = agreeing[-1].local_ns - agreeing[0].local_ns
+        slope = _slope(agreeing) if span_ns >= DRIFT_SPAN_NS else 0.0
+        self.drift = max(least_drift, min(most_drift, slope))
+        base = agreeing[-1].offset_ns
+        offset = median(
+            sample.offset_ns - base - self.drift * (sample.local_ns - newest) for sample in agreeing
+        )
+        bounds = least_drift - WANDER, most_drift + WANDER
+        self._line = newest, self._within(base + offset, *bounds), self.drift
 
-    def _within(self, offset_ns: float) -> float:
+    def _within(self, offset_ns: float, least_drift: float, most_drift: float) -> float:
         """Offset at the newest answer, the nearest to this one that no answer contradicts [ns]."""
         newest = self._samples[-1].local_ns
-        reach = [
-            sample.round_trip_ns / 2 + DRIFT_MAX * (newest - sample.local_ns)
+        least = max(
+            sample.offset_ns - sample.round_trip_ns / 2 + least_drift * (newest - sample.local_ns)
             for sample in self._samples
-        ]
-        pairs = list(zip(self._samples, reach, strict=True))
-        least = max(sample.offset_ns - wrong for sample, wrong in pairs)
-        most = min(sample.offset_ns + wrong for sample, wrong in pairs)
+        )
+        most = min(
+            sample.offset_ns + sample.round_trip_ns / 2 + most_drift * (newest - sample.local_ns)
+            for sample in self._samples
+        )
         return max(least, min(most, offset_ns)) if least <= most else offset_ns
 
     def _offset(self, local_ns: int) -> float:
@@ -149,6 +181,38 @@ class BootClock:
     def local_ns(self, boot_ns: int) -> int:
         """Time of the client's clock at a time since boot; the clock must be known."""
         origin_ns, offset_ns, drift = self._line
-        # local = boot + offset(local), and the drift is too small to ask twice for it
-        near = boot_ns + int(offset_ns)
-        return near + int(drift * (near - origin_ns))
+        # local = boot + offset + drift * (local - origin), solved for local
+        since_ns = boot_ns + int(offset_ns) - origin_ns
+        return origin_ns + round(since_ns / (1.0 - drift))
+
+
+def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
+    """Newest answers that do not contradict each other, and the least and largest drift that they
+    allow.
+
+    Older ones are of before the drift changed, or before the clock stood still for a while.
+    """
+    least, most = -DRIFT_MAX, DRIFT_MAX
+    newest = samples[-1]
+    for count, other in enumerate(reversed(samples)):
+        span_ns = newest.local_ns - other.local_ns
+        if span_ns <= 0:
+            continue
+        drift = (newest.offset_ns - other.offset_ns) / span_ns
+        wrong = (newest.round_trip_ns + other.round_trip_ns) / 2 / span_ns
+        lower, upper = max(least, drift - wrong), min(most, drift + wrong)
+        if lower > upper + WANDER:
+            return samples[-count:], least, most
+        least, most = min(lower, upper), max(lower, upper)
+    return samples, least, most
+
+
+def _slope(quick: list[Sample]) -> float:
+    """Drift of the line through some answers."""
+    newest = quick[-1]
+    times = [float(sample.local_ns - newest.local_ns) for sample in quick]
+    offsets = [float(sample.offset_ns - newest.offset_ns) for sample in quick]
+    middle, mean = fmean(times), fmean(offsets)
+    spread = sum((time - middle) ** 2 for time in times)
+    pairs = zip(times, offsets, strict=True)
+    return sum((time - middle) * (offset - mean) for time, offset in pairs) / spread

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from airborne import SAFE, Air, scenario
+from airborne import SAFE, Air, modes, scenario
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.mavlink.port import VELOCITY_ALONE
@@ -27,7 +27,6 @@ from skytether.shared.core.aboard import (
     ParametersUnsafe,
 )
 from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import ModeChanged
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
@@ -398,11 +397,6 @@ def test_the_flight_must_not_begin_on_the_ground() -> None:
 
 
 # The failsafe
-
-
-def modes(air: Air) -> list[tuple[str, str]]:
-    """Modes of the failsafe and their reasons, as far as they are told."""
-    return [(each.after, each.reason) for each in air.of(ModeChanged)]
 
 
 def flying(flavour: FlavourName, *faults: str, **table: object) -> Air:
