@@ -153,6 +153,7 @@ def fly(argv: Sequence[str]) -> None:
             feed=feed,
             metrics=command.optional_address("--metrics", options.metrics),
             line=line,
+            is_patient=True,
             warnings=command.flight_warnings(scenario),
         )
         if alone and len(rows := recording.rows()):

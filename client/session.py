@@ -12,7 +12,7 @@ from skytether.client.failsafe import Failsafe
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused
+from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
 from skytether.shared.core.steady import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Terms
@@ -38,6 +38,8 @@ from skytether.shared.wire.protocol import (
 SLEPT_NS = JUMP_NS // 2
 """Time by which the server's clock goes on further than ours while we sleep [ns]; far more than
 what delays that change make of it."""
+UNANSWERED_NS = 5 * SECOND_NS
+"""Time without a first answer after which this is said [ns]."""
 REFUSED = {
     Refusal.OTHER_TERMS: Drop.OTHER_TERMS,
     Refusal.FULL: Drop.FULL,
@@ -112,6 +114,8 @@ class ServerSession:
         self.hello_ns = 0
         """Time before which no HELLO is said again."""
         self._began_ns: int | None = None
+        self._is_unanswered = False
+        """Whether it has been said that nobody has answered yet."""
         self.number: int | None = None
         """Number of the session; None before the first."""
         self._is_open = False
@@ -275,9 +279,19 @@ class ServerSession:
             self._began_ns = now_ns
         waited_ns = now_ns - self._began_ns
         if waited_ns <= self._connect_ns:
+            self._say_unanswered(self._connect_ns - waited_ns, waited_ns)
             return True
         self._give_up(waited_ns / SECOND_NS)
         return False
+
+    def _say_unanswered(self, left_ns: int, waited_ns: int) -> None:
+        """Say once, after a while, that nobody has answered."""
+        if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
+            return
+        self._is_unanswered = True
+        host, port = self._server
+        said = Unanswered(vehicle=self._vehicle, host=host, port=port, left_s=left_ns / SECOND_NS)
+        self._events.append(said)
 
     def _give_up(self, waited_s: float) -> None:
         """Fail for want of a first session; a refusal has been said before."""

@@ -126,7 +126,10 @@ def ardupilot(system: int) -> tuple[Rule, ...]:
         ),
         Rule(
             ("SYSID_MYGCS", "MAV_GCS_SYSID"),
-            lambda v: f"it notices that system {v:g} is gone; ours is {system}",
+            lambda v: (
+                f"it notices that system {v:g} is gone, and heeds a joystick of no other; ours is "
+                f"{system}"
+            ),
             _among(system),
             f"that of mavlink.system: set {system}",
             float(system),

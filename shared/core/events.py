@@ -32,6 +32,27 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"listening on {address}, waiting for {self.waiting_for}"
 
 
+class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The name of a peer cannot be found yet."""
+
+    host: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"cannot find {self.host}: {self.reason}; it is looked up again until it is found"
+
+
+class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The name of a peer that could not be found before has been found."""
+
+    host: str
+    address: str
+    """Numeric address of the peer."""
+
+    def __str__(self) -> str:
+        return f"found {self.host}: it is {self.address}"
+
+
 class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A page can be looked at."""
 
@@ -302,6 +323,20 @@ class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: no answer from {address} in {self.waited_s:.0f} s"
 
 
+class Unanswered(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has not heard the server so far, and goes on asking."""
+
+    host: str
+    """Host that it says HELLO to."""
+    port: int
+    left_s: float
+    """Time after which it gives up [s]."""
+
+    def __str__(self) -> str:
+        at, left = address_text(self.host, self.port), f"{self.left_s:.0f} s"
+        return f"vehicle {self.vehicle}: no answer from {at} yet, asking for another {left}"
+
+
 class Flying(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle's first session has opened, and with it the flight has begun."""
 
@@ -440,6 +475,9 @@ Event = (
     | NumberTaken
     | NoSession
     | NoAnswer
+    | Unanswered
+    | HostMissing
+    | HostFound
     | Flying
     | ModeChanged
     | PlanningStopped

@@ -442,8 +442,9 @@ class LinkConfig(Section, frozen=True):
     """Time of silence after which the vehicle takes the server for gone [s]: it brakes and says
     HELLO again. After the same time, or twice that with heartbeats "auto", the server lets
     another client have the vehicle's number."""
-    connect_s: OfVehicle[Interval] = 15.0
-    """Time for which the vehicle waits for its first session before it gives up [s]."""
+    connect_s: OfVehicle[Interval] = 120.0
+    """Time for which the vehicle waits for its first session before it gives up [s]; a server that
+    starts for the first time compiles for up to a minute."""
 
     @property
     def fixed_ns(self) -> int | None:

@@ -20,7 +20,7 @@ from socket import socket
 from typing import Any
 
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
-from skytether.shared.core.events import Event, Fault
+from skytether.shared.core.events import Event, Fault, HostFound, HostMissing
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.batch import BATCH_MAX, Batch, Segments
@@ -90,6 +90,8 @@ class Shell:
         control: heeds changes in flight.
         feed: tells readers what is recorded and said.
         line: where socket 1 leads, of an endpoint that talks to hardware beside its peers.
+        is_patient: whether the endpoint is driven although a peer's name cannot be found yet; the
+            name is looked up again until it is.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
@@ -105,6 +107,8 @@ class Shell:
         control: Control | None = None,
         feed: Feed | None = None,
         line: Line | None = None,
+        *,
+        is_patient: bool = False,
     ) -> None:
         self.endpoint = endpoint
         self._stopwatch = stopwatch or Stopwatch()
@@ -113,9 +117,10 @@ class Shell:
         """Number of datagrams that could not be sent."""
         self._drops = 0
         """Number of datagrams that the kernel dropped at sockets now closed."""
-        self._names = Names(peers)
+        self._names = Names(peers, is_patient=is_patient)
         self._elsewhere = within_reach_of(self._names.numbers())
         bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
+        assert bind is None or not self._names.missing
         if forms:
             admit_only(bound, forms)
         self._sockets = {0: bound}
@@ -146,6 +151,8 @@ class Shell:
     @property
     def is_local(self) -> bool:
         """Whether no other machine can reach it, nor be reached."""
+        if self._names.missing:
+            return False
         return is_loopback(self.address) and is_loopback(self._elsewhere)
 
     def _add(self, line: Line) -> None:
@@ -419,13 +426,34 @@ class Shell:
             self.send_errors += 1
 
     async def _keep_resolving(self) -> None:
+        for (host, _), reason in self._names.missing.items():
+            self._on_event(HostMissing(host=host, reason=reason))
         while self._names.may_change:
             await asyncio.sleep(RESOLVE_EVERY_S)
             found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
             # No executor: it would be waited for at the end, and where a name is gone a look-up
             # can take 20 s.
             threading.Thread(target=self._look_up, args=(found,), daemon=True).start()
-            self._names.learn(await found)
+            self._learn(await found)
+
+    def _learn(self, found: dict[Address, Address]) -> None:
+        """Use these addresses of peers from now on, and say which could not be found before."""
+        late = [(host, found[host, port][0]) for host, port in self._names.missing.keys() & found]
+        self._names.learn(found)
+        if not late:
+            return
+        for host, number in late:
+            self._on_event(HostFound(host=host, address=number))
+        elsewhere = within_reach_of(self._names.numbers())
+        if elsewhere != self._elsewhere:
+            # Socket 0 was bound without knowing where to: the peer may be of the other family.
+            self._elsewhere = elsewhere
+            self._drops += kernel_drops(self._sockets[0])
+            self._loop.remove_reader(self._sockets[0])
+            self._sockets[0].close()
+            self._sockets[0] = open_socket(elsewhere)
+            self.address = from_kernel(self._sockets[0].getsockname())
+            self._listen(0)
 
     def _look_up(self, found: "asyncio.Future[dict[Address, Address]]") -> None:
         numbers = self._names.look_up()

@@ -100,6 +100,7 @@ def drive(
     feed: Feed | None = None,
     metrics: Address | None = None,
     line: Line | None = None,
+    is_patient: bool = False,
     warnings: Sequence[Event] = (),
     ready: Callable[[], None] = lambda: None,
 ) -> None:
@@ -109,7 +110,7 @@ def drive(
         process: name of the process in its log.
         endpoint: what to run.
         options: its options, with the scenario and its name.
-        bind, peers, forms, stopwatch, line: see `Shell`.
+        bind, peers, forms, stopwatch, line, is_patient: see `Shell`.
         waiting_for: the peer whose datagrams it waits for, named to the operator.
         secure: whether it has keys; None for one that only forwards datagrams.
         insecure: whether it may run without keys even where other machines can reach it.
@@ -132,7 +133,17 @@ def drive(
         served = stack.enter_context(_served(metrics, process, options))
         try:
             heeds = stack.enter_context(controlled(control, running))
-            shell = Shell(endpoint, bind, peers, stopwatch, forms, heeds, feed, line)
+            shell = Shell(
+                endpoint,
+                bind,
+                peers,
+                stopwatch,
+                forms,
+                heeds,
+                feed,
+                line,
+                is_patient=is_patient,
+            )
         except LocalError as error:
             raise CommandError(f"--control: {error}", CONFIGURATION) from None
         except AddressError as error:

@@ -11,6 +11,7 @@ import resource
 import socket
 import struct
 import sys
+import threading
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
@@ -31,6 +32,9 @@ again. A flood of HELLOs from ever new ports fills this memory."""
 
 SPARE_FILES = 48
 """Number of open files that a process may need beside its sockets, with all who look on."""
+
+FIND_S = 2.0
+"""Longest time for which the start of a patient process waits for a name's address [s]."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
@@ -189,18 +193,47 @@ def kernel_drops(sock: socket.socket) -> int:
 class Names:
     """Numeric addresses of peers, which an endpoint knows as the user has written them.
 
+    Args:
+        peers: names or numbers.
+        is_patient: whether a name that cannot be found now may be found by `look_up` later. Until
+            then nothing can be sent there.
+
     Raises:
-        AddressError: one of them cannot be found.
+        AddressError: one of them cannot be found, and the names are not patient.
     """
 
-    def __init__(self, peers: Iterable[Address]) -> None:
+    def __init__(self, peers: Iterable[Address], *, is_patient: bool = False) -> None:
+        self.missing: dict[Address, str] = {}
+        """Peers that have not been found yet, and the reasons."""
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
         self._names: list[Address] = []
         self._heard: dict[RawAddress, Address] = {}
         self._reached: dict[Address, tuple[tuple[Any, ...], RawAddress]] = {}
         for peer in peers:
-            self.add(peer)
+            if is_patient and not _is_numeric(peer[0]):
+                self._add_patiently(peer)
+            else:
+                self.add(peer)
+
+    def _add_patiently(self, peer: Address) -> None:
+        """Know another peer by a name that may not be found for now; blocks for FIND_S at most."""
+        self._names.append(peer)
+        self.missing[peer] = "no answer yet"
+        found: dict[Address, Address] = {}
+
+        def find() -> None:
+            try:
+                found[peer] = look_up(peer)
+            except OSError as error:
+                self.missing[peer] = error.strerror or str(error)
+
+        # A thread: where the network is down, a look-up may take 20 s, and a vehicle may be in the
+        # air.
+        thread = threading.Thread(target=find, daemon=True)
+        thread.start()
+        thread.join(FIND_S)
+        self.learn(dict(found))
 
     def add(self, peer: Address) -> None:
         """Know another peer from now on; blocks.
@@ -264,7 +297,7 @@ class Names:
         """Numeric address of a peer, as a socket takes it.
 
         Raises:
-            OSError: there is no such interface as its scope.
+            OSError: there is no such interface as its scope, or it has not been found yet.
         """
         return self._reach(peer)[0]
 
@@ -272,13 +305,15 @@ class Names:
         """Numeric address of a peer in the kernel's own form; empty where it has none.
 
         Raises:
-            OSError: there is no such interface as its scope.
+            OSError: there is no such interface as its scope, or it has not been found yet.
         """
         return self._reach(peer)[1]
 
     def _reach(self, peer: Address) -> tuple[tuple[Any, ...], RawAddress]:
         reached = self._reached.get(peer)
         if reached is None:
+            if peer in self.missing:
+                raise OSError(f"cannot find {peer[0]}")
             address, raw = to_kernel(self.number(peer)), b""
             # The socket's plain call says what is wrong with an address that cannot be packed.
             with contextlib.suppress(OSError, OverflowError):
@@ -300,6 +335,8 @@ class Names:
 
     def learn(self, found: dict[Address, Address]) -> None:
         """Let these numbers stand for these peers from now on."""
+        for peer in found:
+            self.missing.pop(peer, None)
         self._numbers |= found
         self._by_number = {number: name for name, number in self._numbers.items()}
         self._heard.clear()

@@ -19,6 +19,7 @@ from skytether.shared.core.events import (
     NoAnswer,
     NoSession,
     SessionRefused,
+    Unanswered,
 )
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
@@ -124,15 +125,16 @@ def test_hello_is_repeated_until_somebody_answers() -> None:
 
 
 def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
-    """After `link.connect_s`, before it has flown at all."""
-    server = Server(scenario())
+    """After `link.connect_s`, before it has flown at all; after 5 s it says that it goes on."""
+    server = Server(scenario(link={"connect_s": 15.0}))
     for _ in range(30):
         if server.client.finished:
             break
         server.wake()
     failure = NoAnswer(vehicle=4, host="server", port=0, waited_s=16.0)
     assert server.client.failure == failure
-    assert server.client.events() == (failure,)
+    waits = Unanswered(vehicle=4, host="server", port=0, left_s=10.0)
+    assert server.client.events() == (waits, failure)
     assert str(failure) == "vehicle 4: no answer from server:0 in 16 s"
     assert server.client.next_wake_ns() is None
 
@@ -162,7 +164,7 @@ def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason
     refusal: int, reason: Literal["full", "taken"], said: str
 ) -> None:
     """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
-    server, hellos = Server(scenario()), 0
+    server, hellos = Server(scenario(link={"connect_s": 15.0})), 0
     while not server.client.finished:
         hellos += len(server.wake())
         server.welcome(refusal=refusal)

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from fenced_flights import furthest_m, scenario
+from helpers import packaged
 from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import FenceHolds
+from skytether.shared.core.events import FenceHolds, ModeChanged
 from skytether.shared.scenario.fence import SLOW_STEPS, inner
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
+from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import fly
 
 
@@ -82,6 +84,24 @@ def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
     assert record.client["state"][:, 0, 0].max() <= 1.0
     assert record.client["state"][:, 0, 0].min() < -1.0
     assert any(isinstance(each.event, FenceHolds) for each in record.events)
+
+
+def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
+    """Wind blows it there while it hovers without a link; that is said until it lands."""
+    blown = packaged(
+        "demo",
+        duration=60.0,
+        fence={"low_m": [-9.0, -9.0], "high_m": [1.0, 9.0], "wind_mps": 0.2},
+        reference={"shape": "hover", "points_m": [[0.0, 0.0]]},
+        vehicle={"steady_wind_mps": [0.14, 0.0], "wind": 0.0, "land_after_s": 12.0},
+        network={"uplink": "constant(0.05) & outage(10, 50)", "downlink": "constant(0.05)"},
+    )
+    told = [(each.time_ns / 1e9, each.event) for each in fly(blown).events]
+    modes = [(t, event.after) for t, event in told if isinstance(event, ModeChanged)]
+    (land_s,) = (t for t, after in modes if after == str(Mode.LAND))
+    held_s = [t for t, event in told if isinstance(event, FenceHolds)]
+    assert held_s
+    assert max(held_s) < land_s < 40.0
 
 
 @pytest.mark.parametrize(

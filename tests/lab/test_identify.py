@@ -427,7 +427,7 @@ def test_the_documented_field_flies_at_once_with_the_model_identified(
     air = Air(flavour, **reading.to_table(written))
     air.fly()
     air.run(20.0)
-    assert air.rmse(settle_s=10.0) < 0.2
+    assert air.rmse(written.settled_s) < 0.1
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])

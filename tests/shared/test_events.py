@@ -39,6 +39,8 @@ from skytether.shared.core.events import (
     Finished,
     FlowOpened,
     Flying,
+    HostFound,
+    HostMissing,
     LeftTube,
     Listening,
     Measured,
@@ -59,6 +61,7 @@ from skytether.shared.core.events import (
     SessionOpened,
     SessionRefused,
     StateDoubted,
+    Unanswered,
     Unauthenticated,
     address_text,
 )
@@ -155,6 +158,18 @@ SENTENCES = [
     (
         NoAnswer(vehicle=1, host="server", port=5, waited_s=15.6),
         "vehicle 1: no answer from server:5 in 16 s",
+    ),
+    (
+        Unanswered(vehicle=1, host="server", port=5, left_s=10.0),
+        "vehicle 1: no answer from server:5 yet, asking for another 10 s",
+    ),
+    (
+        HostMissing(host="ground.example", reason="no answer yet"),
+        "cannot find ground.example: no answer yet; it is looked up again until it is found",
+    ),
+    (
+        HostFound(host="ground.example", address="::1"),
+        "found ground.example: it is ::1",
     ),
     (Flying(vehicle=1), "vehicle 1: session open, flying"),
     (

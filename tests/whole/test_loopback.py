@@ -4,6 +4,7 @@ import asyncio
 import io
 import socket
 import sys
+import threading
 import time
 from typing import Any
 
@@ -18,7 +19,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, FlowOpened
+from skytether.shared.core.events import Event, FlowOpened, HostFound, HostMissing
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
@@ -285,6 +286,97 @@ def test_an_ipv6_socket_hears_ipv6_alone() -> None:
         port = six.getsockname()[1]
         with open_socket(("0.0.0.0", port)) as four:
             assert four.getsockname()[1] == port
+
+
+class Asking(Echo):
+    """Says HELLO to a peer every 20 ms until something is heard."""
+
+    def __init__(self, peer: Address) -> None:
+        super().__init__(last=10**6)
+        self.peer, self.due_ns, self.senders = peer, 0, list[Address]()
+
+    @property
+    def finished(self) -> bool:
+        """Once something has been heard."""
+        return bool(self.senders)
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        """Note who has said it."""
+        self.senders.append(datagram.peer)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Ask again."""
+        self.due_ns = now_ns + 20_000_000
+        self._out.append(Datagram(b"hello", self.peer))
+
+    def next_wake_ns(self) -> int | None:
+        """The time of the next HELLO."""
+        return self.due_ns
+
+
+@pytest.mark.parametrize(
+    ("loopback", "family"),
+    [
+        (LOOPBACK, socket.AF_INET),
+        pytest.param(LOOPBACK_6, socket.AF_INET6, marks=pytest.mark.ipv6),
+    ],
+    ids=["IPv4", "IPv6"],
+)
+async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
+    loopback: Address, family: socket.AddressFamily, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the network there is no answer to the name, and then there is one."""
+    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.05)
+    with socket.socket(family, socket.SOCK_DGRAM) as server:
+        server.setblocking(False)
+        server.bind(loopback)
+        port = server.getsockname()[1]
+        peer, found = ("ground.example", port), list[str]()
+
+        def look_up(asked: Address) -> Address:
+            assert asked == peer
+            if not found:
+                raise OSError(-3, "Temporary failure in name resolution")
+            return (found[0], port)
+
+        monkeypatch.setattr(udp, "look_up", look_up)
+        asking, events = Asking(peer), list[Event]()
+        driver = Shell(asking, None, [peer], is_patient=True)
+        assert not driver.is_local  # as far as it is known
+        loop = asyncio.get_running_loop()
+        task = asyncio.create_task(driver.run(events.append))
+        await asyncio.sleep(0.2)
+        assert driver.send_errors > 0
+        assert events == [
+            HostMissing(host=peer[0], reason="Temporary failure in name resolution"),
+        ]
+        found.append(loopback[0])
+        _, sender = await asyncio.wait_for(loop.sock_recvfrom(server, 100), 5)
+        await loop.sock_sendto(server, b"welcome", sender)
+        await asyncio.wait_for(task, 5)
+    assert events[1:] == [HostFound(host=peer[0], address=loopback[0])]
+    assert asking.senders == [peer]
+    assert driver.is_local
+
+
+def test_a_look_up_that_takes_long_does_not_keep_a_patient_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its vehicle may be in the air: a resolver without a network takes 20 s to give up."""
+    answered = threading.Event()
+
+    def look_up(peer: Address) -> Address:
+        answered.wait(20.0)
+        return peer
+
+    monkeypatch.setattr(udp, "look_up", look_up)
+    monkeypatch.setattr(udp, "FIND_S", 0.01)
+    names = udp.Names([("ground.example", 1)], is_patient=True)
+    assert not answered.is_set()
+    assert names.missing == {("ground.example", 1): "no answer yet"}
+    with pytest.raises(OSError, match=r"cannot find ground\.example"):
+        names.kernel(("ground.example", 1))
+    answered.set()
 
 
 def test_addresses_of_no_use_are_named() -> None:
