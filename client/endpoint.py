@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe
+from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
@@ -76,6 +76,7 @@ class Client(Endpoint):
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
             timeout_ns=self._timeout_ns,
+            brake_ns=brake_ns(terms),
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             changed=self._mode_changed,
         )

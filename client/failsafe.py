@@ -8,11 +8,13 @@
 Time is an argument. What is flown in each mode is chosen in `client.pilot`.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.law.terms import Terms
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
@@ -30,6 +32,8 @@ MALFORMED_MAX = 5
 """Malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
 """Horizons for impossible times within `WINDOW_NS` that make it ask for its session anew."""
+BRAKE_SPARE_NS = 500 * MILLISECOND_NS
+"""Time beyond that of the braking curve itself for which a vehicle may brake [ns]."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
 """Causes for which somebody else flies the vehicle, or nobody."""
@@ -52,6 +56,11 @@ CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session: another WELCOME is needed."""
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
 """Causes for which the horizon held is dropped."""
+
+HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
+"""Modes in which it stands still until something comes."""
+KEPT = frozenset({Reason.BRAKED, Reason.WAITED})
+"""Causes that are no reason of their own: what it brakes or hovers for stays the reason."""
 
 CALM = frozenset({Mode.TRACK, Mode.COAST, Mode.HOVER})
 """Modes in which a vehicle may fly for many steps without a cause for another one."""
@@ -82,10 +91,9 @@ TABLE: Table = MappingProxyType(
         (Mode.TRACK, Reason.OLD): Mode.COAST,
         (Mode.COAST, Reason.HORIZON): Mode.TRACK,
         (Mode.BRAKE, Reason.HORIZON): Mode.TRACK,
-        (Mode.BRAKE, Reason.STILL): Mode.HOVER,
+        (Mode.BRAKE, Reason.BRAKED): Mode.HOVER,
         (Mode.HOVER, Reason.HORIZON): Mode.TRACK,
         (Mode.HOVER, Reason.GOOD): Mode.HOVER,
-        (Mode.HOVER, Reason.ALONE): Mode.LAND,
         (Mode.HOVER, Reason.LEAPT): Mode.HOVER,
         (Mode.MANUAL, Reason.RETURNED): Mode.HOVER,
     }
@@ -94,6 +102,7 @@ TABLE: Table = MappingProxyType(
         for mode in (Mode.SYNC, Mode.READY, Mode.HOVER)
         for cause in GROUNDING
     }
+    | {(mode, cause): Mode.LAND for mode in HANGING for cause in (Reason.ALONE, Reason.WAITED)}
     # LOST is left out: in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
@@ -124,6 +133,12 @@ HOLD: Table = MappingProxyType(
 """Next mode with `vehicle.exhausted = "hold"`: never does the vehicle brake or land by itself."""
 
 
+def brake_ns(terms: Terms) -> int:
+    """Longest time of braking [ns]: from u_max on all axes at once, and BRAKE_SPARE_NS."""
+    steps = math.ceil(math.hypot(*terms.u_max) / terms.brake) if terms.brake else 0
+    return steps * terms.dt_ns + BRAKE_SPARE_NS
+
+
 class Failsafe:
     """Mode of one vehicle, and why it is in it.
 
@@ -132,7 +147,9 @@ class Failsafe:
         armed: whether horizons may be flown at all, see `armed`.
         timeout_ns: time of silence after which the link is lost, and without a newer horizon after
             which the vehicle coasts [ns].
-        land_after_ns: time of hovering with a lost link after which it lands [ns]; 0: never.
+        brake_ns: longest time of braking [ns]: then it hovers, whatever still pushes it.
+        land_after_ns: time of hovering after which it lands, if nothing that it needs to fly on has
+            come: a good link, say [ns]; 0: never.
         changed: called whenever mode or reason have changed, with those before, the cause, and the
             time.
     """
@@ -143,13 +160,14 @@ class Failsafe:
         *,
         armed: bool,
         timeout_ns: int,
+        brake_ns: int,
         land_after_ns: int,
         changed: Callable[[Mode, Reason, Reason, int], None],
     ) -> None:
         self._table = table
         self.armed = armed
         """Whether horizons may be flown at all; it may change in flight."""
-        self._timeout_ns = timeout_ns
+        self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
         self._changed = changed
         self.mode = Mode.INIT
@@ -164,8 +182,11 @@ class Failsafe:
         """Time at which the newest horizon was taken."""
         self._late_ns: int | None = None
         """Time since which all horizons have come late; None where the newest has not."""
-        self._alone_ns = 0
-        """Time since which it has hovered with a lost link, as far as it has."""
+        self._began_ns = 0
+        """Time at which the present mode began."""
+        self._waits_ns: int | None = None
+        """Time since which it has hovered without what it needs to fly on; None where it has
+        that."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         """Times of the newest malformed messages."""
         self._has_leapt = False
@@ -282,10 +303,23 @@ class Failsafe:
             self.meet(Reason.LEAPT, now_ns=now_ns)
         if now_ns - self._horizon_ns > self._timeout_ns:
             self.meet(Reason.OLD, now_ns=now_ns)
-        if self.mode is not Mode.HOVER or not lost:
-            self._alone_ns = now_ns
-        elif 0 < self._land_after_ns <= now_ns - self._alone_ns:
-            self.meet(Reason.ALONE, now_ns=now_ns)
+        if now_ns - self._began_ns >= self._brake_ns:
+            self.meet(Reason.BRAKED, now_ns=now_ns)
+        self._wait(lost=lost, good=good, now_ns=now_ns)
+
+    def _wait(self, *, lost: bool, good: bool, now_ns: int) -> None:
+        """Land where what the vehicle needs to fly on does not come."""
+        # A link that is never good, or an autopilot that is silent, locks it as a lost link does.
+        locked = self.reason in LOCKING or self.mode is Mode.SYNC
+        waits = lost or (locked and not good) or self._has_leapt
+        # A link that has just come back has its second to be good.
+        patience_ns = self._land_after_ns + (0 if lost else GOOD_NS)
+        if self.mode not in HANGING or not waits:
+            self._waits_ns = None
+        elif self._waits_ns is None:
+            self._waits_ns = now_ns
+        elif self._land_after_ns and now_ns - self._waits_ns >= patience_ns:
+            self.meet(Reason.ALONE if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
         """Note that its state has leapt: no horizon is taken until it is disarmed and armed."""
@@ -304,9 +338,10 @@ class Failsafe:
             self._good_ns = now_ns
         if cause in CLOSING:
             self._heard_ns = None
+        if after is not self.mode:
+            self._began_ns = now_ns
         before = self.mode, self.reason
-        # Standing still is no reason of its own: what it braked for stays.
-        self.mode, self.reason = after, self.reason if cause is Reason.STILL else cause
+        self.mode, self.reason = after, self.reason if cause in KEPT else cause
         if (self.mode, self.reason) != before:
             self._changed(*before, cause, now_ns)
 

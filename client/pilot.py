@@ -257,18 +257,19 @@ class Pilot:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:
             failsafe.meet(Reason.ENDED, now_ns=now_ns)
-        if flown is None or failsafe.mode in STOPPED:
+        stops = flown is None or failsafe.mode in STOPPED
+        if flown is None or stops:
             flown = told = [0.0] * self._terms.axes
-        elif self._fence is not None:
-            flown = self._fenced(self._fence, flown)
         # The braking curve is for what is told; feedback is bounded by u_max alone
-        # (docs/failsafe.md).
+        # (docs/failsafe.md). What the fence adds is no part of it either: it may push for ever.
         if compensator.feeds_back:
             self._speed = min(math.hypot(*told), speed_max)
         else:
             self._speed = math.hypot(*flown)
         if not self._speed:
-            failsafe.meet(Reason.STILL, now_ns=now_ns)
+            failsafe.meet(Reason.BRAKED, now_ns=now_ns)
+        if self._fence is not None and not stops:
+            flown = self._fenced(self._fence, flown)
         return np.array(flown)
 
     def _rest(self) -> None:

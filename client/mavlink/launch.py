@@ -120,8 +120,11 @@ class Launch:
             may_arm: whether a vehicle on the ground is armed.
             now_ns: time now.
         """
-        if self._is_flying:
-            return self._is_placed(now_ns)
+        if self._is_flying and not self.failure:
+            is_placed = self._is_placed(now_ns)
+            if not is_placed:
+                self._wait("not flown", "it does not tell where it is", now_ns)
+            return is_placed
         if self.failure or self._closed or self.phase is Phase.LANDING:
             return False
         if self.phase is Phase.GROUND:

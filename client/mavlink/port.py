@@ -329,7 +329,7 @@ class Port(Endpoint):
 
     def _tick(self, now_ns: int) -> None:
         assert self._began_ns is not None
-        if self._peer is not None and now_ns >= self._beat_ns:
+        if self._peer is not None and now_ns >= self._beat_ns and not self._is_given_up(now_ns):
             self._beat_ns = now_ns + HEARTBEAT_NS
             self._say(
                 dialect.MAVLink_heartbeat_message(
@@ -358,6 +358,14 @@ class Port(Endpoint):
             *self._launch.ask(now_ns=now_ns),
         ):
             self._say(message)
+
+    def _is_given_up(self, now_ns: int) -> bool:
+        """Whether it is to land, and does not say that it does: without our heartbeats its own
+        failsafe lands it.
+        """
+        launch = self._launch
+        lands = launch is not None and launch.phase is Phase.LANDING
+        return lands and not self._condition.is_fresh(now_ns=now_ns)
 
     def _setpoint_ns(self) -> int | None:
         """Time of the next setpoint; None where none is to be sent."""

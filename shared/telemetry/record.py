@@ -49,7 +49,7 @@ class Reason(IntEnum):
     MALFORMED = 11
     RESYNC = 12
     STALLED = 13
-    STILL = 14
+    BRAKED = 14
     ALONE = 15
     NOT_FINITE = 16
     LEAPT = 17
@@ -59,6 +59,7 @@ class Reason(IntEnum):
     BATTERY = 21
     ASTRAY = 22
     MUTE = 23
+    WAITED = 24
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -79,7 +80,7 @@ REASON_TEXTS = {
     Reason.MALFORMED: "the server sends malformed messages",
     Reason.RESYNC: "the server plans for impossible times",
     Reason.STALLED: "its own computer woke it too late",
-    Reason.STILL: "it stands still",
+    Reason.BRAKED: "it has braked",
     Reason.ALONE: "the server has been silent for long",
     Reason.NOT_FINITE: "its state or its input is not finite",
     Reason.LEAPT: "its state has jumped further than a vehicle can move",
@@ -89,6 +90,7 @@ REASON_TEXTS = {
     Reason.BATTERY: "its battery is low",
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
+    Reason.WAITED: "what it waits for has not come for long",
 }
 
 

@@ -54,7 +54,8 @@ class AutopilotOptions:
             help="Fault to simulate, with its time after arming; may come several times. "
             "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
-            "estimate@20-25: it does not know where it is.",
+            "estimate@20-25: it does not know where it is; "
+            "drift@20-25: its accelerometers fail, it moves and does not notice.",
         ),
     ] = ()
     insecure: bool = False

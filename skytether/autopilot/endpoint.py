@@ -228,7 +228,7 @@ class Autopilot(Endpoint):
         """Record the true state at a time."""
         if self._recorder is not None:
             x, y, z = self.flight.position()
-            vx, vy, vz = self.flight.velocity()
+            vx, vy, vz = self.flight.quadrotor.velocity().tolist()
             self._recorder.append_row(time_ns, x, vx, y, vy, z, vz)
 
     def _meet(self, address: Address, *, pinned: bool = False) -> Peer | None:

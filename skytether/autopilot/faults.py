@@ -5,15 +5,17 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 from skytether.autopilot.flavours import FlightMode
-from skytether.autopilot.flight import PilotedVehicle
+from skytether.autopilot.flight import REST, PilotedVehicle, Vector
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.base.units import seconds_to_ns
 
-FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate"]
+FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate", "drift"]
 NAMES: tuple[str, ...] = get_args(FaultName)
-LASTING = ("silence", "estimate")
+LASTING = ("silence", "estimate", "drift")
 """Faults that may end."""
+DRIFT: Vector = (3.5, 0.0, 0.0)
+"""Velocity at which the vehicle moves unnoticed with the fault `drift` [m/s]."""
 LOW_CHARGE = 0.05
 """Charge that is left by the fault `battery`."""
 
@@ -44,7 +46,7 @@ def parse(text: str) -> ScriptedFault:
     if name not in NAMES:
         raise ConfigError(f"--fault: got {name!r}; {hint(name, NAMES)}")
     if end is not None and (name not in LASTING or float(end) <= float(begin)):
-        expected = f"expected a later end, and one of {' and '.join(LASTING)} alone"
+        expected = f"expected a later end, and one of {', '.join(LASTING)} alone"
         raise ConfigError(f"--fault: got {text!r}, {expected}")
     return ScriptedFault(
         name, seconds_to_ns(float(begin)), None if end is None else seconds_to_ns(float(end))
@@ -91,7 +93,10 @@ class Script:
                 self._change(name, flight, wrong=True)
 
     def _change(self, name: str, flight: PilotedVehicle, *, wrong: bool) -> None:
-        if name == "silence":
-            self.silent = wrong
-        else:
-            flight.estimates = not wrong
+        match name:
+            case "silence":
+                self.silent = wrong
+            case "drift":
+                flight.drift = DRIFT if wrong else REST
+            case _:
+                flight.estimates = not wrong

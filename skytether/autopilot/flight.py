@@ -114,6 +114,9 @@ class PilotedVehicle(ABC):
         """Whether the vehicle has left the ground."""
         self.estimates = True
         """Whether its position estimate is valid, once it is ready."""
+        self.drift: Vector = REST
+        """Velocity at which it moves beside the one that it estimates, as with accelerometers that
+        have failed [m/s]."""
         self.said: list[tuple[Severity, str]] = []
         """Texts not sent yet."""
         self.now_ns = 0
@@ -329,7 +332,8 @@ class PilotedVehicle(ABC):
         else:
             velocity = REST
         self.quadrotor.on = self.armed and self.flying
-        self.quadrotor.advance(np.array(velocity), TICK_NS)
+        drift = self.drift if self.flying else REST
+        self.quadrotor.advance(np.add(velocity, drift), TICK_NS)
         if self.armed:
             self._settle(velocity)
 
@@ -450,8 +454,8 @@ class PilotedVehicle(ABC):
         return x, y, z
 
     def velocity(self) -> Vector:
-        """Velocity [m/s]."""
-        x, y, z = self.quadrotor.velocity().tolist()
+        """Velocity, as it estimates it [m/s]."""
+        x, y, z = np.subtract(self.quadrotor.velocity(), self.drift).tolist()
         return x, y, z
 
     def quadrotor_wants(self) -> Vector:

@@ -814,3 +814,33 @@ def test_a_stream_that_stops_is_asked_for_again() -> None:
     air.run(5.0)
     assert number in peer.streams
     assert air.client._failsafe.mode in (Mode.HOVER, Mode.TRACK)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe(
+    flavour: FlavourName,
+) -> None:
+    """Setpoints and heartbeats stop after `vehicle.land_after_s`; its own failsafe lands it."""
+    air = flying(flavour, vehicle={"land_after_s": 4.0})
+    air.autopilot.script.silent = True
+    silent_ns = air.world.now_ns
+    down_s = air.run(60.0, lambda: not air.flight.armed)
+    assert [after for after, _ in modes(air)][-3:] == ["brake", "hover", "land"]
+    assert modes(air)[-1] == ("land", str(Reason.MUTE))
+    assert not air.heard("HEARTBEAT", silent_ns + 8 * SECOND)
+    assert not air.setpoints(silent_ns + 8 * SECOND)
+    assert down_s < 30.0
+
+
+def test_a_vehicle_that_drifts_over_its_fence_lands_when_its_link_is_lost() -> None:
+    """Its accelerometers have failed: the fence pushes for ever, and keeps it from nothing."""
+    fence = {"low_m": [-9.0, -9.0, 0.5], "high_m": [8.0, 9.0, 9.0], "wind_mps": 0.5}
+    air = flying("ardupilot", "drift@1", fence=fence, vehicle={"land_after_s": 4.0})
+    air.run(30.0, lambda: air.flight.position()[0] > 8.2)
+    assert air.flight.position()[0] > 8.2
+    air.world.stop("server")
+    lost_s = air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
+    assert [after for after, _ in modes(air)][-3:] == ["brake", "hover", "land"]
+    # The time-out, braking from 3 m/s on all axes at 2 m/s², hovering, and landing.
+    assert lost_s < 1.5 + 3.1 + 4.0 + 0.2
+    assert air.setpoints()[-1][1].vx < -1.0

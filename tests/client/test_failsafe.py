@@ -239,9 +239,9 @@ def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
 
 
 def test_a_link_that_stutters_is_not_good() -> None:
-    """A heartbeat every 1.1 s for ten seconds, where silence of 1 s is a loss."""
+    """A heartbeat every 1.1 s for nine seconds, where silence of 1 s is a loss."""
     hand = Hand()
-    for _ in range(9):
+    for _ in range(8):
         hand.fly(1.1, beats=False)
         hand.heartbeat()
         assert hand.mode is Mode.SYNC
@@ -251,10 +251,10 @@ def test_a_link_that_stutters_is_not_good() -> None:
 def test_a_link_is_good_while_it_is_never_silent_for_more_than_two_thirds_of_the_time_out(
     steps: int, mode: Mode
 ) -> None:
-    """A heartbeat every 0.66 s, and every 0.68 s, twenty times: silence of 1 s is a loss."""
+    """A heartbeat every 0.66 s, and every 0.68 s, fifteen times: silence of 1 s is a loss."""
     hand = Hand()
     hand.fly(1 / STEPS_PER_S, beats=False)
-    for _ in range(20):
+    for _ in range(15):
         hand.heartbeat()
         hand.fly(steps / STEPS_PER_S, beats=False)
     assert (hand.mode, hand.takes) == (mode, mode is Mode.READY)
@@ -456,7 +456,12 @@ def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
     """Ten horizons for impossible times end a session; the next ten are needed to end another."""
     met: list[Reason] = []
     guard = Failsafe(
-        TABLE, armed=True, timeout_ns=SECOND_NS, land_after_ns=SECOND_NS, changed=lambda *_: None
+        TABLE,
+        armed=True,
+        timeout_ns=SECOND_NS,
+        brake_ns=SECOND_NS,
+        land_after_ns=SECOND_NS,
+        changed=lambda *_: None,
     )
 
     def meet(cause: Reason, *, now_ns: int) -> None:
@@ -591,7 +596,7 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again(
         hand.fly(0.02, plans=True)
         assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
         assert hand.changes[-1] == ("brake", "its state has jumped further than a vehicle can move")
-        hand.fly(20.0, plans=True)
+        hand.fly(9.0, plans=True)
         assert (hand.mode, hand.takes) == (Mode.HOVER, False)
         assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
         for armed in (False, True):
@@ -737,6 +742,7 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         TABLE,
         armed=True,
         timeout_ns=SECOND_NS,
+        brake_ns=SECOND_NS,
         land_after_ns=SECOND_NS,
         changed=lambda _, __, cause, ___: told.append(cause),
     )
@@ -810,16 +816,116 @@ def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
 def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """However long it takes; a second after it is heard again, plans are flown."""
+    """A second after it is heard again, plans are flown."""
     hand = tracking()
     hindered(monkeypatch, hand, Reason.MUTE)
     hand.fly(0.02)
     assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
-    hand.fly(20.0, plans=True)
+    hand.fly(9.0, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
     hindered(monkeypatch, hand, None)
     hand.fly(1.1)
     assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+
+
+def test_a_vehicle_whose_autopilot_stays_silent_lands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`vehicle.land_after_s` of hovering, and the second that a link has to be good."""
+    hand = tracking()
+    hindered(monkeypatch, hand, Reason.MUTE)
+    hand.fly(0.6 + 10.0, plans=True)
+    assert hand.mode is Mode.HOVER
+    hand.fly(1.2, plans=True)
+    assert hand.mode is Mode.LAND
+    assert hand.changes[-1] == ("land", "its autopilot is silent")
+
+
+def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None:
+    """It was lost for 9.9 s of hovering, and is good before the vehicle lands."""
+    hand = tracking()
+    hand.fly(1.0 + 0.52 + 9.8, beats=False)
+    assert hand.mode is Mode.HOVER
+    hand.fly(1.3)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+
+
+# -- no mode is held for ever by what pushes, or by what never comes ---------------------------
+
+
+def beyond_its_fence() -> Hand:
+    """A vehicle that wind of 1.5 m/s holds beyond its fence, whose bound is 4.5 m."""
+    fence = {"low_m": [-9.0, -9.0], "high_m": [4.5, 9.0], "wind_mps": 0.2}
+    hand = Hand(vehicle={"steady_wind_mps": [1.5, 0.0]}, fence=fence)
+    hand.fly(1.2)
+    hand.fly(5.0, plans=True)
+    assert hand.rows()["state"][-1, 0, 0] > 4.6
+    assert hand.speed > 1.0
+    return hand
+
+
+def test_a_fence_that_pushes_for_ever_keeps_no_vehicle_from_landing() -> None:
+    """The link is cut: it brakes, hovers and lands when one inside would, and is pushed back."""
+    hand = beyond_its_fence()
+    began_s = hand.now_ns / SECOND_NS
+    while hand.mode is not Mode.LAND and hand.now_ns / SECOND_NS < began_s + 20.0:
+        hand.fly(0.02, beats=False)
+        assert hand.speed > 1.0
+    modes = [after for after, _ in hand.changes]
+    assert modes[-3:] == ["brake", "hover", "land"]
+    timeout_s, braking_s, land_after_s = 1.0, failsafe.brake_ns(hand.terms) / SECOND_NS, 10.0
+    assert hand.now_ns / SECOND_NS - began_s < timeout_s + braking_s + land_after_s + 0.1
+
+
+def test_the_longest_braking_is_that_from_the_fastest_input() -> None:
+    """From u_max on both axes at 2 m/s², in whole steps, and half a second more."""
+    terms = scenario().terms()
+    assert failsafe.brake_ns(terms) / SECOND_NS == pytest.approx(
+        np.hypot(*terms.u_max) / 2.0 + 0.5, abs=terms.dt_s
+    )
+
+
+ADVERSITIES: dict[str, tuple[float, Reason | None]] = {
+    "silence": (float("inf"), None),
+    "a link that stutters": (1.1, None),
+    "a silent autopilot": (0.1, Reason.MUTE),
+    "a low battery": (0.1, Reason.BATTERY),
+    "no estimate": (0.1, Reason.ASTRAY),
+    "a leap": (0.1, Reason.LEAPT),
+}
+"""Time between packets [s], and what is met at every step."""
+
+
+@pytest.mark.parametrize("adversity", ADVERSITIES)
+@pytest.mark.parametrize(
+    "mode", [each for each in Mode if each not in (Mode.INIT, Mode.LAND, Mode.FAULT, Mode.MANUAL)]
+)
+def test_no_mode_in_the_air_lasts_for_ever(mode: Mode, adversity: str) -> None:
+    """Nothing ever tells that it stands still: something pushes it; only time passes."""
+    every_s, hindrance = ADVERSITIES[adversity]
+    aboard = Failsafe(
+        TABLE,
+        armed=True,
+        timeout_ns=SECOND_NS,
+        brake_ns=2 * SECOND_NS,
+        land_after_ns=10 * SECOND_NS,
+        changed=lambda *_: None,
+    )
+    aboard.meet(Reason.OPENED, now_ns=0)
+    aboard.heard(now_ns=0)
+    aboard.mode, heard_ns = mode, 0
+    if hindrance is Reason.LEAPT:
+        aboard.leapt(now_ns=0)
+        hindrance = None
+    now_ns, dt_ns = 0, 20 * MILLISECOND_NS
+    while aboard.mode is not Mode.LAND and now_ns < 60 * SECOND_NS:
+        now_ns += dt_ns
+        if now_ns - heard_ns >= every_s * SECOND_NS:
+            heard_ns = now_ns
+            aboard.heard(now_ns=now_ns)
+        aboard.step(late_ns=0, hindrance=hindrance, now_ns=now_ns)
+        if aboard.mode in (Mode.TRACK, Mode.COAST) and now_ns > 5 * SECOND_NS:
+            aboard.meet(Reason.ENDED, now_ns=now_ns)
+    # The longest plan, noticing, braking, hovering, and a second for a link to be good.
+    assert now_ns <= (5 + 1 + 2 + 10 + 1.1) * SECOND_NS
 
 
 def hindrance_test(test: Callable[..., None], *causes: Reason) -> Callable[[], None]:
@@ -837,7 +943,8 @@ ROWS: dict[Reason, Callable[[], None]] = {
     Reason.UNARMED: test_a_vehicle_that_is_not_armed_flies_nothing,
     Reason.OLD: test_without_a_newer_horizon_it_coasts_and_says_nothing,
     Reason.ENDED: test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once,
-    Reason.STILL: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.BRAKED: test_a_silent_server_ends_in_brake_with_horizon_left,
+    Reason.WAITED: hindrance_test(test_a_vehicle_whose_autopilot_stays_silent_lands),
     Reason.LOST: test_a_silent_server_ends_in_brake_with_horizon_left,
     Reason.ALONE: test_ten_seconds_of_hovering_alone_end_in_landing_for_good,
     Reason.LATE: test_horizons_that_come_late_for_half_a_second_end_in_brake,

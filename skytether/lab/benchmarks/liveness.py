@@ -84,7 +84,12 @@ def _session(network: DirectionConfig, seed: int) -> tuple[int, float]:
     up, down = (Fates(network, seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, None)
     failsafe = Failsafe(
-        TABLE, armed=True, timeout_ns=timeout_ns, land_after_ns=end_ns, changed=lambda *_: None
+        TABLE,
+        armed=True,
+        timeout_ns=timeout_ns,
+        brake_ns=0,
+        land_after_ns=end_ns,
+        changed=lambda *_: None,
     )
     nowhere = ("nowhere", 0)
     hearing = Hearing(LINK.patience_ns, STEP_NS, None)
