@@ -184,9 +184,8 @@ class Failsafe:
         """Time since which all horizons have come late; None where the newest has not."""
         self._began_ns = 0
         """Time at which the present mode began."""
-        self._waits_ns: int | None = None
-        """Time since which it has hovered without what it needs to fly on; None where it has
-        that."""
+        self._waits_ns = 0
+        """Time since which it has hovered without what it needs to fly on, as far as it has."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         """Times of the newest malformed messages."""
         self._has_leapt = False
@@ -315,8 +314,6 @@ class Failsafe:
         # A link that has just come back has its second to be good.
         patience_ns = self._land_after_ns + (0 if lost else GOOD_NS)
         if self.mode not in HANGING or not waits:
-            self._waits_ns = None
-        elif self._waits_ns is None:
             self._waits_ns = now_ns
         elif self._land_after_ns and now_ns - self._waits_ns >= patience_ns:
             self.meet(Reason.ALONE if lost else Reason.WAITED, now_ns=now_ns)
@@ -340,6 +337,7 @@ class Failsafe:
             self._heard_ns = None
         if after is not self.mode:
             self._began_ns = now_ns
+            self._waits_ns = self._waits_ns if self.mode in HANGING else now_ns
         before = self.mode, self.reason
         self.mode, self.reason = after, self.reason if cause in KEPT else cause
         if (self.mode, self.reason) != before:
