@@ -4,20 +4,21 @@ Clients send to netem's bound socket. Each client address is a flow with a socke
 the server, so that the server's answers find their way back. Uplink is server to client, downlink
 is client to server, as in the paper.
 
-A flow that the server has answered keeps its place while it is used. Where no place is free, any
-other gives way to a new client at once, the one first whose last packet is oldest: what strangers
-send takes no place from those who fly, and none for long from those who come.
+Where no place is free for a new client, `places` says which flow gives way. A server address that
+leads back here is found out as well: until the server has sent its first packet, a packet that has
+come from LAPS_MAX new addresses, one after the other, opens no further flow.
 """
 
+import hashlib
 from collections import OrderedDict
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from skytether.netem.fate import Fates
-from skytether.netem.link import Lane, Link
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.netem.link import QUEUE_MAX, Lane, Link
+from skytether.netem.places import Flow, Places, host_of
+from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
-from skytether.shared.core.events import Fault, FlowOpened
+from skytether.shared.core.events import Fault, FlowOpened, Returned
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
@@ -25,23 +26,9 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
 """Largest number of clients at once by default; packets of others are dropped and counted."""
-IDLE_NS = 60 * SECOND_NS
-"""Time without a packet after which a flow that was answered gives way to a new client [ns]."""
-
-
-@dataclass(slots=True)
-class Flow:
-    """State of one client address."""
-
-    client: Address
-    socket: int
-    """Number of its socket towards the server, from 1."""
-    uplink: Lane
-    downlink: Lane
-    used_ns: int
-    """Time of its newest packet, either way."""
-    order: "OrderedDict[Address, Flow]"
-    """Flows among which it stands, answered or unanswered, by client, oldest packet first."""
+LAPS_MAX = 16
+"""Largest number of flows that one packet opens, each from another address, while the server has
+never answered."""
 
 
 class Proxy(Endpoint):
@@ -73,12 +60,16 @@ class Proxy(Endpoint):
         network = scenario.network
         self.uplink = Link(UPLINK, mtu, recorder, network.uplink.path)
         self.downlink = Link(DOWNLINK, mtu, recorder, network.downlink.path)
-        self._answered: OrderedDict[Address, Flow] = OrderedDict()
-        """Flows through which a packet of the server's has come, by client, oldest packet first."""
-        self._unanswered: OrderedDict[Address, Flow] = OrderedDict()
-        """All other flows, by client, oldest packet first."""
+        self._places = Places()
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
+        self._is_answered = False
+        """Whether the server has ever sent a packet."""
+        self._is_looped = False
+        """Whether it was told that packets come back."""
+        self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
+        """While it has not: most laps of each of the newest packets, and the client that it came
+        from then, by a digest of the packet."""
         self._faults: set[str] = set()
         """Tracebacks of mistakes in plug-ins that were reported."""
         self.refused = 0
@@ -89,11 +80,12 @@ class Proxy(Endpoint):
         payload, peer, socket = datagram
         # Socket 0 is the one that clients send to.
         if socket == 0:
-            flow = self._answered.get(peer) or self._unanswered.get(peer)
-            flow = flow or self._open(peer, now_ns)
+            flow = self._places.find(peer) or self._open(datagram, now_ns)
             if flow is None:
                 self.refused += 1
                 return
+            if not self._is_answered:
+                self._note(payload, flow)
             onward = make_datagram((payload, self._server, flow.socket))
             may_leave = self.downlink.take(onward, flow.downlink, now_ns=now_ns)
         else:
@@ -104,16 +96,11 @@ class Proxy(Endpoint):
                 return
             onward = make_datagram((payload, flow.client, 0))
             may_leave = self.uplink.take(onward, flow.uplink, now_ns=now_ns)
-            # Its place is earned by the server's answer, for a sender's address can be made up.
-            if flow.order is self._unanswered:
-                flow.order = self._answered
-                self._answered[flow.client] = self._unanswered.pop(flow.client)
+            self._is_answered = True
+            self._passed.clear()
         if flow.uplink.fates.fault or flow.downlink.fates.fault:
             self._tell_faults(flow)
-        flow.used_ns = now_ns
-        # Both dictionaries stay ordered by use: the oldest flow is found without a search, also in
-        # a flood of new clients.
-        flow.order.move_to_end(flow.client)
+        self._places.hear(flow, now_ns, is_answer=socket != 0)
         # What is not delayed leaves now, and not a wake later.
         if may_leave:
             self._forward(now_ns)
@@ -140,15 +127,19 @@ class Proxy(Endpoint):
             return down_ns
         return up_ns
 
-    def _open(self, client: Address, now_ns: int) -> Flow | None:
+    def _open(self, datagram: Datagram, now_ns: int) -> Flow | None:
+        """Open a flow for the sender of a packet; None where there is no place for it."""
+        client = host, port = datagram.peer
+        laps = self._laps(datagram)
+        if laps > LAPS_MAX:
+            return None
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
             # Sockets are never closed: a flow that gives way leaves its own to the next.
-            oldest = self._oldest(now_ns)
-            if oldest is None:
+            gone = self._places.gives_way(host_of(client), now_ns)
+            if gone is None:
                 return None
-            del oldest.order[oldest.client]
-            socket = oldest.socket
+            socket = gone.socket
         number = self._opened
         self._opened += 1
         flow = Flow(
@@ -157,12 +148,36 @@ class Proxy(Endpoint):
             Lane(number, self._fates("uplink", number), now_ns),
             Lane(number, self._fates("downlink", number), now_ns),
             now_ns,
-            self._unanswered,
+            host_of(client),
+            self._places.others,
+            laps,
         )
-        self._unanswered[client] = self._by_socket[socket] = flow
-        host, port = client
+        flow.order.append(flow)
+        self._by_socket[socket] = flow
         self._events.append(FlowOpened(flow=number, host=host, port=port))
         return flow
+
+    def _laps(self, datagram: Datagram) -> int:
+        """Number of flows, each of another address, that a packet has passed by one after another.
+
+        Without a server that answers, such a packet is one of our own that has come back.
+        """
+        passed = self._passed.get(_digest(datagram.payload)) if not self._is_answered else None
+        if passed is None:
+            return 0
+        laps = passed[0] + (passed[1] != datagram.peer)
+        if laps == LAPS_MAX + 1 and not self._is_looped:
+            self._is_looped = True
+            self._events.append(Returned(times=laps))
+        return laps
+
+    def _note(self, payload: bytes, flow: Flow) -> None:
+        """Note that a packet passes by a flow."""
+        digest = _digest(payload)
+        laps, client = self._passed.pop(digest, (0, flow.client))
+        self._passed[digest] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)
+        if len(self._passed) > QUEUE_MAX:
+            self._passed.popitem(last=False)
 
     def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         """Fates of the packets of a flow in one direction."""
@@ -184,16 +199,6 @@ class Proxy(Endpoint):
             flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
 
-    def _oldest(self, now_ns: int) -> Flow | None:
-        """Flow that gives way to a new client; None where none does."""
-        unanswered = next(iter(self._unanswered.values()), None)
-        answered = next(iter(self._answered.values()), None)
-        if answered is None or now_ns - answered.used_ns < IDLE_NS:
-            return unanswered
-        if unanswered is None or answered.used_ns < unanswered.used_ns:
-            return answered
-        return unanswered
-
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         return {
@@ -202,3 +207,8 @@ class Proxy(Endpoint):
             "uplink": self.uplink.figures(),
             "downlink": self.downlink.figures(),
         }
+
+
+def _digest(payload: bytes) -> bytes:
+    """Digest of a packet, by which it is known again."""
+    return hashlib.blake2s(payload, digest_size=16).digest()

@@ -166,6 +166,19 @@ class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"flow {self.flow} for {address_text(self.host, self.port)}"
 
 
+class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A packet has come back to netem, while the server has never answered."""
+
+    times: int
+    """Number of new addresses that it has come from, one after the other."""
+
+    def __str__(self) -> str:
+        return (
+            f"a packet has come back from {self.times} new addresses, and opens no more flows: the "
+            "server has never answered, and its address may lead back to this netem"
+        )
+
+
 class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """An autopilot has said something in words."""
 
@@ -462,6 +475,7 @@ Event = (
     | RecordIncomplete
     | Fault
     | FlowOpened
+    | Returned
     | AutopilotSaid
     | AboardEvent
     | Unauthenticated

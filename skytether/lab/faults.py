@@ -55,9 +55,14 @@ class Kind(StrEnum):
     addresses, before or after the originals, and forwards the answers."""
     KEYS = "keys"
     """Restart of the server with other keys, then with the right ones again."""
+    CROWD = "crowd"
+    """Attacker on a host of his own that sends copies of vehicles' packets to netem from many
+    ports, as many per second as the amount, and forwards the answers."""
+    PORT = "port"
+    """NAT that gives every vehicle another port, permanent; what is sent to the old one is lost."""
 
 
-HARMLESS = frozenset({Kind.COPY, Kind.DUPLICATES, Kind.REPLAY, Kind.FLOOD})
+HARMLESS = frozenset({Kind.COPY, Kind.CROWD, Kind.DUPLICATES, Kind.REPLAY, Kind.FLOOD})
 """Faults that must not keep any vehicle from flying, because every packet passes."""
 
 NETWORK = ("uplink", "downlink", "both")
@@ -99,6 +104,8 @@ RANGES = {
     Kind.FLOOD: Range(HOSTS, (0.1, 5.0), (100.0, 2_000.0)),
     Kind.COPY: Range(("both",), (5.0, 30.0), SHARE),
     Kind.KEYS: Range(("server",), (0.1, 10.0)),
+    Kind.CROWD: Range(("netem",), (5.0, 30.0), (20.0, 1_000.0)),
+    Kind.PORT: Range(("client",), (0.0, 0.0)),
 }
 """Range of every kind."""
 

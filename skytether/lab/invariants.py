@@ -543,7 +543,11 @@ def _extent(scenario: Scenario) -> list[tuple[float, float]]:
 
 # -- bounds of containers --------------------------------------------------------------------
 
-LARGE = {"front": 65536, "_later": 65536, "_slices": 65536, "_by_bin": 4096, "_agenda": 10**9}
+LARGE = {
+    **dict.fromkeys(("front", "_later", "_slices", "_passed"), 65536),
+    "_by_bin": 4096,
+    "_agenda": 10**9,
+}
 """Bounds of containers by attribute name, where they differ from BOUND."""
 BOUND = max(EVENTS_MAX, 2048)
 """Largest number of items in a container of an endpoint."""

@@ -1,8 +1,7 @@
-"""Man in the middle between vehicles and netem that replays and alters packets, but cannot read
-them.
+"""Attackers: a man in the middle between vehicles and netem, and an observer with a host of his own.
 
-Packets pass unless a fault is active (`lab.faults`): then they are lost, duplicated, delayed,
-altered or replayed, or a stranger sends further packets.
+Neither can read packets. They pass unless a fault is active (`lab.faults`): then they are lost,
+duplicated, delayed, altered or replayed, or a stranger sends further packets.
 """
 
 from collections import Counter, deque
@@ -14,9 +13,14 @@ import numpy as np
 from skytether.lab.faults import Kind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.wire.channel import kind as kind_of
+from skytether.shared.wire.handshake import INITIATION
 
 SERVER: Address = ("server", 0)
 NETEM: Address = ("netem", 0)
+OBSERVER = "observer"
+"""Name of the observer's host."""
+SABOTEUR: Address = ("saboteur", 0)
 
 RECORDED = 2048
 """Number of newest packets of a direction that an attacker keeps for replay."""
@@ -29,6 +33,12 @@ OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
 ones, and the latter's count."""
 COPIER_SOCKET, COPIERS = 300, 16
 """First number and count of the sockets that send copies and receive the answers."""
+OTHER_PORTS = 1000
+"""Number of sockets from those of the vehicles to those that NAT gives them next."""
+CROWD_PORTS = (100, 600)
+"""Fewest and most ports from which an observer sends."""
+HELLOS = 0.8
+"""Share of handshakes among an observer's copies: the server answers them all."""
 COPY_S = 0.3
 """Longest delay of a copy, or of an answer to one [s]."""
 SWIFT = 0.5
@@ -40,7 +50,8 @@ ASTRAY = 0.2
 class Saboteur(Endpoint):
     """Man in the middle that replays and alters packets, but cannot read them.
 
-    Vehicle n is represented to netem by socket n. Packets pass unless a fault is active.
+    Vehicle n is represented to netem by socket n, and by others once NAT has given it another port.
+    Packets pass unless a fault is active.
 
     Args:
         rng: random generator.
@@ -50,6 +61,7 @@ class Saboteur(Endpoint):
     def __init__(self, rng: np.random.Generator, clients: Sequence[Address]) -> None:
         super().__init__()
         self._rng = rng
+        self._addresses = clients
         self._clients = dict(enumerate(clients, start=1))
         self._numbers = {client: number for number, client in self._clients.items()}
         self._on: list[ScheduledFault] = []
@@ -60,6 +72,8 @@ class Saboteur(Endpoint):
             direction: deque(maxlen=RECORDED) for direction in ("uplink", "downlink")
         }
         """Newest packets of each direction, and the times at which they passed."""
+        self.initiations: deque[bytes] = deque(maxlen=RECORDED)
+        """Newest INITIATIONs of the vehicles."""
         self._held: list[tuple[int, int, Datagram]] = []
         """Heap of delayed packets: time at which a packet goes on, order, and packet."""
         self._order = 0
@@ -91,12 +105,30 @@ class Saboteur(Endpoint):
         self._left.pop(fault, None)
         self._swift.discard(fault)
 
+    def change_ports(self) -> None:
+        """Represent each vehicle to netem by another socket from now on."""
+        first = max(self._clients) + OTHER_PORTS
+        self._clients = dict(enumerate(self._addresses, start=first))
+        self._numbers = {client: number for number, client in self._clients.items()}
+
+    def copy(self) -> bytes | None:
+        """Packet of a vehicle that an observer repeats, or None before there is any."""
+        rng, sent = self._rng, self._recorded["downlink"]
+        if self.initiations and rng.random() < HELLOS:
+            return self.initiations[-1]
+        return sent[int(rng.integers(len(sent)))][1].payload if sent else None
+
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Pass a packet on, or apply the active faults."""
         payload, peer, socket = datagram
         if socket == 0:
             number = self._numbers.get(peer)
-            if number is not None:
+            if peer[0] == OBSERVER:
+                clients = list(self._clients.values())
+                self._send_copy(payload, clients[int(self._rng.integers(len(clients)))], 0, now_ns)
+            elif number is not None:
+                if kind_of(payload) == INITIATION:
+                    self.initiations.append(payload)
                 self._pass("downlink", Datagram(payload, NETEM, number), now_ns)
         elif socket in self._clients:
             self._pass("uplink", Datagram(payload, self._clients[socket]), now_ns)
@@ -255,3 +287,53 @@ class Saboteur(Endpoint):
     def _release(self, now_ns: int) -> None:
         while self._held and self._held[0][0] <= now_ns:
             self._out.append(heappop(self._held)[2])
+
+
+class Observer(Endpoint):
+    """Attacker on a host of his own who sends copies of vehicles' packets to netem from many ports.
+
+    The answers go to the vehicles under their server's address.
+
+    Args:
+        rng: random generator.
+        saboteur: shows him the packets, and forges the address.
+    """
+
+    def __init__(self, rng: np.random.Generator, saboteur: Saboteur) -> None:
+        super().__init__()
+        self._rng, self._saboteur = rng, saboteur
+        self._on: dict[ScheduledFault, int] = {}
+        """Active faults, and the number of ports that each sends from."""
+        self._sent = 0
+        self._volley_ns: int | None = None
+        """Time of the next burst of copies."""
+
+    def begin(self, fault: ScheduledFault, now_ns: int) -> None:
+        """Send copies from now on."""
+        self._on[fault] = int(self._rng.integers(*CROWD_PORTS))
+        self._volley_ns = now_ns
+
+    def end(self, fault: ScheduledFault) -> None:
+        """Send no more."""
+        del self._on[fault]
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        """Forward an answer."""
+        self.send(datagram.payload, SABOTEUR)
+
+    def wake(self, *, now_ns: int) -> None:
+        """Send a burst of copies."""
+        if self._volley_ns is None or now_ns < self._volley_ns:
+            return
+        for fault, ports in self._on.items():
+            for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
+                payload = self._saboteur.copy()
+                if payload is not None:
+                    self._sent += 1
+                    self.send(payload, NETEM, self._sent % ports)
+                    self._saboteur.counts[f"packets: {Kind.CROWD}"] += 1
+        self._volley_ns = now_ns + FLOOD_NS if self._on else None
+
+    def next_wake_ns(self) -> int | None:
+        """Time of the next burst of copies."""
+        return self._volley_ns

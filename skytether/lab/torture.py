@@ -1,6 +1,7 @@
 """Torture: the real endpoints, encrypted, under a schedule of faults, with invariants checked.
 
     clients ── saboteur ── netem ── server          on hosts that stop, freeze, and set their clocks
+               observer ────┘
 
 The scenario is drawn from a trial's seed, and the faults are part of the trial, so every trial is
 reproducible. A failure is a `Violation` of an invariant (`lab.invariants`), or an exception of an
@@ -33,7 +34,7 @@ from skytether.lab.invariants import (
     WatchedLife,
     check_bounds,
 )
-from skytether.lab.saboteur import NETEM, SERVER, STRANGERS, Saboteur
+from skytether.lab.saboteur import NETEM, OBSERVER, SABOTEUR, SERVER, Observer, Saboteur
 from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
 from skytether.server.control.clock import BUCKET_NS, BUCKETS, RECENT
@@ -55,8 +56,6 @@ from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import make_keys
 from skytether.sim.world import Clock, World
 
-SABOTEUR: Address = ("saboteur", 0)
-
 CLOCK_NS = 10**7 * SECOND_NS
 """Initial time on all clocks [ns], so large that no backward step makes it negative."""
 LANDED_NS = 5 * SECOND_NS
@@ -73,6 +72,9 @@ REKEYING = 0.3
 REKEY_NS = 4 * SECOND_NS
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
 """Time after which the server has forgotten clock measurements from before a step [ns]."""
+FLOWS = 128
+"""Number of netem's places: more than one host holds against others, and fewer than an observer has
+ports."""
 COMPUTE_NS = MILLISECOND_NS
 """Computing time of the server per step [ns]."""
 
@@ -264,6 +266,8 @@ class Torture:
             stream(trial.seed, "torture", "saboteur"), [(name, 0) for name in names]
         )
         self.world.add(SABOTEUR[0], self.saboteur)
+        self.observer = Observer(stream(trial.seed, "torture", "observer"), self.saboteur)
+        self.world.add(OBSERVER, self.observer)
         self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
         self.vehicles: list[TorturedVehicle] = []
         for number, name in enumerate(names, start=1):
@@ -328,7 +332,7 @@ class Torture:
     def _new_netem(self) -> Steady:
         scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + self._netems)
         self._netems += 1
-        self._netem = Proxy(scenario, server=SERVER, flows=2 * len(self._keyring) + STRANGERS)
+        self._netem = Proxy(scenario, server=SERVER, flows=FLOWS)
         return Steady(self._netem)
 
     def _new_client(
@@ -525,6 +529,15 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
             torture.set_solver(fault.amount, failing=begins)
         case Kind.OVERLOAD:
             world.set_compute(SERVER[0], round(fault.amount * dt_ns) if begins else COMPUTE_NS)
+        case Kind.PORT if begins:
+            torture.saboteur.change_ports()
+        case Kind.PORT:
+            pass
+        case Kind.CROWD if begins:
+            torture.observer.begin(fault, world.now_ns)
+            world.rearm(OBSERVER)
+        case Kind.CROWD:
+            torture.observer.end(fault)
         case _ if begins:
             torture.saboteur.begin(fault, world.now_ns)
             world.rearm(SABOTEUR[0])

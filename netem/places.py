@@ -1,0 +1,171 @@
+"""Places of netem: the flows that hold one, and the order in which they give way to new clients.
+
+netem reads no payload, so it cannot tell a vehicle from somebody who repeats a vehicle's packets.
+It can count. An exchange is a packet of the client's followed by one of the server's, and
+EXCHANGES of them earn a flow its place for EARNED_NS. One answer earns nothing, because anybody can
+provoke it. Where no place is free, the first of these gives way to a new client:
+
+    1. of the flows that have not earned their place, the one that is unused longest, for IDLE_NS
+    2. of those, the oldest of a host with more than HOST_FLOWS
+    3. of those, the oldest
+    4. of the flows that have earned their place, the oldest of another host with more than
+       HOST_FLOWS
+
+So who holds a place must go on exchanging packets at the rate of a slow vehicle in each of them,
+and who has one address holds no more than HOST_FLOWS against others.
+"""
+
+import ipaddress
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from skytether.netem.link import Lane
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address
+
+# A vehicle and its server each send a packet at least three times within `link.timeout_s`.
+EXCHANGES = 8
+"""Number of exchanges that earn a flow its place."""
+EARNED_NS = 10 * SECOND_NS
+"""Time for which a place is earned [ns]."""
+IDLE_NS = 5 * SECOND_NS
+"""Time without a packet after which a flow gives way before those of a crowded host [ns]."""
+HOST_FLOWS = 64
+"""Largest number of flows of a host that do not give way before those of other hosts."""
+NETWORK_BYTES = 8
+"""Length of the part of an IPv6 address that stands for a host [B]: whoever has one address of a
+network of 64 bits has them all."""
+
+
+@dataclass(slots=True)
+class Flow:
+    """State of one client address."""
+
+    client: Address
+    socket: int
+    """Number of its socket towards the server, from 1."""
+    uplink: Lane
+    downlink: Lane
+    used_ns: int
+    """Time of its newest packet, either way."""
+    host: str
+    """Host of the client, see `host_of`."""
+    order: "Order"
+    """Flows among which it stands: those that have earned their place, or the others."""
+    laps: int
+    """Number of times that the packet which opened it had passed from other addresses before."""
+    asks: bool = False
+    """Whether a packet of the client's has come since the newest exchange."""
+    exchanges: int = 0
+    """Number of exchanges since it earned its place last."""
+    earned_ns: int = 0
+    """Time at which it earned its place last."""
+
+
+class Order:
+    """Flows in an order, the oldest first, all together and by host."""
+
+    def __init__(self) -> None:
+        self.flows: OrderedDict[Address, Flow] = OrderedDict()
+        """All flows by client."""
+        self._hosts: dict[str, OrderedDict[Address, Flow]] = {}
+        """Flows of each host by client."""
+        self._crowded: dict[str, None] = {}
+        """Hosts with more than HOST_FLOWS flows."""
+
+    def append(self, flow: Flow) -> None:
+        """Put a flow in as the newest."""
+        of_host = self._hosts.setdefault(flow.host, OrderedDict())
+        self.flows[flow.client] = of_host[flow.client] = flow
+        if len(of_host) > HOST_FLOWS:
+            self._crowded[flow.host] = None
+
+    def remove(self, flow: Flow) -> None:
+        """Take a flow out."""
+        of_host = self._hosts[flow.host]
+        del self.flows[flow.client], of_host[flow.client]
+        if len(of_host) <= HOST_FLOWS:
+            self._crowded.pop(flow.host, None)
+        if not of_host:
+            del self._hosts[flow.host]
+
+    def renew(self, flow: Flow) -> None:
+        """Make a flow the newest."""
+        self.flows.move_to_end(flow.client)
+        self._hosts[flow.host].move_to_end(flow.client)
+
+    def oldest(self) -> Flow | None:
+        """Oldest flow, or None."""
+        return next(iter(self.flows.values()), None)
+
+    def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
+        """Oldest flow of a host with more than HOST_FLOWS, or None.
+
+        Args:
+            but: host that does not count.
+        """
+        host = next((host for host in self._crowded if host != but), None)
+        return None if host is None else next(iter(self._hosts[host].values()))
+
+
+class Places:
+    """Flows that hold a place."""
+
+    def __init__(self) -> None:
+        self._earned = Order()
+        """Flows that have earned their place, in the order in which they last did."""
+        self.others = Order()
+        """All other flows, in the order of their last packets."""
+
+    def find(self, client: Address) -> Flow | None:
+        """Flow of a client, or None."""
+        return self._earned.flows.get(client) or self.others.flows.get(client)
+
+    def hear(self, flow: Flow, now_ns: int, *, is_answer: bool) -> None:
+        """Note a packet of a flow.
+
+        Args:
+            flow: the flow.
+            now_ns: time now.
+            is_answer: whether the server has sent it, and not the client.
+        """
+        flow.used_ns = now_ns
+        if is_answer and flow.asks:
+            flow.exchanges += 1
+        flow.asks = not is_answer
+        if flow.exchanges == EXCHANGES:
+            flow.exchanges, flow.earned_ns = 0, now_ns
+            self._put(flow, self._earned)
+        elif flow.order is self.others:
+            flow.order.renew(flow)
+
+    def gives_way(self, host: str, now_ns: int) -> Flow | None:
+        """Flow that gives way to a new client of a host, now without a place; None if none does."""
+        earned, others = self._earned, self.others
+        while (last := earned.oldest()) and now_ns - last.earned_ns >= EARNED_NS:
+            self._put(last, others)
+        flow = others.oldest()
+        if flow is None:
+            flow = earned.oldest_of_a_crowd(but=host)
+        elif now_ns - flow.used_ns < IDLE_NS:
+            flow = others.oldest_of_a_crowd() or flow
+        if flow is not None:
+            flow.order.remove(flow)
+        return flow
+
+    def _put(self, flow: Flow, order: Order) -> None:
+        flow.order.remove(flow)
+        flow.order = order
+        order.append(flow)
+
+
+def host_of(client: Address) -> str:
+    """Host that a client's address counts for: its IPv4 address, or its network of IPv6."""
+    name = client[0]
+    if ":" not in name:
+        return name
+    try:
+        address = ipaddress.IPv6Address(name)
+    except ValueError:
+        return name
+    return address.packed[:NETWORK_BYTES].hex()
