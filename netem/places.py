@@ -5,14 +5,15 @@ It can count. An exchange is a packet of the client's followed by one of the ser
 EXCHANGES of them earn a flow its place for EARNED_NS. One answer earns nothing, because anybody can
 provoke it. Where no place is free, the first of these gives way to a new client:
 
-    1. of the flows that have not earned their place, the one that is unused longest, for IDLE_NS
-    2. of those, the oldest of a host with more than HOST_FLOWS
-    3. of those, the oldest
-    4. of the flows that have earned their place, the oldest of another host with more than
-       HOST_FLOWS
+    1. the oldest flow that is not earned, if it is unused for IDLE_NS
+    2. the oldest that is not earned of the new client's own host, if that has more than HOST_FLOWS
+    3. where fewer than one place of TRIALS is not earned: the oldest flow of another host that has
+       earned more than HOST_FLOWS places
+    4. the oldest that is not earned of a host with more than HOST_FLOWS such flows
+    5. the oldest that is not earned
 
 So who holds a place must go on exchanging packets at the rate of a slow vehicle in each of them,
-and who has one address holds no more than HOST_FLOWS against others.
+and who has one address keeps no more than HOST_FLOWS from others.
 """
 
 import ipaddress
@@ -32,6 +33,9 @@ IDLE_NS = 5 * SECOND_NS
 """Time without a packet after which a flow gives way before those of a crowded host [ns]."""
 HOST_FLOWS = 64
 """Largest number of flows of a host that do not give way before those of other hosts."""
+TRIALS = 8
+"""Divisor of the number of places: so large a part of them is not kept from new clients by a host
+with more than HOST_FLOWS."""
 NETWORK_BYTES = 8
 """Length of the part of an IPv6 address that stands for a host [B]: whoever has one address of a
 network of 64 bits has them all."""
@@ -94,24 +98,34 @@ class Order:
         self.flows.move_to_end(flow.client)
         self._hosts[flow.host].move_to_end(flow.client)
 
-    def oldest(self) -> Flow | None:
-        """Oldest flow, or None."""
-        return next(iter(self.flows.values()), None)
+    def count(self, host: str) -> int:
+        """Number of flows of a host."""
+        return len(self._hosts.get(host, ()))
+
+    def oldest(self, host: str = "") -> Flow | None:
+        """Oldest flow of all, or of one host; None where there is none."""
+        flows = self._hosts.get(host, {}) if host else self.flows
+        return next(iter(flows.values()), None)
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
-        """Oldest flow of a host with more than HOST_FLOWS, or None.
+        """Oldest flow of a host with more than HOST_FLOWS; None where there is none.
 
         Args:
             but: host that does not count.
         """
-        host = next((host for host in self._crowded if host != but), None)
-        return None if host is None else next(iter(self._hosts[host].values()))
+        return next((self.oldest(host) for host in self._crowded if host != but), None)
 
 
 class Places:
-    """Flows that hold a place."""
+    """Flows that hold a place.
 
-    def __init__(self) -> None:
+    Args:
+        count: number of places.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._trials = count // TRIALS
+        """Number of places that a host with more than HOST_FLOWS does not keep from others."""
         self._earned = Order()
         """Flows that have earned their place, in the order in which they last did."""
         self.others = Order()
@@ -145,13 +159,20 @@ class Places:
         while (last := earned.oldest()) and now_ns - last.earned_ns >= EARNED_NS:
             self._put(last, others)
         flow = others.oldest()
-        if flow is None:
-            flow = earned.oldest_of_a_crowd(but=host)
-        elif now_ns - flow.used_ns < IDLE_NS:
-            flow = others.oldest_of_a_crowd() or flow
+        if flow is None or now_ns - flow.used_ns < IDLE_NS:
+            flow = self._crowding(host) or flow
         if flow is not None:
             flow.order.remove(flow)
         return flow
+
+    def _crowding(self, host: str) -> Flow | None:
+        """Flow of a host with more than HOST_FLOWS that gives way to a new client of a host."""
+        earned, others = self._earned, self.others
+        if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
+            return others.oldest(host)
+        if len(others.flows) < self._trials and (flow := earned.oldest_of_a_crowd(but=host)):
+            return flow
+        return others.oldest_of_a_crowd()
 
     def _put(self, flow: Flow, order: Order) -> None:
         flow.order.remove(flow)

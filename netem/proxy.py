@@ -60,7 +60,7 @@ class Proxy(Endpoint):
         network = scenario.network
         self.uplink = Link(UPLINK, mtu, recorder, network.uplink.path)
         self.downlink = Link(DOWNLINK, mtu, recorder, network.downlink.path)
-        self._places = Places()
+        self._places = Places(flows)
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
         self._is_answered = False

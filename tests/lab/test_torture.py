@@ -22,6 +22,7 @@ import skytether.client.pilot
 import skytether.client.secure
 import skytether.lab.commands.torture
 import skytether.lab.torture
+import skytether.netem.places
 import skytether.shared.wire.channel
 from skytether.__main__ import main
 from skytether.client.failsafe import LOCKING, TABLE
@@ -145,6 +146,8 @@ EFFECTS = [
     (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
     (fault(Kind.COPY, "both", 5, 6), "packets: copy"),
     (fault(Kind.KEYS, "server", 5, 3), "brake: the server is silent"),
+    (fault(Kind.CROWD, "netem", 5, 6, 200.0), "packets: crowd"),
+    (fault(Kind.PORT, "client", 5, 0), "faults: port"),
 ]
 
 
@@ -161,6 +164,27 @@ def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: 
     outcome = fly(Trial(1, (one,)))
     assert not outcome.failure
     assert outcome.counts[effect] > 0
+
+
+SIEGE = Trial(1, (fault(Kind.CROWD, "netem", 3, 12, 200.0), fault(Kind.PORT, "client", 8, 0)))
+"""An observer takes netem's places, and the vehicles' ports change."""
+
+
+def test_an_observer_at_netem_keeps_no_vehicle_from_flying() -> None:
+    """One who copies what vehicles send, from more ports than netem has places."""
+    outcome = fly(SIEGE)
+    assert not outcome.failure
+    assert outcome.counts["packets: crowd"] > 2000
+
+
+def test_if_one_answer_earned_a_place_an_observer_would_shut_vehicles_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ablation: as in an early version, one answer earns a place for a minute."""
+    monkeypatch.setattr(skytether.netem.places, "EXCHANGES", 1)
+    monkeypatch.setattr(skytether.netem.places, "EARNED_NS", 60 * SECOND_NS)
+    monkeypatch.setattr(skytether.netem.places, "HOST_FLOWS", 128)
+    assert fly(SIEGE).invariant == "recovers"
 
 
 @pytest.mark.parametrize("amount", [3600.0, -3600.0])
@@ -466,8 +490,8 @@ def test_a_container_without_a_bound_is_found() -> None:
     scenario, _ = make_scenario(1)
     netem = Proxy(scenario, server=("server", 0), flows=10**6)
     for port in range(2100):
-        netem.receive(Datagram(b"", ("host", port)), now_ns=CLOCK_NS)
-    with pytest.raises(Violation, match=r"bounded memory: netem\.\w+ holds 2100"):
+        netem.receive(Datagram(b"%d" % port, ("host", port)), now_ns=CLOCK_NS)
+    with pytest.raises(Violation, match=r"bounded memory: netem[.\w]+ holds 2100"):
         check_bounds("netem", netem)
 
 

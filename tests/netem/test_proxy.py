@@ -1,6 +1,7 @@
 """`netem.proxy`: an endpoint between clients and a server that reads none of their payloads."""
 
 import random
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -8,13 +9,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skytether.netem import link as link_module
-from skytether.netem import proxy as proxy_module
+from skytether.netem import places as places_module
 from skytether.netem.fate import Fates
 from skytether.netem.link import Link
-from skytether.netem.proxy import FLOWS_MAX, IDLE_NS, Flow, Proxy
-from skytether.shared.base.units import MILLISECOND_NS
+from skytether.netem.places import EARNED_NS, EXCHANGES, HOST_FLOWS, IDLE_NS, Flow, host_of
+from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import FlowOpened
+from skytether.shared.core.events import FlowOpened, Returned
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 
 SERVER = ("192.0.2.9", 47001)
@@ -49,11 +51,17 @@ def pass_on(proxy: Proxy, payload: bytes, client: tuple[str, int], at: int = 0) 
     return sent.socket
 
 
-def fly(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
+def ask(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
     """A client's packet crosses and is answered; the socket of its flow."""
     socket = pass_on(proxy, b"?", client, at)
     hear(proxy, b"!", SERVER, socket, at=at)
     assert proxy.outbox() == [Datagram(b"!", client, 0)]
+    return socket
+
+
+def fly(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
+    """A client earns its place; the socket of its flow."""
+    (socket,) = {ask(proxy, client, at) for _ in range(EXCHANGES)}
     return socket
 
 
@@ -101,7 +109,7 @@ def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
 
 
 def test_a_client_too_many_is_refused() -> None:
-    """While those that are there, and were answered, stay served."""
+    """While those that are there, and have earned their places, stay served."""
     proxy = make_proxy(flows=2)
     assert [fly(proxy, client) for client in (ALICE, BOB)] == [1, 2]
     hear(proxy, b"?", CAROL)
@@ -109,41 +117,66 @@ def test_a_client_too_many_is_refused() -> None:
     assert pass_on(proxy, b"?", BOB) == 2
 
 
-def test_the_flow_that_is_idle_longest_gives_its_place_to_a_new_client() -> None:
-    """The flow's socket then carries the new client's answers, and the old one has to wait."""
+def test_a_place_is_earned_for_a_while_and_then_goes_to_a_new_client() -> None:
+    """The flow's socket then carries the new client's answers, and the old client comes back where
+    somebody else has not earned a place.
+    """
     proxy = make_proxy(flows=2)
     fly(proxy, ALICE, at=0)
     fly(proxy, BOB, at=1)
-    hear(proxy, b"?", CAROL, at=IDLE_NS - 1)
+    hear(proxy, b"?", CAROL, at=EARNED_NS - 1)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
-    assert pass_on(proxy, b"?", CAROL, at=IDLE_NS) == 1
-    hear(proxy, b"!", SERVER, 1, at=IDLE_NS)
-    assert proxy.outbox() == [Datagram(b"!", CAROL, 0)]
-    hear(proxy, b"?", ALICE, at=IDLE_NS)
-    assert (proxy.outbox(), proxy.refused) == ([], 2)
+    assert fly(proxy, CAROL, at=EARNED_NS) == 1
+    assert pass_on(proxy, b"?", ALICE, at=EARNED_NS + 1) == 2
+    hear(proxy, b"?", BOB, at=EARNED_NS + 1)
+    assert proxy.outbox() == [Datagram(b"?", SERVER, 2)]
+
+
+def test_a_vehicle_that_goes_on_flying_keeps_its_place() -> None:
+    """At one exchange a second, through an outage of two seconds."""
+    proxy = make_proxy(flows=1)
+    fly(proxy, ALICE)
+    for second in (*range(1, 60), *range(62, 120)):
+        ask(proxy, ALICE, at=second * SECOND_NS)
+        hear(proxy, b"x", BOB, at=second * SECOND_NS)
+        assert proxy.outbox() == []
+
+
+@pytest.mark.parametrize(("asks", "answers"), [(1, 1), (100, 1), (1, 100), (0, 100), (100, 0)])
+def test_only_a_conversation_earns_a_place(asks: int, answers: int) -> None:
+    """Not one answer, nor any number of packets one way."""
+    proxy = make_proxy(flows=1)
+    socket = pass_on(proxy, b"?", ALICE)
+    for _ in range(asks):
+        hear(proxy, b"?", ALICE)
+    for _ in range(answers):
+        hear(proxy, b"!", SERVER, socket)
+    proxy.outbox()
+    assert pass_on(proxy, b"?", BOB) == socket
 
 
 def test_flows_give_way_in_the_order_of_their_last_use() -> None:
     """Whether that was the client's packet or the server's."""
     proxy = make_proxy(flows=3)
     for client in (ALICE, BOB, CAROL):
-        fly(proxy, client)
+        ask(proxy, client)
     pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, 2)
     proxy.outbox()
     newcomers = [("192.0.2.3", port) for port in range(3)]
-    assert [pass_on(proxy, b"?", client, at=IDLE_NS) for client in newcomers] == [3, 1, 2]
+    assert [pass_on(proxy, b"?", client) for client in newcomers] == [3, 1, 2]
 
 
 def test_a_refusal_looks_at_one_flow_however_many_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A flood from strangers takes as long with 16 384 flows as with one."""
-    proxy = make_proxy(flows=300)
-    for port in range(300):
+    proxy = make_proxy(flows=HOST_FLOWS)
+    for port in range(HOST_FLOWS):
         fly(proxy, ("192.0.2.1", port))
     looked = []
-    monkeypatch.setattr(Flow, "used_ns", property(lambda flow: looked.append(flow.socket) or 0))
+    earned_ns = property(lambda flow: looked.append(flow.socket) or 0)
+    monkeypatch.setattr(Flow, "earned_ns", earned_ns)
     for port in range(100):
         hear(proxy, b"?", ("192.0.2.3", port))
     assert proxy.refused == 100
@@ -151,7 +184,7 @@ def test_a_refusal_looks_at_one_flow_however_many_there_are(
 
 
 def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> None:
-    """Nobody has answered them; a flow that was answered keeps its place."""
+    """Nobody talks with them; a flow that has earned its place keeps it."""
     proxy = make_proxy(flows=3)
     assert fly(proxy, ALICE) == 1
     strangers = [("192.0.2.3", port) for port in range(4)]
@@ -162,84 +195,212 @@ def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> No
     assert (proxy.refused, proxy.figures()["flows"]) == (0, 3)
 
 
-@pytest.mark.parametrize(("begins", "expected"), [("client", 1), ("stranger", 2)])
-def test_of_a_stranger_and_a_flow_unused_for_long_the_older_gives_way(
-    begins: str, expected: int
-) -> None:
-    """An answer is worth IDLE_NS, and no more."""
-    proxy = make_proxy(flows=2)
-    fly(proxy, ALICE)
-    pass_on(proxy, b"x", BOB, at=1)
-    if begins == "stranger":
-        pass_on(proxy, b"?", ALICE, at=2)
-    assert pass_on(proxy, b"?", CAROL, at=IDLE_NS + 2) == expected
+# -- attacks on the places -------------------------------------------------------------------
+
+ATTACKER = "192.0.2.66"
 
 
-def served_in_a_flood(proxy: Proxy) -> tuple[int, int]:
-    """Number of vehicles that are served beside strangers, each at a port of its own.
+class Siege:
+    """netem under attack: its places are sought by somebody who repeats a packet from many ports.
 
-    Each vehicle sends one packet, whose answer comes after packets of thirty strangers.
-
-    Returns:
-        Number of those of 8 vehicles that flew before the flood, and of 8 others.
+    Args:
+        proxy: the proxy; the server answers each packet at once, a step of 0.1 s after the other.
+        hosts: hosts of the attacker.
+        ports: number of ports on each.
+        rate_hz: packets a second, of all ports together.
     """
-    old, new = ([(host, port) for port in range(8)] for host in ("192.0.2.1", "192.0.2.2"))
-    for client in old:
-        fly(proxy, client)
-    strangers, served = (("192.0.2.66", port) for port in range(1000)), [0, 0]
-    for _ in range(70):
-        hear(proxy, b"x", next(strangers))
-    proxy.outbox()
-    for client in (*old, *new):
-        hear(proxy, b"?", client)
-        sockets = [sent.socket for sent in proxy.outbox()]
-        for _ in range(30):
-            hear(proxy, b"x", next(strangers))
-        proxy.outbox()
-        for socket in sockets:
-            hear(proxy, b"!", SERVER, socket)
-        served[client in new] += Datagram(b"!", client, 0) in proxy.outbox()
-    return served[0], served[1]
+
+    def __init__(self, proxy: Proxy, hosts: list[str], ports: int, rate_hz: int) -> None:
+        self.proxy = proxy
+        self.addresses = [(host, 1000 + port) for port in range(ports) for host in hosts]
+        self.each_step = rate_hz // 10
+        self.now_ns = 0
+        self._sent = 0
+
+    def step(self, *clients: tuple[str, int]) -> set[tuple[str, int]]:
+        """Let 0.1 s pass: the attacker sends, the clients send, and the server answers them all.
+
+        Returns:
+            Those of the clients who get an answer.
+        """
+        self.now_ns += 100 * MILLISECOND_NS
+        for client in clients:
+            hear(self.proxy, b"?", client, at=self.now_ns)
+        for _ in range(self.each_step):
+            at = self.addresses[self._sent % len(self.addresses)]
+            self._sent += 1
+            hear(self.proxy, b"x", at, at=self.now_ns)
+        for _, _, socket in self.proxy.outbox():
+            hear(self.proxy, b"!", SERVER, socket, at=self.now_ns)
+        return {sent.peer for sent in self.proxy.outbox()} & set(clients)
+
+    def run(self, seconds: int, *clients: tuple[str, int]) -> float:
+        """Let seconds pass; returns the share of the clients' packets that were answered."""
+        steps = 10 * seconds
+        return sum(len(self.step(*clients)) for _ in range(steps)) / (steps * len(clients) or 1)
 
 
-def test_a_flood_of_strangers_shuts_nobody_out() -> None:
-    """From 550 ports, with 64 places."""
-    assert served_in_a_flood(make_proxy(flows=64)) == (8, 8)
+def spread(count: int) -> list[str]:
+    """Addresses of so many hosts."""
+    return [f"198.51.{number // 256}.{number % 256}" for number in range(count)]
 
 
-def test_if_no_flow_gave_way_a_flood_would_shut_newcomers_out(
+SIEGES = [
+    ([ATTACKER], 512, 10),
+    ([ATTACKER], 128, 300),
+    ([ATTACKER], 5_000, 500),
+    (spread(2), 300, 500),
+    (spread(128), 1, 60),
+    (spread(5_000), 1, 60),
+    ([ALICE[0]], 128, 60),
+    ([ALICE[0]], 5_000, 60),
+]
+"""Attackers against whom vehicles hold their places: hosts, ports of each, packets a second."""
+
+
+@pytest.mark.parametrize(("hosts", "ports", "rate_hz"), SIEGES)
+def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
+    hosts: list[str], ports: int, rate_hz: int
+) -> None:
+    """Neither a vehicle that flies, nor one that comes, nor one whose port changes; from one host
+    or many, or behind the same address as the vehicles.
+    """
+    siege = Siege(make_proxy(flows=128), hosts, ports, rate_hz)
+    siege.run(3, ALICE)
+    siege.run(15)  # all places are taken
+    siege.run(4, ALICE)
+    assert siege.run(3, ALICE) == 1.0
+    siege.run(4, ALICE, BOB, CAROL)
+    assert siege.run(3, ALICE, BOB, CAROL) == 1.0
+    elsewhere = (ALICE[0], 7)
+    siege.run(4, elsewhere, BOB, CAROL)
+    assert siege.run(3, elsewhere, BOB, CAROL) == 1.0
+
+
+def old_rule(patch: pytest.MonkeyPatch) -> None:
+    """One answer earns a place for a minute, whoever comes."""
+    patch.setattr(places_module, "EXCHANGES", 1)
+    patch.setattr(places_module, "EARNED_NS", 60 * SECOND_NS)
+    patch.setattr(places_module, "HOST_FLOWS", FLOWS_MAX)
+
+
+def no_bound_for_a_host(patch: pytest.MonkeyPatch) -> None:
+    """A host may hold all places."""
+    patch.setattr(places_module, "HOST_FLOWS", FLOWS_MAX)
+
+
+@pytest.mark.parametrize(("ablation", "rate_hz"), [(old_rule, 10), (no_bound_for_a_host, 300)])
+def test_if_places_were_earned_otherwise_newcomers_would_be_shut_out(
+    monkeypatch: pytest.MonkeyPatch, ablation: Callable[[pytest.MonkeyPatch], None], rate_hz: int
+) -> None:
+    """Ablation: by one answer, as in an early version; or by one host without a bound."""
+    ablation(monkeypatch)
+    siege = Siege(make_proxy(flows=128), [ATTACKER], 128, rate_hz)
+    siege.run(13)
+    assert siege.run(5, ALICE) == 0.0
+
+
+def test_what_one_host_holds_against_others_is_bounded() -> None:
+    """Also where it exchanges packets in all flows; others may have all other places."""
+    siege = Siege(make_proxy(flows=128), [ATTACKER], 128, 300)
+    siege.run(5)
+    others = [("192.0.2.1", port) for port in range(128 - HOST_FLOWS)]
+    for count in range(8, len(others) + 1, 8):
+        siege.run(1, *others[:count])
+    siege.run(2, *others)
+    assert siege.run(2, *others) > 0.95
+
+
+def test_a_fleet_of_one_host_keeps_its_places_from_strangers() -> None:
+    """As many as one host may hold, where there are no others, and the strangers converse."""
+    fleet = [("192.0.2.1", port) for port in range(HOST_FLOWS)]
+    siege = Siege(make_proxy(flows=HOST_FLOWS), spread(5), 5, rate_hz=0)
+    siege.run(2, *fleet)
+    siege.each_step = 10
+    assert siege.run(3, *fleet) == 1.0
+
+
+def test_a_stale_stranger_gives_way_before_a_crowd_that_begins_to_fly() -> None:
+    """A fleet behind one address takes all places of those who are there no longer."""
+    proxy = make_proxy(flows=100)
+    for number in range(30):
+        ask(proxy, (f"198.51.100.{number}", 1))
+    fleet = [("192.0.2.1", port) for port in range(100)]
+    sockets = [pass_on(proxy, b"?", client, at=IDLE_NS) for client in fleet]
+    assert sorted(sockets) == list(range(1, 101))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("192.0.2.1", "192.0.2.1", True),
+        ("192.0.2.1", "192.0.2.2", False),
+        ("2001:db8::1", "2001:db8::ffff:1", True),
+        ("2001:db8::1", "2001:db8:0:1::1", False),
+        ("fe80::1%eth0", "fe80::2%eth0", True),
+        ("server", "client", False),
+    ],
+)
+def test_a_network_of_ipv6_counts_as_one_host(one: str, other: str, *, same: bool) -> None:
+    """Whoever has one address there has them all."""
+    assert (host_of((one, 1)) == host_of((other, 2))) is same
+
+
+# -- packets that come back ------------------------------------------------------------------
+
+
+def circulate(*netems: Proxy, packets: int, limit: int = 5000) -> int:
+    """Let netems forward each to the next and the last to the first; number of packets forwarded.
+
+    Args:
+        netems: the netems; the sockets of netem n have the host "netem n".
+        packets: packets that a client sends to the first, one after the other.
+        limit: number of forwarded packets at which a loop counts as endless.
+    """
+    forwarded = 0
+    for number in range(packets):
+        hear(netems[0], b"%d" % number, ALICE)
+        while any(out := [netem.outbox() for netem in netems]) and forwarded < limit:
+            for n, sent in enumerate(out):
+                for payload, _, socket in sent:
+                    forwarded += 1
+                    hear(netems[(n + 1) % len(netems)], payload, (f"netem {n}", socket))
+    return forwarded
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_packet_that_comes_back_ends_after_a_number_of_laps(count: int) -> None:
+    """Through a netem that is its own server, or through several in a circle; it is told once."""
+    netems = [make_proxy() for _ in range(count)]
+    assert circulate(*netems, packets=1) == count * (LAPS_MAX + 1)
+    assert circulate(*netems, packets=100) <= 101 * count * (LAPS_MAX + 1)
+    told = [event for netem in netems for event in netem.events() if isinstance(event, Returned)]
+    assert told == [Returned(times=LAPS_MAX + 1)]
+
+
+def test_if_laps_were_not_counted_a_packet_would_circulate_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: strangers' flows are kept like all others, as in an early version."""
-    proxy = make_proxy(flows=64)
-    monkeypatch.setattr(proxy, "_oldest", lambda _: None)
-    assert served_in_a_flood(proxy) == (8, 0)
+    """Ablation: through all flows, again and again."""
+    monkeypatch.setattr("skytether.netem.proxy.LAPS_MAX", 2**62)
+    assert circulate(make_proxy(), packets=1) == 5000
 
 
-def test_if_no_flow_were_kept_a_flood_would_take_the_places_of_those_who_fly(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Their answers, which are on their way, would go to strangers."""
-    proxy = make_proxy(flows=64)
-    for client in [("192.0.2.1", port) for port in range(8)]:
-        fly(proxy, client)
-    monkeypatch.setattr(proxy_module, "IDLE_NS", 0)
-    for port in range(70):
-        hear(proxy, b"x", ("192.0.2.66", port), at=1)
-    proxy.outbox()
-    for socket in range(1, 9):
-        hear(proxy, b"!", SERVER, socket)
-    assert {sent.peer[0] for sent in proxy.outbox()} == {"192.0.2.66"}
-
-
-def test_the_servers_packets_keep_a_flow_in_use() -> None:
-    """A client that only listens is not idle."""
-    proxy = make_proxy(flows=1)
-    socket = fly(proxy, ALICE)
-    hear(proxy, b"!", SERVER, socket, at=IDLE_NS - 1)
-    proxy.outbox()
-    hear(proxy, b"?", BOB, at=IDLE_NS)
+def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None:
+    """Before it does, so many of them, and each that has a flow already."""
+    proxy = make_proxy()
+    clients = [("192.0.2.1", port) for port in range(LAPS_MAX + 2)]
+    for client in clients[:-1]:
+        pass_on(proxy, b"hello", client)
+    hear(proxy, b"hello", clients[-1])
     assert (proxy.outbox(), proxy.refused) == ([], 1)
+    pass_on(proxy, b"other", clients[-1])
+    ask(proxy, clients[0])
+    for port in range(100):
+        pass_on(proxy, b"hello", ("192.0.2.2", port))
+
+
+# -- all else --------------------------------------------------------------------------------
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
@@ -248,7 +409,7 @@ def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() 
     proxy = make_proxy(uplink=slow, downlink=AT_ONCE, flows=1)
     socket = pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, socket)
-    assert pass_on(proxy, b"?", BOB, at=IDLE_NS) == socket
+    assert pass_on(proxy, b"?", BOB) == socket
     proxy.wake(now_ns=61 * 1000 * MILLISECOND_NS)
     assert proxy.outbox() == [Datagram(b"!", ALICE, 0)]
 

@@ -56,6 +56,7 @@ from skytether.shared.core.events import (
     PlanningResumed,
     PlanningStopped,
     RecordIncomplete,
+    Returned,
     ServerFull,
     SessionEnded,
     SessionOpened,
@@ -111,6 +112,11 @@ SENTENCES = [
     (
         Fault(traceback="Traceback:\nZeroDivisionError\n"),
         "a mistake in its code, the flight goes on\nTraceback:\nZeroDivisionError",
+    ),
+    (
+        Returned(times=17),
+        "a packet has come back from 17 new addresses, and opens no more flows: the server has "
+        "never answered, and its address may lead back to this netem",
     ),
     (FlowOpened(flow=2, host="192.0.2.1", port=5), "flow 2 for 192.0.2.1:5"),
     (AutopilotSaid(text="Arming motors", severity=6), "Arming motors"),
