@@ -9,12 +9,14 @@ if __name__ == "__main__":  # before the imports below, which take a while
 
 import gc
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from skytether.netem.proxy import FLOWS_MAX, Proxy
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import address_text
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
@@ -22,7 +24,7 @@ from skytether.shell import command, process
 from skytether.shell.command import ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
-from skytether.shell.udp import files_max, sockets_max
+from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
 """Number of new objects after which garbage is collected: packets under way are no garbage, and the
@@ -86,6 +88,7 @@ def emulate(argv: Sequence[str]) -> None:
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
+    _check_server(server, bind)
     part = process.part_of(options.record)
     with (
         process.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
@@ -122,6 +125,19 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
         laid = reading.with_directions(laid, directions)
     source = f"{options.scenario} and the command line"
     return replace(options, config=reading.check(reading.to_table(laid), source))
+
+
+def _check_server(server: Address, bind: Address) -> None:
+    """Refuse a server that is netem itself.
+
+    Raises:
+        CommandError: packets would circulate.
+    """
+    with suppress(OSError):  # an address that cannot be found is reported when it is used
+        if leads_back(server, bind):
+            at = address_text(*server)
+            said = f"--server: got {at}, which is netem itself; expected the address of a server"
+            raise command.CommandError(said, command.CONFIGURATION)
 
 
 def _flows(given: int | None) -> int:

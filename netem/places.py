@@ -104,8 +104,8 @@ class Order:
 
     def oldest(self, host: str = "") -> Flow | None:
         """Oldest flow of all, or of one host; None where there is none."""
-        flows = self._hosts.get(host, {}) if host else self.flows
-        return next(iter(flows.values()), None)
+        flows = self._hosts.get(host) if host else self.flows
+        return next(iter(flows.values())) if flows else None
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
         """Oldest flow of a host with more than HOST_FLOWS; None where there is none.

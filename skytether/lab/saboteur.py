@@ -1,4 +1,4 @@
-"""Attackers: a man in the middle between vehicles and netem, and an observer with a host of his own.
+"""Attackers: a man in the middle between vehicles and netem, and an observer beside them.
 
 Neither can read packets. They pass unless a fault is active (`lab.faults`): then they are lost,
 duplicated, delayed, altered or replayed, or a stranger sends further packets.

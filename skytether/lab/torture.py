@@ -44,7 +44,6 @@ from skytether.server.endpoint import Server
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.core.steady import JUMP_NS, Steady
 from skytether.shared.law.model import Array, Flags

@@ -64,6 +64,37 @@ def is_loopback(address: Address) -> bool:
     return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
+def leads_back(address: Address, bound: Address) -> bool:
+    """Whether what is sent to an address of this machine comes to a socket that is bound; blocks.
+
+    Args:
+        address: a name or a number, to which is sent.
+        bound: address of the socket, which may be one that stands for all of this machine.
+
+    Raises:
+        OSError: one of them cannot be found.
+    """
+    (host, port), (bound_host, bound_port) = look_up(address), look_up(bound)
+    if port != bound_port or (":" in host) != (":" in bound_host):
+        return False
+    if _is_unspecified(host):  # packets to it go to loopback
+        host = "::1" if ":" in host else "127.0.0.1"
+    return host == bound_host or (_is_unspecified(bound_host) and _is_own(host))
+
+
+def _is_unspecified(host: str) -> bool:
+    return ipaddress.ip_address(host).is_unspecified
+
+
+def _is_own(host: str) -> bool:
+    """Whether a numeric address is one of this machine's: a socket can be bound to those alone."""
+    try:
+        open_socket((host, 0)).close()
+    except AddressError:
+        return False
+    return True
+
+
 def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
     """A non-blocking UDP socket with large buffers; one of IPv6 hears IPv6 alone.
 

@@ -22,10 +22,11 @@ from skytether.__main__ import main
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.traces import recorded_in
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
+from skytether.shell.udp import leads_back
 from skytether.view import traffic
 
 ROOT = Path(__file__).parents[2]
@@ -282,3 +283,37 @@ def test_a_recording_becomes_the_trace_of_each_flow(tmp_path: Path) -> None:
     assert found.time_s.tolist() == [0.0, 1.0, 2.0]
     assert found.lost.tolist() == [False, True, False]
     assert found.delay_s.tolist() == [0.1, 0.2, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("bind", "server"),
+    [
+        ("127.0.0.1:47600", "127.0.0.1:47600"),
+        ("127.0.0.1:47600", "localhost:47600"),
+        ("localhost:47600", "0.0.0.0:47600"),
+        ("0.0.0.0:47600", "127.0.0.1:47600"),
+        ("0.0.0.0:47600", "127.0.0.7:47600"),
+        pytest.param("[::]:47600", "[::1]:47600", marks=pytest.mark.ipv6),
+    ],
+)
+def test_netem_is_not_its_own_server(
+    bind: str, server: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Under any name of this machine, where it listens at all of them."""
+    assert main(["netem", "--bind", bind, "--server", server]) == 2
+    said = f"--server: got {server}, which is netem itself; expected the address of a server"
+    assert said in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("server", "bind"),
+    [
+        (("127.0.0.1", 47601), ("127.0.0.1", 47600)),
+        (("127.0.0.2", 47600), ("127.0.0.1", 47600)),
+        (("192.0.2.1", 47600), ("0.0.0.0", 47600)),
+        (("127.0.0.1", 47600), ("::1", 47600)),
+    ],
+)
+def test_other_servers_do_not_lead_back(server: Address, bind: Address) -> None:
+    """Another port, another address, another machine, another family."""
+    assert not leads_back(server, bind)
