@@ -201,21 +201,24 @@ ATTACKER = "192.0.2.66"
 
 
 class Siege:
-    """netem under attack: its places are sought by somebody who repeats a packet from many ports.
+    """An attack on netem: its places are sought by somebody who repeats a packet from many ports.
 
     Args:
         proxy: the proxy; the server answers each packet at once, a step of 0.1 s after the other.
         hosts: hosts of the attacker.
         ports: number of ports on each.
         rate_hz: packets a second, of all ports together.
+        stays: number of steps in a row with packets from the same ports.
     """
 
-    def __init__(self, proxy: Proxy, hosts: list[str], ports: int, rate_hz: int) -> None:
-        self.proxy = proxy
+    def __init__(
+        self, proxy: Proxy, hosts: list[str], ports: int, rate_hz: int, *, stays: int = 1
+    ) -> None:
+        self.proxy, self.stays = proxy, stays
         self.addresses = [(host, 1000 + port) for port in range(ports) for host in hosts]
         self.each_step = rate_hz // 10
         self.now_ns = 0
-        self._sent = 0
+        self._steps = 0
 
     def step(self, *clients: tuple[str, int]) -> set[tuple[str, int]]:
         """Let 0.1 s pass: the attacker sends, the clients send, and the server answers them all.
@@ -226,9 +229,10 @@ class Siege:
         self.now_ns += 100 * MILLISECOND_NS
         for client in clients:
             hear(self.proxy, b"?", client, at=self.now_ns)
-        for _ in range(self.each_step):
-            at = self.addresses[self._sent % len(self.addresses)]
-            self._sent += 1
+        first = self._steps // self.stays * self.each_step
+        self._steps += 1
+        for number in range(first, first + self.each_step):
+            at = self.addresses[number % len(self.addresses)]
             hear(self.proxy, b"x", at, at=self.now_ns)
         for _, _, socket in self.proxy.outbox():
             hear(self.proxy, b"!", SERVER, socket, at=self.now_ns)
@@ -275,6 +279,35 @@ def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
     elsewhere = (ALICE[0], 7)
     siege.run(4, elsewhere, BOB, CAROL)
     assert siege.run(3, elsewhere, BOB, CAROL) == 1.0
+
+
+@pytest.mark.parametrize("hosts", [spread(8), spread(128), [ALICE[0]]])
+@pytest.mark.parametrize(("rate_hz", "expected"), [(90, 1.0), (150, 0.0)])
+def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
+    hosts: list[str], rate_hz: int, expected: float
+) -> None:
+    """With eight packets in ten seconds for each place, or more; a vehicle that flies flies on."""
+    assert 90 < 128 * EXCHANGES * SECOND_NS / EARNED_NS < 150
+    siege = Siege(make_proxy(flows=128), hosts, 128 // len(hosts), 0, stays=EXCHANGES)
+    siege.run(2, ALICE)
+    siege.each_step = rate_hz // 10
+    siege.run(20, ALICE)
+    newcomer = (ALICE[0], 7)
+    siege.run(4, ALICE, newcomer)
+    found = [siege.step(ALICE, newcomer) for _ in range(30)]
+    assert all(ALICE in answered for answered in found)
+    assert sum(newcomer in answered for answered in found) / 30 == expected
+
+
+@pytest.mark.parametrize("hosts", [spread(8), spread(128), [ALICE[0]]])
+def test_who_opens_flows_fast_enough_shuts_newcomers_out(hosts: list[str]) -> None:
+    """As many as there are places, before an answer comes; a vehicle that flies flies on."""
+    siege = Siege(make_proxy(flows=128), hosts, 2_000, 0)
+    siege.run(2, ALICE)
+    siege.each_step = 140
+    siege.step(ALICE)
+    found = [siege.step(ALICE, (ALICE[0], 7)) for _ in range(20)]
+    assert found == [{ALICE}] * 20
 
 
 def old_rule(patch: pytest.MonkeyPatch) -> None:

@@ -115,8 +115,10 @@ SENTENCES = [
     ),
     (
         Returned(times=17),
-        "a packet has come back from 17 new addresses, and opens no more flows: the server has "
-        "never answered, and its address may lead back to this netem",
+        (
+            "a packet has come back from 17 new addresses, and opens no more flows: the server has "
+            "never answered, and its address may lead back to this netem"
+        ),
     ),
     (FlowOpened(flow=2, host="192.0.2.1", port=5), "flow 2 for 192.0.2.1:5"),
     (AutopilotSaid(text="Arming motors", severity=6), "Arming motors"),
