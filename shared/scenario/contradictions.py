@@ -137,8 +137,13 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
     """Why there can be no such zones."""
+    least_m = scenario.mission.tube_m
     try:
-        _ = scenario.zones
+        for zone in scenario.zones.zones:
+            long_m = float(np.ptp(zone.corners, axis=0).max())
+            if long_m < least_m:
+                what = f"zones of at least mission.tube_m = {least_m:g} m; this is {long_m:.2g} m"
+                yield "mission.zones", zone.name, f"{what} long, in metres"
     except policies.PolicyError as error:
         yield "mission.zones", repr(error.given), error.expected
     except OSError as error:

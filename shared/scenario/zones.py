@@ -34,6 +34,15 @@ FILE_BYTES_MAX = 4_000_000
 """Size of the largest GeoJSON file [B]."""
 EARTH_M = 6_378_137.0
 """Radius of the earth at the equator, WGS 84 [m]."""
+METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
+"""Largest coordinate [m] of a file in metres, and of one in degrees, where the earth is round."""
+NORTH_MAX = 85.0
+"""Largest latitude [degrees]."""
+CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+"""The one `crs` that means what RFC 7946 means without any."""
+Frame = Callable[[Any], Array]
+"""Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
+_NOWHERE: Array = np.zeros((0, 2))
 
 
 class Zone(NamedTuple):
@@ -284,7 +293,7 @@ def _between(written: str, corners: Array, heights: list[float]) -> Zone:
 
 
 def _polygon(written: str, text: str) -> list[Zone]:
-    return [Zone(written, _points(_numbers(text), 3, "polygon"))]
+    return [Zone(written, _ring(_points(_numbers(text), 3, "polygon")))]
 
 
 def _fence(written: str, text: str) -> list[Zone]:
@@ -293,7 +302,7 @@ def _fence(written: str, text: str) -> list[Zone]:
         if not (given[0] < given[1] and given[2] < given[3]):
             raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
         return [Zone(written, _corners(*given), is_fence=True)]
-    return [Zone(written, _points(given, 3, "fence"), is_fence=True)]
+    return [Zone(written, _ring(_points(given, 3, "fence")), is_fence=True)]
 
 
 def _corridor(written: str, text: str) -> list[Zone]:
@@ -334,59 +343,173 @@ def _none(written: str) -> list[Zone]:
 def _features(file: str, told: Any) -> Iterator[Zone]:
     """Zones of a FeatureCollection.
 
-    Its `origin` is longitude and latitude of the scenario's origin; without one coordinates are
-    metres. A feature's properties may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and
-    `radius_m` of a Point.
+    Coordinates are degrees, as RFC 7946 has it, and the member `origin` of the collection is the
+    longitude and latitude of the scenario's origin. In place of it, the member `"units": "m"` says
+    that coordinates are metres. A feature's properties may be `kind` ("keep_out" or "fence"),
+    `low_m`, `high_m`, and `radius_m` of a Point.
 
     Raises:
         ValueError: with what is wrong.
     """
-    if not isinstance(told, dict) or not isinstance(told.get("features"), list):
+    whole = isinstance(told, dict) and told.get("type") == "FeatureCollection"
+    if not (whole and isinstance(told.get("features"), list)):
         raise ValueError("a GeoJSON file with a FeatureCollection")
-    origin = told.get("origin")
+    placed, corners = _frame(told), 0
     for i, feature in enumerate(told["features"]):
         name = f"{file}: feature {i + 1}"
         try:
-            properties = feature.get("properties") or {}
-            geometry = feature["geometry"]
-            kind, coordinates = geometry["type"], geometry["coordinates"]
-            low = float(properties.get("low_m", -math.inf))
-            high = float(properties.get("high_m", math.inf))
-            is_fence = {"keep_out": False, "fence": True}[properties.get("kind", "keep_out")]
-            label = f"{file}: {properties.get('name', f'feature {i + 1}')}"
-            if kind == "Point":
-                (place,) = _local([coordinates], origin)
-                radius = float(properties["radius_m"])
-                if not radius > 0.0:
-                    raise ValueError(f"{name} with radius_m above 0")
-                yield Zone(label, _around(place[0], place[1], radius), low, high, is_fence)
-                continue
-            parts = {"Polygon": [coordinates], "MultiPolygon": coordinates}[kind]
-            for rings in parts:
-                for ring, points in enumerate(rings):
-                    places = _local(points, origin)
-                    if len(places) > 3 and (places[0] == places[-1]).all():
-                        places = places[:-1]
-                    if len(places) < 3:
-                        raise ValueError(f"{name} with at least 3 corners")
-                    # A hole in a fence is kept out of; in what is kept out of it changes nothing.
-                    if ring == 0 or is_fence:
-                        yield Zone(label, places, low, high, is_fence and ring == 0)
+            for zone in _feature(file, i, feature, placed):
+                yield zone
+                corners += len(zone.corners)
+                if corners > CORNERS_MAX:
+                    return  # as `parse` says
         except (KeyError, TypeError, AttributeError, IndexError) as error:
             raise ValueError(
                 f"{name} as RFC 7946 has it, {type(error).__name__}: {error}"
             ) from None
+        except ValueError as error:
+            raise ValueError(f"{name} with {error}") from None
 
 
-def _local(points: Any, origin: Any) -> Array:
-    """East and north of the origin [m]; shape (n, 2)."""
-    places = np.array([[float(point[0]), float(point[1])] for point in points])
-    if origin is not None:
-        east, north = float(origin[0]), float(origin[1])
-        degree = math.radians(1.0) * EARTH_M
-        places = (places - [east, north]) * [degree * math.cos(math.radians(north)), degree]
-    if not (np.abs(places) <= 1e6).all():
-        raise ValueError("coordinates of at most 1e6 m from the origin")
+def _frame(told: dict[str, Any]) -> Frame:
+    """Function from coordinates to metres east and north of the scenario's origin.
+
+    Raises:
+        ValueError: the collection does not say what its coordinates are.
+    """
+    crs, units, origin = told.get("crs"), told.get("units"), told.get("origin")
+    if crs not in (None, CRS84):
+        raise ValueError(f"no crs, for RFC 7946 has degrees of WGS 84, got {str(crs)[:80]}")
+    if units not in (None, "m"):
+        raise ValueError(f'"units": "m" or none, got {str(units)[:80]!r}')
+    if (units is None) == (origin is None):
+        given = "neither" if origin is None else "both"
+        raise ValueError(
+            'a member "origin" with the longitude and latitude of the scenario\'s origin, for '
+            f'coordinates are degrees, or "units": "m" where they are metres; got {given}'
+        )
+    if origin is None:
+        return lambda points: _near(_places(points), METRES_MAX)
+    if not (isinstance(origin, list) and len(origin) == 2):
+        raise ValueError('"origin": [longitude, latitude]')
+    east, north = map(_number, origin)
+    if not (abs(east) <= 180.0 and abs(north) <= NORTH_MAX):
+        raise ValueError(f'"origin": [longitude, latitude], up to {NORTH_MAX:g} degrees north')
+    return lambda points: _local(_places(points), east, north)
+
+
+def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
+    """Zones of the feature with index i.
+
+    Raises:
+        ValueError: with what is wrong.
+        KeyError, TypeError, AttributeError, IndexError: it is no feature.
+    """
+    properties, geometry = feature.get("properties") or {}, feature["geometry"]
+    kind = None if geometry is None else geometry["type"]
+    if kind not in ("Polygon", "MultiPolygon", "Point"):
+        raise ValueError(f"a Polygon, a MultiPolygon or a Point, got {kind}")
+    low = _number(properties.get("low_m", -math.inf), "low_m")
+    high = _number(properties.get("high_m", math.inf), "high_m")
+    if not low < high:
+        raise ValueError(f"low_m below high_m, got {low:g} and {high:g}")
+    is_fence = {"keep_out": False, "fence": True}[properties.get("kind", "keep_out")]
+    zone = Zone(f"{file}: {properties.get('name', f'feature {i + 1}')}", _NOWHERE, low, high)
+    coordinates = geometry["coordinates"]
+    if kind == "Point":
+        ((x, y),) = placed([coordinates]).tolist()
+        radius = _number(properties["radius_m"], "radius_m")
+        if not 0.0 < radius <= METRES_MAX:
+            raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")
+        yield zone._replace(corners=_around(x, y, radius), is_fence=is_fence)
+        return
+    parts = [coordinates] if kind == "Polygon" else coordinates
+    if is_fence and len(parts) > 1:
+        raise ValueError("one polygon, for nobody can stay within several fences beside each other")
+    if not (isinstance(parts, list) and parts and all(parts)):
+        raise ValueError("coordinates, got none")
+    for rings in parts:
+        # A hole in a fence is kept out of; in what is kept out of it changes nothing.
+        for number, points in enumerate(rings if is_fence else rings[:1]):
+            corners = _ring(placed(points))
+            yield zone._replace(corners=corners, is_fence=is_fence and number == 0)
+
+
+def _ring(places: Array) -> Array:
+    """Corners of a polygon's ring, whose last point repeats the first; of either winding.
+
+    Raises:
+        ValueError: it encloses nothing, or what it encloses is not clear.
+    """
+    if len(places) > 3 and (places[0] == places[-1]).all():
+        places = places[:-1]
+    if len(places) < 3:
+        raise ValueError("at least 3 corners")
+    if len(places) <= CORNERS_MAX and _crosses_itself(places):
+        raise ValueError("a border that does not cross itself")
+    return places
+
+
+def _crosses_itself(corners: Array) -> bool:
+    """Whether two edges of a polygon cross."""
+    begin, end = corners, np.roll(corners, -1, axis=0)
+    along = end - begin
+
+    def side(points: Array) -> Array:
+        off = points[None] - begin[:, None]
+        sides: Array = np.sign(along[:, None, 0] * off[..., 1] - along[:, None, 1] * off[..., 0])
+        return sides
+
+    parted = side(begin) * side(end) < 0.0
+    return bool((parted & parted.T).any())
+
+
+def _number(given: Any, key: str = "origin") -> float:
+    """A number, and not a text, a truth value or NaN.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
+        raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
+    return float(given)
+
+
+def _places(points: Any) -> Array:
+    """Coordinates as they are written; shape (n, 2).
+
+    Raises:
+        ValueError: they are no coordinates, or have heights.
+    """
+    if not (isinstance(points, list) and points):
+        raise ValueError("coordinates, got none")
+    for point in points:
+        if not (isinstance(point, list) and len(point) in (2, 3)):
+            raise ValueError(f"coordinates of two numbers, got {str(point)[:80]}")
+        if any(_number(each, "coordinates") for each in point[2:]):
+            raise ValueError("no heights in its coordinates: they are the properties low_m, high_m")
+    return np.array([[_number(each, "coordinates") for each in point[:2]] for point in points])
+
+
+def _local(degrees: Array, east: float, north: float) -> Array:
+    """Metres east and north of the origin, of places by longitude and latitude; shape (n, 2).
+
+    Degrees are as long as at the mean of the two latitudes, as ArduPilot reckons.
+    """
+    longitude, latitude = degrees.T
+    if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
+        raise ValueError("coordinates of longitude and latitude")
+    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # the shorter way over the antimeridian
+    degree = math.radians(1.0) * EARTH_M
+    scale = np.cos(np.radians((latitude + north) / 2.0))
+    return _near(
+        np.stack([degree * scale * away, degree * (latitude - north)], axis=1), DEGREES_MAX_M
+    )
+
+
+def _near(places: Array, most_m: float) -> Array:
+    if not (np.abs(places) <= most_m).all():
+        raise ValueError(f"coordinates of at most {most_m:g} m from the origin")
     return places
 
 

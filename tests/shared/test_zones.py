@@ -163,7 +163,8 @@ def test_what_is_no_zone_is_told(text: str, said: str) -> None:
 
 
 def geojson(features: Any, **more: Any) -> str:
-    """A file's content."""
+    """Content of a file in metres, unless it has an origin or a member says otherwise."""
+    more = {"units": "m"} | more if "origin" not in more else more
     return json.dumps({"type": "FeatureCollection", "features": features, **more})
 
 
@@ -183,7 +184,9 @@ def test_zones_from_a_map(tmp_path: Path) -> None:
     file.write_text(geojson([polygon(square, low_m=0, high_m=30)], origin=[10.0, 50.0]))
     kept = zones.parse(f'geojson("{file}")', 3)
     (zone,) = kept.zones
-    assert zone.corners[2] == pytest.approx([degree_m * 1e-3 * np.cos(np.radians(50.0)), 111.3195])
+    assert zone.corners[2] == pytest.approx(
+        [degree_m * 1e-3 * np.cos(np.radians(50.0005)), 111.3195]
+    )
     assert (zone.low_m, zone.high_m, zone.is_fence) == (0.0, 30.0, False)
     fence = polygon(field, kind="fence", name="field")
     fence["geometry"]["coordinates"].append(hole)
@@ -194,15 +197,52 @@ def test_zones_from_a_map(tmp_path: Path) -> None:
     assert (inside > 0.0).tolist() == [False, True, False, False]
 
 
+SQUARE = [[0, 0], [9, 0], [9, 9], [0, 9], [0, 0]]
+BOW_TIE = [[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]
+MEMBER = {"type": "Feature", "properties": None}
+
+
+def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
+    """A file with one feature of a geometry."""
+    geometry = {"type": geometry_type, "coordinates": coordinates}
+    return geojson([MEMBER | {"properties": properties, "geometry": geometry}])
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
         ("{", "a GeoJSON file"),
         ("[]", "FeatureCollection"),
+        (json.dumps({"features": []}), "FeatureCollection"),
+        (json.dumps(MEMBER), "FeatureCollection"),
         (geojson([]), "a feature with a Polygon"),
-        (geojson([{"geometry": None}]), "feature 1 as RFC 7946 has it"),
+        (geojson([polygon(SQUARE)], units=None), 'a member "origin" with the longitude'),
+        (geojson([polygon(SQUARE)], units="m", origin=[10, 50]), "got both"),
+        (geojson([polygon(SQUARE)], units="ft"), '"units": "m" or none, got \'ft\''),
+        (geojson([polygon(SQUARE)], origin=[10]), '"origin": [longitude, latitude]'),
+        (geojson([polygon(SQUARE)], origin=[50, 110]), "up to 85 degrees north"),
+        (geojson([polygon(SQUARE)], origin=[10, "50"]), "origin a number, got '50'"),
+        (geojson([polygon(SQUARE)], origin=[10, 50]), "at most 100000 m from the origin"),
+        (geojson([polygon([[0, 0], [0, 89], [1, 89]])], origin=[0, 84]), "longitude and latitude"),
+        (geojson([polygon(SQUARE)], crs={"type": "name"}), "no crs, for RFC 7946 has degrees"),
+        (geojson([{"geometry": None}]), "a Polygon, a MultiPolygon or a Point, got None"),
+        (geojson([{"properties": {}}]), "feature 1 as RFC 7946 has it"),
+        (shape("GeometryCollection", []), "feature 1 with a Polygon, a MultiPolygon or a Point"),
+        (shape("LineString", SQUARE), "or a Point, got LineString"),
+        (shape("Polygon", []), "feature 1 with coordinates, got none"),
+        (shape("Polygon", [[]]), "feature 1 with coordinates, got none"),
+        (shape("MultiPolygon", []), "feature 1 with coordinates, got none"),
+        (shape("Point", [], radius_m=1), "feature 1 with coordinates of two numbers"),
+        (shape("Point", [0, 0], radius_m="5"), "radius_m a number, got '5'"),
+        (shape("Point", [0, 0], radius_m=float("inf")), "radius_m above 0, at most 1e+06"),
+        (shape("MultiPolygon", [[SQUARE], [SQUARE]], kind="fence"), "feature 1 with one polygon"),
+        (geojson([polygon([[0, 0, 5], [1, 1, 5], [0, 1, 5]])]), "no heights in its coordinates"),
+        (geojson([polygon(SQUARE, low_m=30, high_m=0)]), "low_m below high_m, got 30 and 0"),
+        (geojson([polygon(SQUARE, high_m=float("nan"))]), "high_m a number, got 'nan'"),
         (geojson([polygon([[0, 0], [1, 1]])]), "feature 1 with at least 3 corners"),
-        (geojson([polygon([[0, 0], [1e9, 1], [0, 1]])]), "at most 1e6 m"),
+        (geojson([polygon([[0, 0], [True, 1], [0, 1]])]), "coordinates a number, got 'True'"),
+        (geojson([polygon([[0, 0], [1e9, 1], [0, 1]])]), "at most 1e+06 m"),
+        (geojson([polygon(BOW_TIE)]), "a border that does not cross itself"),
         (geojson([polygon([[0, 0], [1, 1], [0, 1]], kind="danger")]), "KeyError: 'danger'"),
     ],
 )
@@ -213,6 +253,47 @@ def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(PolicyError) as refused:
         zones.parse(f'geojson("{file}")', 2)
     assert said in str(refused.value)
+
+
+def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -> None:
+    """Of either winding, closed or not, with heights of 0, and on both sides of 180 degrees."""
+    file = tmp_path / "map.geojson"
+
+    def corners(points: Any, origin: Any, **more: Any) -> list[list[float]]:
+        file.write_text(geojson([polygon(points)], origin=origin, **more))
+        (zone,) = zones.parse(f"geojson({file})", 2).zones
+        found: list[list[float]] = zone.corners.round(6).tolist()
+        return found
+
+    square = [[0.0, 0.0], [0.001, 0.0], [0.001, 0.001], [0.0, 0.001]]
+    expected = corners(square, [0.0, 0.0])
+    assert expected[1] == pytest.approx([111.319491, 0.0])
+    assert corners([*square, square[0]], [0.0, 0.0]) == expected
+    assert corners([[*point, 0.0] for point in square], [0, 0], crs=zones.CRS84) == expected
+    assert sorted(corners(square[::-1], [0.0, 0.0])) == sorted(expected)
+    east = [[-179.9995, y] if x else [179.9995, y] for x, y in square]
+    assert corners(east, [179.9995, 0.0]) == expected
+    assert corners(east, [-179.9995, 0.0])[0] == pytest.approx([-111.319491, 0.0])
+
+
+def test_neither_winding_nor_hole_changes_where_a_vehicle_may_be(tmp_path: Path) -> None:
+    """A hole in what is kept out of does not open it; a hole in a fence is kept out of."""
+    file = tmp_path / "map.geojson"
+    hole = [[3, 3], [6, 3], [6, 6], [3, 6], [3, 3]]
+    places = np.array([[1.0, 1.0], [4.5, 4.5], [12.0, 1.0]])
+    for outer, inner in ((SQUARE, hole), (SQUARE[::-1], hole), (SQUARE, hole[::-1])):
+        for kind, free in (("keep_out", [False, False, True]), ("fence", [True, False, False])):
+            file.write_text(shape("Polygon", [outer, inner], kind=kind))
+            kept = zones.parse(f"geojson({file})", 2)
+            assert (kept.clearance(places).min(axis=1) > 0.0).tolist() == free
+
+
+def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
+    """By the even-odd rule a vehicle would be free within what is enclosed twice."""
+    star = "polygon(0, 10, -6, -8, 9.5, 3, -9.5, 3, 6, -8)"
+    with pytest.raises(PolicyError, match="does not cross itself"):
+        zones.parse(star, 2)
+    zones.parse(U, 2)
 
 
 def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n") -> Any:
@@ -229,6 +310,7 @@ def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n
     [
         ("box(3, 5, -1, 1)", "", "none within 0.23 m of the goal (4, 0) of vehicle 1"),
         ("fence(-1, 3, -1, 5)", "", "of the goal (4, 0) of vehicle 1"),
+        ("box(9, 9.0004, 9, 9.0003)", "", "at least mission.tube_m = 0.2 m; this is 0.0004 m long"),
         ("geojson(missing.json)", "", "a file that can be read"),
         ("", "1,0,0,0\n2,0,0.5,0\n", "at most 0.5 m, as the goals of vehicles 1 and 2 at 0 s"),
     ],
