@@ -107,7 +107,8 @@ class Compensator:
         Raises:
             ProtocolError: it is made for a time so far ahead that nothing later could replace it,
                 from an observation that was not made yet, or too long ago for any of its inputs,
-                or so long after its committed steps that other inputs were flown meanwhile.
+                or so long after its committed steps that other inputs were flown meanwhile, or it
+                is a motion of a mission whose first knot is yet to come.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
@@ -125,6 +126,10 @@ class Compensator:
             raise ProtocolError(Drop.OBSERVATION)
         if length < 1:
             raise ProtocolError(Drop.TOO_OLD)
+        if self._join and horizon.step > step:
+            # The server takes the vehicle's clock for further on than it is: before its first knot
+            # the motion is not the one in force, and would be a leap.
+            raise ProtocolError(Drop.TOO_EARLY)
         is_late = bool(self._join) and step - horizon.step > self._join
         if is_late or self._comes_too_late(step - horizon.step, given - self._H, length):
             raise ProtocolError(Drop.TOO_LATE)

@@ -195,17 +195,19 @@ class Server(Endpoint):
         """Number of HELLOs of vehicles that were refused, by reason."""
         return self._reception.refused
 
+    def _of_vehicle(self, row: int) -> dict[str, Any]:
+        """Figures of one vehicle; on a mission also what it waits for, and what its clock costs."""
+        bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
+        told = {"step": int(self.controller.last_step[row]), "clock_bound_ms": round(bound_ms, 3)}
+        clock_m, waits = self.controller.clock_m(row), self.controller.waits(row)
+        more = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
+        return told | {name: each for name, each in more.items() if each is not None}
+
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         ticks = self._ticker.durations
-        told = {
-            str(session.vehicle): {
-                "step": int(self.controller.last_step[session.row]),
-                "clock_bound_ms": self._clock.bound_ns(session.row) / MILLISECOND_NS,
-                **({"waits": said} if (said := self.controller.waits(session.row)) else {}),
-            }
-            for session in self.sessions.first(VEHICLES_TOLD_MAX)
-        }
+        shown = self.sessions.first(VEHICLES_TOLD_MAX)
+        told = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}
         return {
             "vehicles": len(self.sessions),
             "degraded": self._grid.degraded,
@@ -215,7 +217,7 @@ class Server(Endpoint):
             "tick_ms_p99": ticks.quantile_ms(0.99),
             "ticks_within_ms": ticks.within(TICK_EDGES_MS),
             "spent_ns": dict(self.stopwatch.spent_ns),
-            "counts": dict(self.controller.counts),
+            "counts": dict(self.controller.counts) | self._clock.counts,
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
             "by_vehicle": told,

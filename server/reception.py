@@ -204,7 +204,7 @@ class Reception:
             raise ProtocolError(IMPLAUSIBLE[verdict])
         session.doubted = False
         if verdict == ANEW:
-            self._anew(row)
+            self._anew(row, None)
             session.hearing.begin()
         # Only after it was believed: an observation that is not does not keep a session alive.
         session.heard_ns = now_ns
@@ -222,9 +222,14 @@ class Reception:
             session.address, session.line = address, call.line
         self._grid.arm(now_ns)
 
-    def _anew(self, row: int) -> None:
-        """Forget all that is known of a vehicle but its session."""
-        self._clock.forget(row)
+    def _anew(self, row: int, life: int | None) -> None:
+        """Forget all that is known of a vehicle but its session.
+
+        Args:
+            row: the vehicle.
+            life: number of its life, if its clock may be the one that is known.
+        """
+        self._clock.forget(row, life)
         self._controller.forget(row)
         self._sessions.idle[row] = Idle.PLANS
 
@@ -233,7 +238,7 @@ class Reception:
         session = self._sessions.begin(observation, now_ns)
         session.line = call.line
         self._plausibility.forget(session.row)
-        self._anew(session.row)
+        self._anew(session.row, session.boot_id)
         self._controller.desired.assign(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))

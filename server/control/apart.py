@@ -4,6 +4,12 @@ Distances along the third axis may count less than those in the plane: all are o
 are multiplied by `scale` first. So a sphere of that metric is an ellipsoid, higher than it is wide,
 as downwash asks for.
 
+Where each vehicle is on its motion the server knows to within the error of the step that it counts
+(`clock.StepError`). Between two vehicles only the sum of both counts, and it is that of one number:
+by how many steps the other one is further on its motion, or less far, than the server counts. So
+one of the two is taken at a step, and the other anywhere between two steps: a swept piece of its
+way, which is longer the faster it flies, and a point where it rests.
+
 In space a vehicle that hears nothing lands after a while. From the first step at which it may, it
 may be anywhere between its motion, which is at rest by then, and the ground. So in the end any two
 motions have to be apart side by side.
@@ -14,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.server.control.clock import DRIFT, EXACT, StepError
 from skytether.shared.base.kernel import (
     B1,
     F1,
@@ -49,6 +56,10 @@ class Flown(NamedTuple):
     """First step at which it may begin to land; shape (room,)."""
     wide: F1
     """Distance to be kept beyond that from others [m]; shape (room,)."""
+    early: F1
+    """Error of the steps of the vehicle, see `clock.StepError`; shape (room,)."""
+    late: F1
+    """Error of the steps of the vehicle the other way; shape (room,)."""
     position: F3
     """Positions of the knots [m]; shape (room, KNOTS, axes)."""
     velocity: F3
@@ -71,19 +82,33 @@ class FlownMotions:
         self.count = 0
         self.scale, self.dt_s = scale, dt_s
         room, axes = 64, len(scale)
-        numbers, widths = np.zeros((4, room), dtype=np.int64), np.zeros(room)
+        numbers, widths = np.zeros((4, room), dtype=np.int64), np.zeros((3, room))
         knots, corners = np.zeros((2, room, KNOTS, axes)), np.zeros((2, room, axes))
-        self.arrays = Flown._make([*numbers, widths, *knots, *corners])
+        self.arrays = Flown._make([*numbers, *widths, *knots, *corners])
 
     def replace(
-        self, row: int, motions: Sequence[Motion], ahead: int, lands: int, wide_m: float
+        self,
+        row: int,
+        motions: Sequence[Motion],
+        ahead: int,
+        lands: int,
+        wide_m: float,
+        error: StepError = EXACT,
     ) -> None:
         """Replace all motions of a vehicle; see `add`."""
         self.count = _remove(self.arrays, self.count, row)
         for motion in motions:
-            self.add(row, motion, ahead, lands, wide_m)
+            self.add(row, motion, ahead, lands, wide_m, error)
 
-    def add(self, row: int, motion: Motion, ahead: int, lands: int, wide_m: float) -> None:
+    def add(
+        self,
+        row: int,
+        motion: Motion,
+        ahead: int,
+        lands: int,
+        wide_m: float,
+        error: StepError = EXACT,
+    ) -> None:
         """Add a motion.
 
         Args:
@@ -92,10 +117,21 @@ class FlownMotions:
             ahead: number of steps by which that is ahead of those in common.
             lands: first of those in common at which it may begin to land, or NEVER.
             wide_m: distance to be kept from it beyond that from others [m].
+            error: of the steps of the vehicle.
         """
         self.make_room(1)
-        _add(self.arrays, self.count, row, motion, ahead, lands, wide_m, self.scale, self.dt_s)
+        arrays, m = self.arrays, self.count
+        _add(arrays, m, row, motion, ahead, lands, wide_m, error, self.scale, self.dt_s)
         self.count += 1
+
+    def doubt(self, early: Array, late: Array) -> None:
+        """Take other errors of the vehicles' steps for all motions.
+
+        Args:
+            early, late: by row, see `clock.StepError`; shape (capacity,).
+        """
+        n, of = self.count, self.of
+        self.arrays.early[:n], self.arrays.late[:n] = early[of], late[of]
 
     def make_room(self, more: int) -> None:
         """Make room for so many more motions."""
@@ -135,27 +171,27 @@ def too_near(
     lands: int,
     flown: FlownMotions,
     keep_m: float,
+    error: StepError = EXACT,
 ) -> Flags:
-    """Motions that may be flown to which another one comes too near, from a step on for ever.
-
-    Distances are those of straight pieces, SAMPLES an interval, which `motion.bend_m` makes up for.
+    """Motions that may be flown to which another one may come too near, from a step on for ever.
 
     Args:
         motion: by the steps in common.
-        base: the one in force. Where that is nearer already, the other need only come no nearer by
-            NEARER_M: it may always fly away.
+        base: the one in force. Where that is nearer already, and not only by what pieces are off a
+            motion, the other need only come no nearer by NEARER_M: it may always fly away.
         begin: step from which on.
         row: the vehicle's, whose own motions do not count.
         lands: first step at which it may begin to land, or NEVER.
         flown: motions of all.
         keep_m: distance that is kept from them [m].
+        error: of the vehicle's own steps.
 
     Returns:
         shape (flown.count + 1,); the last, which is for zones, is False.
     """
     hit = np.zeros(flown.count + 1, dtype=np.bool_)
     those = flown.arrays, flown.scale, flown.dt_s
-    _too_near(motion, base, begin, row, lands, *those, keep_m, hit)
+    _too_near(motion, base, begin, row, lands, error, *those, keep_m, hit)
     return hit
 
 
@@ -191,8 +227,12 @@ def half_planes(
     lands: int,
     flown: FlownMotions,
     apart_m: float,
+    error: StepError = EXACT,
 ) -> HalfPlanes:
     """Half-planes normal to the lines from the others' motions to the one in force.
+
+    Of a motion whose step is not known exactly it is the nearest point of where it may be then, and
+    the plane is in front of all of that.
 
     Args:
         times: steps in common; shape (n,).
@@ -202,6 +242,7 @@ def half_planes(
         lands: first step at which it may begin to land, or NEVER.
         flown: motions of all.
         apart_m: distance that is kept [m]; less where the one in force is nearer already.
+        error: of the vehicle's own steps.
     """
     most = len(times) * flown.count
     found = HalfPlanes(
@@ -211,7 +252,7 @@ def half_planes(
         np.empty(most, dtype=np.int64),
     )
     those = flown.arrays, flown.count, flown.scale, flown.dt_s
-    n = _half_planes(times, held, reach_m, row, lands, *those, apart_m, found)
+    n = _half_planes(times, held, reach_m, row, lands, error, *those, apart_m, found)
     return HalfPlanes(found.at[:n], found.normal[:n], found.least[:n], found.of[:n])
 
 
@@ -284,12 +325,21 @@ def _is_far(flown: Flown, m: int, low: F1, high: F1, keep: float) -> bool:
 
 @part
 def _write(
-    flown: Flown, m: int, row: int, first: int, position: F2, velocity: F2, lands: int, wide: float
+    flown: Flown,
+    m: int,
+    row: int,
+    first: int,
+    position: F2,
+    velocity: F2,
+    lands: int,
+    wide: float,
+    error: StepError,
 ) -> None:
     """Write a motion down at a place, but for its box."""
     n, axes = position.shape
     flown.first[m], flown.knots[m], flown.of[m] = first, n, row
     flown.lands[m], flown.wide[m] = lands, wide
+    flown.early[m], flown.late[m] = error.early, error.late
     for knot in range(n):
         for x in range(axes):
             flown.position[m, knot, x] = position[knot, x]
@@ -305,7 +355,9 @@ def _remove(flown: Flown, count: int, row: int) -> int:
         count -= 1
         n, lands, wide = flown.knots[count], flown.lands[count], flown.wide[count]
         position, velocity = flown.position[count, :n], flown.velocity[count, :n]
-        _write(flown, m, flown.of[count], flown.first[count], position, velocity, lands, wide)
+        error = StepError(flown.early[count], flown.late[count])
+        row_of, first = flown.of[count], flown.first[count]
+        _write(flown, m, row_of, first, position, velocity, lands, wide, error)
         for x in range(flown.low.shape[1]):
             flown.low[m, x], flown.high[m, x] = flown.low[count, x], flown.high[count, x]
     return count
@@ -320,11 +372,12 @@ def _add(
     ahead: int,
     lands: int,
     wide: float,
+    error: StepError,
     scale: F1,
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
-    write_down(flown, m, row, motion, ahead, lands, wide, scale, dt_s)
+    write_down(flown, m, row, motion, ahead, lands, wide, error, scale, dt_s)
 
 
 @part
@@ -336,25 +389,20 @@ def write_down(
     ahead: int,
     lands: int,
     wide: float,
+    error: StepError,
     scale: F1,
     dt_s: float,
 ) -> None:
     """Write a motion down at a place, see `FlownMotions.add`."""
     first, position, velocity = motion.first - ahead, motion.position, motion.velocity
-    _write(flown, m, row, first, position, velocity, lands, wide)
+    _write(flown, m, row, first, position, velocity, lands, wide, error)
     bound(motion, lands, scale, dt_s, flown.low[m], flown.high[m])
 
 
 @part
-def _is_down(lands: int, step: float, rest: bool) -> bool:
-    """Whether a vehicle may be on its way down.
-
-    Args:
-        lands: first step at which it may begin to land, or NEVER.
-        step: the present one.
-        rest: whether that is after all that is flown, and all have landed that ever do.
-    """
-    return step >= lands or (rest and lands < NEVER)
+def _is_down(lands: int, step: float) -> bool:
+    """Whether a vehicle may be on its way down at a step; `lands` as in `Flown`."""
+    return step >= lands
 
 
 @part
@@ -370,57 +418,246 @@ def _above(away: float, one_lands: bool, other_lands: bool) -> float:
     return away
 
 
+class Extent(NamedTuple):
+    """Bounds of how a motion goes on."""
+
+    speed: float
+    """Largest speed, scaled [m/s]."""
+    bend: float
+    """Largest distance from its straight pieces, SAMPLES an interval, scaled [m]."""
+
+
+@part
+def _extent(motion: Motion, scale: F1, dt_s: float) -> Extent:
+    """Bounds of how a motion goes on."""
+    fastest, turn = 0.0, 0.0
+    for knot in range(len(motion.velocity)):
+        speed, change = 0.0, 0.0
+        for x in range(len(scale)):
+            v = scale[x] * motion.velocity[knot, x]
+            speed += v * v
+            if knot:
+                change += (v - scale[x] * motion.velocity[knot - 1, x]) ** 2
+        fastest, turn = max(fastest, speed), max(turn, change)
+    # Over a piece of the time t a parabola is off the straight line by a t² / 8 at most.
+    piece = SPACING / SAMPLES * dt_s
+    return Extent(np.sqrt(fastest), np.sqrt(turn) / (SPACING * dt_s) * piece * piece / 8.0)
+
+
+@part
+def sweep(
+    other: Motion, step: float, until: float, least: float, most: float
+) -> tuple[float, float]:
+    """Part of the shifts from `least` to `most` in which another motion is ever elsewhere.
+
+    Args:
+        other: the motion, by steps in common.
+        step, until: between these it is looked at.
+        least, most: steps by which it may be further on.
+    """
+    last = other.first + (len(other.position) - 1) * SPACING
+    return min(max(least, other.first - until), most), max(min(most, last - step), least)
+
+
+@part
+def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
+    """Least and most steps by which another vehicle may be further on than it is counted, when one
+    vehicle is where it is counted.
+
+    Args:
+        one, other: errors of their steps.
+        drift: what is added, for the time for which both are looked ahead [steps].
+    """
+    return -other.late - one.early - drift, other.early + one.late + drift
+
+
+@part
+def _away(
+    one: Motion, other: Motion, step: float, shift: float, x: int, scale: F1, dt_s: float
+) -> float:
+    """Difference of two motions on an axis, the other one so many steps further on, scaled [m]."""
+    return scale[x] * (_place(one, x, step, dt_s) - _place(other, x, step + shift, dt_s))
+
+
+class Span(NamedTuple):
+    """Piece of time for which one motion is compared with another."""
+
+    begin: float
+    """Step at which it begins."""
+    end: float
+    """Step at which it ends; the same where the one motion rests."""
+    least: float
+    """Least number of steps by which the other one may be further on."""
+    most: float
+    """Most of them."""
+    down: bool
+    """Whether who flies the one motion may be landing."""
+    other_down: bool
+    """Whether who flies the other one may be landing."""
+
+
+@part
+def _span(
+    other: Motion,
+    begin: int,
+    i: int,
+    pieces: int,
+    lands: int,
+    others_land: int,
+    least: float,
+    most: float,
+) -> Span:
+    """Piece of time number `i` from a step on: one piece after the other while the one motion
+    lasts, then all the time until the other rests too, and then the time when both have landed that
+    ever do.
+    """
+    last = other.first + (len(other.position) - 1) * SPACING
+    step = begin + i * (SPACING / SAMPLES)
+    if i < pieces:
+        end = step + SPACING / SAMPLES
+        low, high = sweep(other, step, end, least, most)
+        return Span(step, end, low, high, _is_down(lands, end), _is_down(others_land, end + most))
+    if i == pieces:
+        low, high = sweep(other, step, step, least, max(most, float(last - begin)))
+        down, other_down = _is_down(lands, last - least), _is_down(others_land, float(last))
+        return Span(step, step, low, high, down, other_down)
+    return Span(step, step, last - step, last - step, lands < NEVER, others_land < NEVER)
+
+
+@part
+def _spare(
+    one: Motion, other: Motion, span: Span, lands: bool, far: float, scale: F1, dt_s: float
+) -> float:
+    """Distance of the middles of two motions in a piece of time, beyond a distance [m].
+
+    Args:
+        lands: whether any of the two ever does: then heights do not count.
+        far: the distance [m].
+    """
+    square = 0.0
+    middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
+    for x in range(len(scale)):
+        if x != ALTITUDE or not lands:
+            square += _away(one, other, middle, shift, x, scale, dt_s) ** 2
+    return np.sqrt(square) - far
+
+
 @part
 def _least_apart(
     one: Motion,
     other: Motion,
     begin: int,
-    one_lands: int,
-    other_lands: int,
+    lands: int,
+    others_land: int,
+    error: StepError,
+    others: StepError,
     scale: F1,
     dt_s: float,
-    here: F1,
-    there: F1,
+    limit: float,
+    sides: F2,
 ) -> float:
-    """Least distance of two motions from a step on, of straight pieces [m].
+    """Bound from below of the distance of two motions from a step on, or `limit` if more [m].
 
     Args:
-        one_lands, other_lands: first step at which each vehicle may begin to land, or NEVER.
-        here, there: scratch; shape (axes,).
+        lands, others_land: first step at which each vehicle may begin to land, or NEVER.
+        error, others: of the steps of each.
+        limit: more than this is not told apart [m].
+        sides: scratch; shape (4, axes).
     """
-    longest = max(
-        len(one.position) * SPACING + one.first, len(other.position) * SPACING + other.first
-    )
-    pieces = max(-(-(longest - SPACING - begin) * SAMPLES // SPACING), 1)
-    nearest, height = np.inf, 0.0
-    # One piece more than they fly: in the end both may have landed that ever do.
-    for i in range(pieces + 2):
-        step = begin + i * (SPACING / SAMPLES)
-        one_down = _is_down(one_lands, step + SPACING / SAMPLES, i > pieces)
-        other_down = _is_down(other_lands, step + SPACING / SAMPLES, i > pieces)
+    piece_s = SPACING / SAMPLES * dt_s
+    one_last = one.first + (len(one.position) - 1) * SPACING
+    other_last = other.first + (len(other.position) - 1) * SPACING
+    drift = 2.0 * max(max(one_last, other_last) - begin, 0) / DRIFT
+    least, most = shifts(error, others, drift)
+    pieces = max(int(np.ceil((one_last - begin) * SAMPLES / SPACING)), 0)
+    mine, its = _extent(one, scale, dt_s), _extent(other, scale, dt_s)
+    fastest = (mine.speed + its.speed) * piece_s
+    any_lands = lands < NEVER or others_land < NEVER
+    nearest, i = limit, 0
+    while i < pieces + 2:
+        span = _span(other, begin, i, pieces, lands, others_land, least, most)
+        swept = its.speed * 0.5 * (span.most - span.least) * dt_s
+        far = nearest + 0.5 * fastest + swept + mine.bend + 2.0 * its.bend
+        spare = _spare(one, other, span, any_lands, far, scale, dt_s)
+        if spare <= 0.0:
+            nearest = min(nearest, _off(one, other, span, mine, its, scale, dt_s, sides))
+            i += 1
+            continue
+        # With each piece the middles come no nearer than by what both fly, and what is swept may
+        # grow by a piece: that is less than twice as much.
+        skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
+        i = max(i + 1, min(i + skipped, pieces))
+    return max(nearest, 0.0)
+
+
+@part
+def _off(
+    one: Motion,
+    other: Motion,
+    span: Span,
+    mine: Extent,
+    its: Extent,
+    scale: F1,
+    dt_s: float,
+    sides: F2,
+) -> float:
+    """Bound from below of the distance of two motions in a piece of time [m].
+
+    The shift of the other one goes in slices no longer than a piece. In one of them the difference
+    of the two motions is p + t a + s b + t s c for t and s from -1/2 to 1/2, where c is small: a
+    parallelogram, and |c| / 4 at most off that.
+    """
+    swept = span.most - span.least
+    slices = max(int(np.ceil(swept * SAMPLES / SPACING)), 1)
+    nearest = np.inf
+    for j in range(slices):
+        here, there = span.least + swept * j / slices, span.least + swept * (j + 1) / slices
         for x in range(len(scale)):
-            away = _place(one, x, step, dt_s) - _place(other, x, step, dt_s)
-            passes = False
+            p00 = _away(one, other, span.begin, here, x, scale, dt_s)
+            p10 = _away(one, other, span.end, here, x, scale, dt_s)
+            p01, p11 = p00, p10
+            if swept > 0.0:
+                p01 = _away(one, other, span.begin, there, x, scale, dt_s)
+                p11 = _away(one, other, span.end, there, x, scale, dt_s)
             if x == ALTITUDE:
-                # Who passes the height of the other in this piece may do so anywhere in it.
-                passes = (one_down or other_down) and height * away < 0.0
-                height = away
-                away = 0.0 if passes else _above(away, one_down, other_down)
-            here[x], there[x] = there[x] if i else scale[x] * away, scale[x] * away
-            if passes:
-                here[x] = 0.0
-        way, off = 0.0, 0.0
-        for x in range(len(scale)):
-            way += (there[x] - here[x]) ** 2
-            off -= here[x] * (there[x] - here[x])
-        # Nearest point of the straight piece from `here` to `there` to the origin, where the
-        # other one is.
-        t = min(max(off / way, 0.0), 1.0) if way > 0.0 else 0.0
-        square = 0.0
-        for x in range(len(scale)):
-            square += (here[x] + t * (there[x] - here[x])) ** 2
-        nearest = min(nearest, square)
-    return float(np.sqrt(nearest))
+                # Who may pass the height of the other in this piece may do so anywhere in it.
+                high, low = max(p00, p10, p01, p11), min(p00, p10, p01, p11)
+                if (span.down and high > 0.0) or (span.other_down and low < 0.0):
+                    p00, p10, p01, p11 = 0.0, 0.0, 0.0, 0.0
+            sides[0, x] = 0.25 * (p00 + p10 + p01 + p11)
+            sides[1, x] = 0.5 * (p10 + p11 - p00 - p01)
+            sides[2, x] = 0.5 * (p01 + p11 - p00 - p10)
+            sides[3, x] = p11 - p10 - p01 + p00
+        nearest = min(nearest, _off_parallelogram(sides))
+    return nearest - mine.bend - (2.0 if swept > 0.0 else 1.0) * its.bend
+
+
+@part
+def _off_parallelogram(sides: F2) -> float:
+    """Distance of 0 from all p + t a + s b + t s c, t and s from -1/2 to 1/2, or a little less.
+
+    Args:
+        sides: p, a, b and c; shape (4, axes).
+    """
+    pp, pa, pb, aa, bb, ab, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for x in range(sides.shape[1]):
+        p, a, b, c = sides[0, x], sides[1, x], sides[2, x], sides[3, x]
+        pp, pa, pb = pp + p * p, pa + p * a, pb + p * b
+        aa, bb, ab, cc = aa + a * a, bb + b * b, ab + a * b, cc + c * c
+    least, det = np.inf, aa * bb - ab * ab
+    if det > 1e-9 * aa * bb:
+        t, s = (ab * pb - bb * pa) / det, (ab * pa - aa * pb) / det
+        if abs(t) <= 0.5 and abs(s) <= 0.5:
+            least = pp + t * pa + s * pb
+    # Nearest points of the four sides.
+    for end in (-0.5, 0.5):
+        s = min(max(-(pb + end * ab) / bb, -0.5), 0.5) if bb > 0.0 else 0.0
+        square = pp + end * end * aa + s * s * bb + 2.0 * (end * pa + s * pb + end * s * ab)
+        least = min(least, square)
+        t = min(max(-(pa + end * ab) / aa, -0.5), 0.5) if aa > 0.0 else 0.0
+        square = pp + end * end * bb + t * t * aa + 2.0 * (end * pb + t * pa + end * t * ab)
+        least = min(least, square)
+    return np.sqrt(max(least, 0.0)) - 0.25 * np.sqrt(cc)
 
 
 @making_kernel
@@ -430,6 +667,7 @@ def _too_near(
     begin: int,
     row: int,
     lands: int,
+    error: StepError,
     flown: Flown,
     scale: F1,
     dt_s: float,
@@ -437,11 +675,11 @@ def _too_near(
     hit: B1,
 ) -> None:
     """Fill in `too_near`."""
-    scratch = np.empty((4, len(scale)))
-    bound(motion, lands, scale, dt_s, scratch[2], scratch[3])
+    scratch = np.empty((6, len(scale)))
+    bound(motion, lands, scale, dt_s, scratch[4], scratch[5])
     for m in range(len(hit) - 1):
         if flown.of[m] != row:
-            hit[m] = is_hit(motion, base, begin, lands, flown, m, scale, dt_s, keep, scratch)
+            hit[m] = is_hit(motion, base, begin, lands, error, flown, m, scale, dt_s, keep, scratch)
 
 
 @making_part
@@ -450,6 +688,7 @@ def is_hit(
     base: Motion,
     begin: int,
     lands: int,
+    error: StepError,
     flown: Flown,
     m: int,
     scale: F1,
@@ -461,18 +700,24 @@ def is_hit(
 
     Args:
         m: place of the latter.
-        scratch: its last two rows are the corners of a box around the motion [m]; shape (4, axes).
+        scratch: its last two rows are the corners of a box around the motion [m]; shape (6, axes).
     """
-    here, there, low, high = scratch[0], scratch[1], scratch[2], scratch[3]
-    keep_m = keep + flown.wide[m]
-    if _is_far(flown, m, low, high, keep_m):
+    keep_m, sides = keep + flown.wide[m], scratch[:4]
+    if _is_far(flown, m, scratch[4], scratch[5], keep_m):
         return False
     other, down = flown_one(flown, m), flown.lands[m]
-    least = _least_apart(motion, other, begin, lands, down, scale, dt_s, here, there)
+    steps = StepError(flown.early[m], flown.late[m])
+    least = _least_apart(
+        motion, other, begin, lands, down, error, steps, scale, dt_s, keep_m, sides
+    )
     if least >= keep_m:
         return False
-    held = _least_apart(base, other, begin, lands, down, scale, dt_s, here, there)
-    return least < held - NEARER_M
+    held = _least_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m, sides)
+    # One that keeps the distance may look nearer by what the bound allows for, which is another
+    # with pieces that begin elsewhere, and with the two exchanged. If that counted as nearer, they
+    # would come nearer by as much again and again.
+    bend = _extent(base, scale, dt_s).bend + _extent(other, scale, dt_s).bend
+    return held >= keep_m - NEARER_M - 4.0 * bend or least < held - NEARER_M
 
 
 @making_kernel
@@ -482,6 +727,7 @@ def _half_planes(
     reach: F1,
     row: int,
     lands: int,
+    error: StepError,
     flown: Flown,
     count: int,
     scale: F1,
@@ -490,8 +736,11 @@ def _half_planes(
     found: HalfPlanes,
 ) -> int:
     """Fill in `half_planes`; the number of them."""
-    n, axes = 0, len(scale)
-    place, off, low, high = np.empty((4, axes))
+    n, axes, final = 0, len(scale), len(times) - 1
+    low, high, off, at = np.empty((4, axes))
+    # Where the other one may be at a time: corners of its way then.
+    ways = np.empty(((KNOTS - 1) * SAMPLES + 4, axes))
+    drift = 2.0 * (times[final] - times[0]) / DRIFT
     for x in range(axes):
         low[x], high[x] = scale[x] * held[:, x].min(), scale[x] * held[:, x].max()
         if x == ALTITUDE and lands < NEVER:
@@ -501,29 +750,75 @@ def _half_planes(
         if flown.of[m] == row or _is_far(flown, m, low, high, keep + reach.max()):
             continue
         other = flown_one(flown, m)
+        least, most = shifts(error, StepError(flown.early[m], flown.late[m]), drift)
         for i in range(len(times)):
             # At the last time all are at rest, and in the end down that ever land.
-            down = _is_down(lands, times[i], i == len(times) - 1)
-            other_down = _is_down(flown.lands[m], times[i], i == len(times) - 1)
-            square = 0.0
-            for x in range(axes):
-                place[x] = _place(other, x, times[i], dt_s)
-                away = held[i, x] - place[x]
-                if x == ALTITUDE:
-                    away = _above(away, down, other_down)
-                off[x] = scale[x] * away
-                square += off[x] * off[x]
-            away = np.sqrt(square)
+            down = _is_down(lands, times[i]) or (i == final and lands < NEVER)
+            other_down = _is_down(flown.lands[m], times[i] + most)
+            other_down |= i == final and flown.lands[m] < NEVER
+            corners = _way(other, times[i], least, most, dt_s, ways)
+            away = _off_way(held[i], ways[:corners], down, other_down, scale, off, at)
             # Out of reach, the constraint could never be active; at the very same place it has no
             # direction.
             if away >= keep + reach[i] or away == 0.0:
                 continue
-            # Where two are too near already, the plane runs just behind the motion in force, which
-            # so remains a solution.
-            offset = min(keep, away - 1e-4)
+            own = 0.0
             for x in range(axes):
                 found.normal[n, x] = scale[x] * off[x] / away
-                offset += found.normal[n, x] * place[x]
-            found.at[n], found.least[n], found.of[n] = i, offset, m
+                own += found.normal[n, x] * held[i, x]
+            # Where two are too near already, the plane runs just behind the motion in force, which
+            # so remains a solution.
+            ahead = (ways[:corners] * found.normal[n]).sum(axis=1).max()
+            found.at[n], found.least[n], found.of[n] = i, min(ahead + keep, own - 1e-4), m
             n += 1
     return n
+
+
+@part
+def _way(other: Motion, step: float, least: float, most: float, dt_s: float, way: F2) -> int:
+    """Fill in corners of the way on which another vehicle may be at a step; their number.
+
+    Args:
+        least, most: steps by which it may be further on.
+        way: output [m]; shape (corners, axes).
+    """
+    first, last = sweep(other, step, step, least, most)
+    slices = int(np.ceil((last - first) * SAMPLES / SPACING))
+    for j in range(slices + 1):
+        shift = first + (last - first) * j / max(slices, 1)
+        for x in range(way.shape[1]):
+            way[j, x] = _place(other, x, step + shift, dt_s)
+    return slices + 1
+
+
+@part
+def _off_way(place: F1, way: F2, down: bool, other_down: bool, scale: F1, off: F1, at: F1) -> float:
+    """Distance of a place from the nearest point of a way, scaled [m].
+
+    Args:
+        place: shape (axes,).
+        way: its corners; shape (n, axes).
+        down, other_down: whether who is at the place, and who is on the way, may be landing.
+        off: output: from that point to the place, scaled [m]; shape (axes,).
+        at: scratch; shape (axes,).
+    """
+    nearest = np.inf
+    for j in range(max(len(way) - 1, 1)):
+        end = min(j + 1, len(way) - 1)
+        along, length = 0.0, 0.0
+        for x in range(len(scale)):
+            here, there = scale[x] * (place[x] - way[j, x]), scale[x] * (way[end, x] - way[j, x])
+            if x == ALTITUDE and _above(here, down, other_down) == 0.0:
+                continue
+            along, length = along + here * there, length + there * there
+        t = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
+        square = 0.0
+        for x in range(len(scale)):
+            away = place[x] - way[j, x] - t * (way[end, x] - way[j, x])
+            at[x] = scale[x] * (_above(away, down, other_down) if x == ALTITUDE else away)
+            square += at[x] * at[x]
+        if square < nearest:
+            nearest = square
+            for x in range(len(scale)):
+                off[x] = at[x]
+    return float(np.sqrt(nearest))

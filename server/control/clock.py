@@ -8,6 +8,14 @@ of the newest packet from here. Over the last 20 s
 
 vehicle's clock minus server's. Half of any asymmetry of the two smallest delays stays unknown: the
 offset is right to within the bound and no better. Step k begins at k Δt of the vehicle.
+
+Beside this estimate stand two bounds that no delay can make false. A delay is never negative, so
+the true offset O is at least -F and at most G at the time of each sample, and until another time
+changes by no more than DRIFT of what has passed:
+
+    max (-F - DRIFT age) ≤ O ≤ min (G + DRIFT age)
+
+over all samples, however old. They do not depend on the estimate, nor on what it is made of.
 """
 
 from typing import Annotated, NamedTuple
@@ -15,9 +23,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import I1, I2, I3, inline, kernel, part, record, records
+from skytether.shared.base.kernel import F1, I1, I2, I3, inline, kernel, part, record, records
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.law.model import Indices
+from skytether.shared.law.heartbeat import SESSION_NS
+from skytether.shared.law.model import Array, Indices
 
 BUCKET_NS = SECOND_NS // 2
 """Length of the half seconds for which minima are kept [ns]."""
@@ -32,6 +41,10 @@ STEP_SAMPLES = 5
 """Samples that recent and old minima need each before a clock may be said to have stepped."""
 STEP_NS = 40 * MILLISECOND_NS
 """Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
+
+DRIFT = 1000
+"""Time in which two clocks may come apart by one unit of it: 0.1 %, of two hosts whose clocks are
+slewed by 500 ppm each."""
 
 ECHOES = 4
 """Number of newest echoes that are kept of a vehicle: how long packets to it take just now."""
@@ -52,6 +65,27 @@ class VehicleClock:
     """Number of packets of ours that it has told G of."""
     adopted: int
     """Offset that is reckoned with, the vehicle's clock minus ours [ns], or UNSEEN."""
+    low: int
+    """Least that the true offset can be at `bounded` [ns]; -UNSEEN before the first sample."""
+    high: int
+    """Most that the true offset can be then [ns]; UNSEEN before the first sample."""
+    bounded: int
+    """Time of our clock at which these two hold; they widen before and after it [ns]."""
+    steps: int
+    """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
+
+
+class StepError(NamedTuple):
+    """Error of the step that the server counts for a vehicle, as far as its clock is known."""
+
+    early: float
+    """Largest number of steps by which the vehicle is ahead of the step that is counted."""
+    late: float
+    """Largest number of steps by which it is behind that."""
+
+
+EXACT = StepError(0.0, 0.0)
+"""Error of a step that is known."""
 
 
 VEHICLE_CLOCK = record(VehicleClock)
@@ -79,6 +113,10 @@ class ClockMap:
 
     def __init__(self, capacity: int, dt_ns: int) -> None:
         self._dt_ns = dt_ns
+        self.tick_ns = 0
+        """Time of our clock that steps were counted for last [ns]."""
+        self._lives: list[int | None] = [None] * capacity
+        """Number of the life of the vehicle in each row."""
         self.seen = Seen(
             vehicles=np.zeros(capacity, dtype=VEHICLE_CLOCK),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
@@ -88,11 +126,21 @@ class ClockMap:
         for row in range(capacity):
             self.forget(row)
 
-    def forget(self, row: int) -> None:
-        """Begin anew with a vehicle, or with a new life of it."""
+    def forget(self, row: int, life: int | None = None) -> None:
+        """Begin anew with a vehicle, or with a new session of it.
+
+        Args:
+            row: the vehicle.
+            life: number of its life, in all of which its step 0 is the same: bounds that were found
+                earlier in the same life stay true. None where it is not known.
+        """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
-        self.seen.vehicles[row] = (0, -1, 0, UNSEEN)
+        kept, steps = (-UNSEEN, UNSEEN, 0), int(self.seen.vehicles[row]["steps"])
+        if life is not None and life == self._lives[row]:
+            kept = tuple(self.seen.vehicles[row][["low", "high", "bounded"]].tolist())
+        self._lives[row] = life
+        self.seen.vehicles[row] = (0, -1, 0, UNSEEN, *kept, steps)
 
     def observe(
         self, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
@@ -102,26 +150,42 @@ class ClockMap:
         Args:
             heard: another number for each packet of ours that G is of.
         """
-        _observe(self.seen, row, forward_ns, backward_ns, heard, now_ns // BUCKET_NS)
+        _observe(self.seen, row, forward_ns, backward_ns, heard, now_ns)
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
         steps = rows.copy()  # room for them: less work than to make an array of a type
+        self.tick_ns = now_ns
         _steps(self.seen, rows, now_ns, self._dt_ns, steps)
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
         # Brings `adopted` up to date; the steps themselves are not needed.
-        self.steps(rows, 0)
+        _steps(self.seen, rows, 0, self._dt_ns, rows.copy())
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of times that a clock was found to have been set, if ever."""
+        steps = int(self.seen.vehicles["steps"].sum())
+        return {"clock_steps": steps} if steps else {}
+
+    def step_errors(self, rows: Indices, steps: Indices, early: Array, late: Array) -> None:
+        """Fill in the error of the steps that were counted for vehicles last, see `StepError`.
+
+        Args:
+            rows, steps: as given to and by `steps`; shape (n,).
+            early, late: written to at the rows; shape (capacity,).
+        """
+        _step_errors(self.seen, rows, steps, self.tick_ns, self._dt_ns, early, late)
+
     def bound_ns(self, row: int) -> int:
-        """Bound of the error of a vehicle's clock offset [ns]: `half_trip_ns`."""
-        # Not by that part: called from Python, what it calls would be compiled in flight.
-        forward, backward = self.seen.minimum[row].min(axis=1).tolist()
-        return (forward + backward) // 2
+        """Half of what the true offset of a vehicle's clock can lie apart, now [ns]."""
+        vehicle = self.seen.vehicles[row]
+        drift_ns = abs(self.tick_ns - int(vehicle["bounded"])) // DRIFT
+        return (int(vehicle["high"]) - int(vehicle["low"])) // 2 + drift_ns
 
 
 @inline
@@ -148,10 +212,45 @@ def shortest_ns(seen: Seen, row: int) -> int:
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
-@kernel
-def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, bucket: int) -> None:
-    """Take F and G [ns] of a vehicle into the half second `bucket`."""
+@part
+def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
+    """Least and most that the offset of a vehicle's clock can be at a time of ours [ns]."""
     vehicle = seen.vehicles[row]
+    apart = abs(now - vehicle.bounded) // DRIFT + 1
+    return vehicle.low - apart, vehicle.high + apart
+
+
+@part
+def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> None:
+    """Narrow the bounds of a vehicle's clock offset by F and G [ns].
+
+    Args:
+        is_new: whether G is of another echo than the one before.
+        now: our time [ns].
+    """
+    vehicle = seen.vehicles[row]
+    low, high = bounds_ns(seen, row, now)
+    # F is as old as the observation, which is no older than the round trip. Of an echo it is known
+    # that the observation before did not tell of it yet, and that of the first one the session has
+    # not ended since.
+    trip = max(forward + backward, 0) // DRIFT + 1
+    since = now - vehicle.bounded if vehicle.high < UNSEEN else SESSION_NS
+    low = max(low, -forward - trip)
+    if is_new:
+        high = min(high, backward + trip + max(since, 0) // DRIFT)
+    if low > high:
+        # Nothing earlier holds any more. By the round trip the newest sample may be one of less
+        # than nothing, of a clock that was set in between.
+        vehicle.steps += 1
+        low, high = min(-forward, backward) - trip, max(-forward, backward) + trip
+    vehicle.low, vehicle.high, vehicle.bounded = low, high, now
+
+
+@kernel
+def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, now: int) -> None:
+    """Take F and G [ns] of a vehicle, received at a time of our clock [ns]."""
+    vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
+    _bound(seen, row, forward, backward, heard != vehicle.heard, now)
     # The same echo told once more is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
@@ -218,3 +317,13 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
         if vehicle["adopted"] == UNSEEN or abs(estimate - vehicle["adopted"]) > dt // 2:
             vehicle["adopted"] = estimate
         steps[i] = (now + vehicle["adopted"]) // dt
+
+
+@kernel
+def _step_errors(seen: Seen, rows: I1, steps: I1, now: int, dt: int, early: F1, late: F1) -> None:
+    """Fill in `ClockMap.step_errors`."""
+    for i in range(len(rows)):
+        low, high = bounds_ns(seen, rows[i], now)
+        # Less the whole steps first: two times of years in nanoseconds have no digits left.
+        early[rows[i]] = (now + high - steps[i] * dt) / dt
+        late[rows[i]] = (steps[i] * dt - now - low) / dt

@@ -129,7 +129,7 @@ class Controller:
                 scenario,
                 terms,
                 block,
-                Roster(scenario, terms, room, block, references, self.desired.number),
+                Roster(scenario, terms, room, block, references, self.desired.number, clock),
             )
         elif terms.splines:
             self._scheme = self.planner = Guidance(
@@ -216,6 +216,10 @@ class Controller:
     def waits(self, row: int) -> str:
         """Reason in words why a vehicle of a mission waits; empty if it does not."""
         return self._together.waits(row) if self._together else ""
+
+    def clock_m(self, row: int) -> float | None:
+        """Distance by which a vehicle of a mission may be elsewhere for want of its clock [m]."""
+        return self._together.clock_m(row) if self._together else None
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

@@ -18,6 +18,7 @@ from skytether.server.control.apart import (
     state,
     write_down,
 )
+from skytether.server.control.clock import StepError
 from skytether.server.control.motionplan import AxisProblem, MotionPlan, Posing, flown_alone
 from skytether.shared.base.kernel import F1, F2, F3, I1, making_kernel
 from skytether.shared.law.model import Array, Indices
@@ -110,7 +111,7 @@ def _fly_direct(
         position, velocity: output: knots of each [m, m/s]; shape (n, knots, axes).
     """
     axes = goals.shape[1]
-    scratch = np.empty((4, axes))
+    scratch = np.empty((6, axes))
     for i in range(len(rows)):
         row, begin, total = rows[i], begins[i], count + i
         own = 0
@@ -131,11 +132,12 @@ def _fly_direct(
             return i
         motion = Motion(begin, position[i], velocity[i])
         lands, wide = flown.lands[own], flown.wide[own]
-        bound(motion, lands, scale, dt_s, scratch[2], scratch[3])
+        error = StepError(flown.early[own], flown.late[own])
+        bound(motion, lands, scale, dt_s, scratch[4], scratch[5])
         for m in range(total):
             if flown.of[m] != row and is_hit(
-                motion, base, begin, lands, flown, m, scale, dt_s, keep + wide, scratch
+                motion, base, begin, lands, error, flown, m, scale, dt_s, keep + wide, scratch
             ):
                 return i
-        write_down(flown, total, row, motion, 0, lands, wide, scale, dt_s)
+        write_down(flown, total, row, motion, 0, lands, wide, error, scale, dt_s)
     return len(rows)

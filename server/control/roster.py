@@ -11,8 +11,9 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from skytether.server.control.apart import NEVER, FlownMotions
+from skytether.server.control.clock import ClockMap, StepError
 from skytether.server.control.known import Known, Sent, repeats_after
-from skytether.shared.base.kernel import B1, I1, making_kernel
+from skytether.shared.base.kernel import B1, F1, I1, kernel
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
@@ -32,7 +33,7 @@ class VehicleRows(NamedTuple):
     """Numbers of all rows; each of shape (capacity,)."""
 
     ahead: I1
-    """Steps by which the vehicle is ahead of one on no grid of its own."""
+    """Steps by which the vehicle is ahead of the grid in common."""
     met: B1
     """Whether that is known."""
     heard: B1
@@ -49,6 +50,10 @@ class VehicleRows(NamedTuple):
     """Step of the motion that was sent last and is not acknowledged."""
     repeats_for: I1
     """Steps after that up to which it is sent once more, see `Known.repeats`."""
+    early: F1
+    """Error of the step that is counted for the vehicle, see `clock.StepError`."""
+    late: F1
+    """Error of the step the other way."""
 
     @classmethod
     def of(cls, capacity: int) -> Self:
@@ -57,9 +62,9 @@ class VehicleRows(NamedTuple):
         met, heard = np.zeros((2, capacity), dtype=np.bool_)
         observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
         lands = np.full(capacity, NEVER)
-        return cls(
-            ahead, met, heard, number, observed_step, lands, unknown_until, sent_step, repeats_for
-        )
+        early, late = np.zeros((2, capacity))
+        numbers = number, observed_step, lands, unknown_until, sent_step, repeats_for
+        return cls(ahead, met, heard, *numbers, early, late)
 
 
 class Roster:
@@ -72,6 +77,7 @@ class Roster:
         block: number of vehicles that are decided on at a time.
         references: where each vehicle wants to be, by its number.
         number_of: number of the vehicle in a row.
+        clock: step of each vehicle, and the error of that.
     """
 
     def __init__(
@@ -82,7 +88,9 @@ class Roster:
         block: int,
         references: Callable[[int], Reference],
         number_of: Callable[[int], int],
+        clock: ClockMap,
     ) -> None:
+        self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.left: list[tuple[int, float]] = []
         """Vehicles that have left their tube since this was emptied, and how far outside they were
@@ -103,14 +111,15 @@ class Roster:
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """Time constant and deceleration with which it comes to rest without a motion [s, m/s²]."""
         self.now = 0
-        """Step of a vehicle on no grid of its own."""
+        """Step on the grid in common: number of whole steps on the server's clock."""
         self.rows = VehicleRows.of(capacity)
         """Numbers of all rows."""
+        self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
         """Step of the newest observation; shape (capacity,)."""
-        self.looks, self._found, self._places = np.zeros((3, block), dtype=np.int64)
-        """Scratch of `meet`: what is to be done for each vehicle, DECIDES and REPEATS; steps by
-        which it is ahead; and the step of each that is known to be on the grid."""
+        self.looks, self._found = np.zeros((2, block), dtype=np.int64)
+        """Scratch of `meet`: what is to be done for each vehicle, DECIDES and REPEATS, and by how
+        many steps its place on the grid has changed."""
         scale = np.ones(terms.axes)
         scale[ALTITUDE:] = scenario.mission.height_scale
         self.flown = FlownMotions(scale, terms.dt_s)
@@ -132,13 +141,17 @@ class Roster:
             self.known[row].goal = None
 
     def ahead(self, row: int) -> int:
-        """Steps by which a vehicle is ahead of one on no grid of its own."""
+        """Steps by which a vehicle is ahead of the grid in common."""
         return int(self.rows.ahead[row])
 
     def lands(self, row: int) -> int:
         """First step in common at which a vehicle may begin to land, or NEVER."""
         lands = int(self.rows.lands[row])
         return lands if lands == NEVER else lands - self.ahead(row)
+
+    def error(self, row: int) -> StepError:
+        """Error of the step that is counted for a vehicle."""
+        return StepError(float(self.rows.early[row]), float(self.rows.late[row]))
 
     def sent(self, row: int, step: int, motion: Motion) -> None:
         """Take note of a motion that is sent with the packet of a step."""
@@ -237,9 +250,11 @@ class Roster:
     def meet(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
         n = len(rows)
-        self.now, moved, foreign = _meet(
-            rows, step, self.now, self.rows, self.looks, self._found, self._places
-        )
+        self.now = self._clock.tick_ns // self._dt_ns
+        moved, foreign = _meet(rows, step, self.now, self.rows, self.looks, self._found)
+        # Of all rows, for others keep apart from those that are silent too.
+        counted = self.now + self.rows.ahead
+        self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         if moved:
             self._changed.update(rows[self._found[:n] != 0].tolist())
         if self.decided:
@@ -256,6 +271,7 @@ class Roster:
             # All that may be flown, also those whose acknowledgement is still under way.
             self.flown.replace(row, each.motions(), self.ahead(row), self.lands(row), each.off_m)
         self._changed.clear()
+        self.flown.doubt(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
         """Goal of a vehicle at the present step [m]; shape (axes,)."""
@@ -273,38 +289,24 @@ class Roster:
         return found
 
 
-@making_kernel
+@kernel
 def _meet(
-    rows: I1,
-    step: I1,
-    now: int,
-    vehicles: VehicleRows,
-    looks: I1,
-    found: I1,
-    places: I1,
-) -> tuple[int, int, int]:
+    rows: I1, step: I1, now: int, vehicles: VehicleRows, looks: I1, found: I1
+) -> tuple[int, int]:
     """Bring vehicles onto one grid, and find what is to be done for each.
 
     Args:
         rows, step: the vehicles, and the step of each; shape (n,).
-        now: step on the grid before, of a vehicle on no grid of its own.
+        now: step on the grid.
         vehicles: numbers of all rows.
         looks: output: DECIDES, REPEATS, both or 0; shape (n,) at least.
         found: output: change of the place on the grid [steps]; shape (n,) at least.
-        places: scratch; shape (n,) at least.
 
     Returns:
-        the step on the grid now, the number of vehicles whose place on it has changed, and the row
-        of a vehicle that may still fly a motion of another server, or -1.
+        the number of vehicles whose place on the grid has changed, and the row of a vehicle that
+        may still fly a motion of another server, or -1.
     """
-    known, moved, foreign = 0, 0, -1
-    for i in range(len(rows)):
-        row = rows[i]
-        if vehicles.met[row]:
-            places[known] = step[i] - vehicles.ahead[row]
-            known += 1
-    # The median, for one vehicle that begins anew must not move the grid of all others.
-    now = np.sort(places[:known])[known // 2] if known else now + 1
+    moved, foreign = 0, -1
     for i in range(len(rows)):
         row = rows[i]
         found[i] = step[i] - now - vehicles.ahead[row]
@@ -322,4 +324,4 @@ def _meet(
             and vehicles.observed_step[row] <= vehicles.unknown_until[row]
         ):
             foreign = row
-    return now, moved, foreign
+    return moved, foreign

@@ -13,12 +13,12 @@ A new motion is sent only if at every time it keeps the distance
 
     D = separation_m + 2 tube_m
 
-from all motions of all other vehicles that may be flown, with `tube_m` for how far a vehicle is
-from its motion (wind, tracking, clocks); from one that was seen outside its tube, as much more as
-it was. Those were apart already. So whichever of them are taken,
-and whichever packets are lost, vehicles are `separation_m` apart, as long as each stays in its tube
-(docs/together.md has the theorem). From zones it keeps `tube_m`. The motion in force is always a
-way out: it needs no packet.
+from all that all other vehicles may fly, wherever on these motions they may be by what is known of
+their clocks, with `tube_m` for how far a vehicle is from its motion (wind, tracking); from one that
+was seen outside its tube, as much more as it was. Those were apart already. So whichever of them
+are taken, and whichever packets are lost or late, vehicles are `separation_m` apart, as long as
+each stays in its tube (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion
+in force is always a way out: it needs no packet.
 
 `roster` has what may be flown, `motionplan` the QP, `apart` the distances, `routes` the ways around
 zones, `aims` what a vehicle flies towards, and `aside` who steps aside for whom.
@@ -60,6 +60,8 @@ STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
 ZONE = "a zone"
 """Reason why a vehicle waits that a zone holds back."""
+CLOCK_POINTS = 33
+"""Number of steps that a vehicle may be at for which it is told how far it may be elsewhere."""
 BINDS_M = 1e-4
 """Distance from a half-plane up to which it holds a motion back [m]."""
 
@@ -99,8 +101,6 @@ class Together:
         self.observed_step = roster.observed_step
         mission = scenario.mission
         clear = self._clear = scenario.clearances
-        self._keep_m = clear.apart_m + 2.0 * clear.bend_m
-        """Distance that straight pieces of motions keep from each other [m]."""
         self._dt_s = terms.dt_s
         self._lead = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot from which on a motion differs from the one in force."""
@@ -122,7 +122,7 @@ class Together:
         self._scale[ALTITUDE:] = scenario.rest_scale
         """Factors of the coordinates before distances of vehicles at rest are taken; shape
         (axes,)."""
-        self._direct = Direct(self._plan, roster.flown, kept, self._keep_m, STUCK)
+        self._direct = Direct(self._plan, roster.flown, kept, clear.apart_m, STUCK)
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
@@ -207,7 +207,9 @@ class Together:
                 return f"{zone}, in which vehicle {number} is to begin, tube included"
         for row, known in self._roster.known.items():
             for motion in known.motions():
+                # The earliest step that the vehicle may be at.
                 k = self._roster.now + self._roster.ahead(row)
+                k -= max(math.ceil(self._roster.error(row).late), 0)
                 points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
                 if touches(zones, points, room_m):
                     zone = zones.in_the_way(points, room_m)
@@ -221,6 +223,21 @@ class Together:
     def waits(self, row: int) -> str:
         """Reason why a vehicle waits; empty if it does not."""
         return self._roster.known[row].waits if row in self._roster.known else ""
+
+    def clock_m(self, row: int) -> float | None:
+        """Distance by which a vehicle may now be elsewhere on its motion than where its step is
+        counted [m]; None of none.
+
+        Others keep as much further away from it, along its way.
+        """
+        known, error = self._roster.known.get(row), self._roster.error(row)
+        if known is None or known.in_force is None:
+            return None
+        motion, k = known.in_force.motion, self._roster.now + self._roster.ahead(row)
+        steps = np.linspace(k - error.late, k + error.early, CLOCK_POINTS)
+        steps = np.append(steps, float(k))
+        position, _ = motion.at(steps.clip(motion.first, motion.last), self._dt_s)
+        return float(np.linalg.norm(position - position[-1], axis=1).max())
 
     # -- what is decided ---------------------------------------------------------------------------
 
@@ -311,7 +328,8 @@ class Together:
             self.counts["stuck"] += 1
         else:
             ahead, lands = self._roster.ahead(row), self._roster.lands(row)
-            self._roster.flown.add(row, known.next, ahead, lands, known.off_m)
+            error = self._roster.error(row)
+            self._roster.flown.add(row, known.next, ahead, lands, known.off_m, error)
 
     def _way(self, row: int, goal: Array) -> Array:
         """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
@@ -408,6 +426,7 @@ class Together:
             self._roster.lands(row),
             self._roster.flown,
             self._clear.planned_apart_m + self._roster.known[row].off_m,
+            self._roster.error(row),
         )
         if not self._zones:
             return found
@@ -442,9 +461,10 @@ class Together:
         common, base = (
             each._replace(first=each.first - ahead) for each in (motion, known.in_force.motion)
         )
-        keep_m = self._keep_m + known.off_m
+        keep_m = self._clear.apart_m + known.off_m
         lands, flown = self._roster.lands(row), self._roster.flown
-        hit = apart.too_near(common, base, k - ahead, row, lands, flown, keep_m)
+        error = self._roster.error(row)
+        hit = apart.too_near(common, base, k - ahead, row, lands, flown, keep_m, error)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
             hit[-1] = touches(self._zones, points, self._clear.tube_m + self._clear.bend_m)

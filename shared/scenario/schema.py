@@ -287,7 +287,7 @@ class MissionConfig(Section, frozen=True):
     height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
     """Smallest distance of two that are one above the other [m], for downwash; 0: the same."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
-    """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking, clocks."""
+    """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking."""
     speed_mps: OfServer[Strength] = 0.0
     """Largest speed of a motion, over all axes [m/s]; 0: no bound but `model.u_max`."""
     acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6

@@ -57,6 +57,8 @@ class Drop(StrEnum):
     OBSERVATION = "observation"
     """The horizon was planned from an observation that there cannot be."""
     TOO_OLD = "too old"
+    TOO_EARLY = "too early"
+    """The motion of a mission begins at a step that is yet to come aboard."""
     TOO_LATE = "too late"
     NOT_TAKEN = "not taken"
 

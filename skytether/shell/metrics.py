@@ -172,8 +172,14 @@ _SERVER = (
         (*_VEHICLE, "clock_bound_ms"),
         "server_vehicle_clock_bound_seconds",
         "gauge",
-        "Largest possible error of the server's estimate of the vehicle's clock.",
+        "Half of the time that the vehicle's clock may lie apart, as far as the server knows.",
         MILLI,
+    ),
+    Metric(
+        (*_VEHICLE, "clock_m"),
+        "server_vehicle_clock_metres",
+        "gauge",
+        "Distance by which the vehicle may be elsewhere on its motion, for want of its clock.",
     ),
 )
 _NETEM = (

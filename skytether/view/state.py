@@ -520,6 +520,14 @@ class State:
         said = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
         return said if isinstance(said, str) else ""
 
+    def clock(self, number: int) -> tuple[float, float]:
+        """What is not known of the clock of a vehicle of a mission: half of the time that it may
+        lie apart [ms], and the distance by which the vehicle may be elsewhere for that [m]; NaN
+        where the server does not say.
+        """
+        figures = group(self.figures("server"), "by_vehicle", str(number))
+        return told(figures, "clock_bound_ms"), told(figures, "clock_m")
+
     def nearest_m(self, number: int, points: int = 1) -> Array:
         """Distance from a vehicle to the nearest other one in the last minute [m].
 

@@ -130,12 +130,14 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
         return []
     asked = f"at least {state.scenario.mission.separation_m:g} m"
     nearest = number(float(state.nearest_m(vehicle)[-1]), ".2f", " m")
+    bound_ms, clock_m = state.clock(vehicle)
     return [
         (
             "nearest other vehicle",
             f"{nearest}, {asked}",
         ),
         ("waits for", state.waits(vehicle) or "–"),
+        ("clock known to ±", f"{number(bound_ms, '.0f', ' ms')}, {number(clock_m, '.2f', ' m')}"),
     ]
 
 

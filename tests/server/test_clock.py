@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.server.control import clock as clocks
-from skytether.server.control.clock import ECHOES, ClockMap, shortest_ns
+from skytether.server.control.clock import ECHOES, ClockMap, half_trip_ns, shortest_ns
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 
@@ -53,7 +53,7 @@ def test_equal_delays_give_the_offset_exactly(offset_ns: int, delay_ns: int) -> 
     """To the nanosecond, from the first observation on, whatever the clocks show."""
     clock = ClockMap(1, DT_NS)
     assert observe(clock, 5 * S, offset_ns, down_ns=delay_ns, up_ns=delay_ns) == offset_ns
-    assert clock.bound_ns(0) == delay_ns
+    assert half_trip_ns(clock.seen, 0) == delay_ns
 
 
 @quick
@@ -63,7 +63,7 @@ def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -
     clock = ClockMap(1, DT_NS)
     error = observe(clock, 5 * S, HOUR, down_ns=down_ns, up_ns=up_ns) - HOUR
     assert error == (up_ns - down_ns) // 2
-    assert clock.bound_ns(0) == (up_ns + down_ns) // 2
+    assert half_trip_ns(clock.seen, 0) == (up_ns + down_ns) // 2
     assert abs(error) <= (up_ns + down_ns + 1) // 2
 
 
@@ -73,7 +73,7 @@ def test_smallest_delay_of_each_direction_counts() -> None:
     observe(clock, 0, HOUR, down_ns=400 * MS, up_ns=900 * MS)
     observe(clock, 1 * S, HOUR, down_ns=800 * MS, up_ns=400 * MS)
     assert clock.offset_ns(ROW).tolist() == [HOUR]
-    assert clock.bound_ns(0) == 400 * MS
+    assert half_trip_ns(clock.seen, 0) == 400 * MS
 
 
 def test_small_movements_do_not_change_the_offset() -> None:
@@ -92,9 +92,9 @@ def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, HOUR, down_ns=100 * MS, up_ns=300 * MS)
     listen(clock, times(0.5, 20), lambda _: HOUR)
-    assert clock.bound_ns(0) == 200 * MS
+    assert half_trip_ns(clock.seen, 0) == 200 * MS
     listen(clock, times(20, 20.5), lambda _: HOUR)
-    assert clock.bound_ns(0) == 400 * MS
+    assert half_trip_ns(clock.seen, 0) == 400 * MS
     assert clock.offset_ns(ROW).tolist() == [HOUR]
 
 
@@ -161,7 +161,7 @@ def test_slower_network_is_no_stepped_clock(down_ms: int, up_ms: int) -> None:
     listen(clock, times(0, 10), lambda _: 0)
     slower = {"down_ns": (400 + down_ms) * MS, "up_ns": (400 + up_ms) * MS}
     assert set(listen(clock, times(10, 14), lambda _: 0, **slower)) == {0}
-    assert clock.bound_ns(0) == 400 * MS
+    assert half_trip_ns(clock.seen, 0) == 400 * MS
 
 
 def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
@@ -176,7 +176,7 @@ def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
         down_ns=down_ns,
         up_ns=up_ns,
     )
-    return clock.bound_ns(0)
+    return half_trip_ns(clock.seen, 0)
 
 
 @pytest.mark.parametrize(("jump_ms", "bound_ms"), [(40, 380), (41, 400)])
@@ -185,7 +185,7 @@ def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> Non
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     listen(clock, times(10, 13), lambda _: jump_ms * MS)
-    assert clock.bound_ns(0) == bound_ms * MS
+    assert half_trip_ns(clock.seen, 0) == bound_ms * MS
 
 
 def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
@@ -234,7 +234,7 @@ def test_forgotten_vehicle_is_measured_anew() -> None:
     listen(clock, times(0, 10), lambda _: HOUR, down_ns=10 * MS, up_ns=10 * MS)
     clock.forget(0)
     assert observe(clock, 10 * S, -HOUR, down_ns=300 * MS, up_ns=300 * MS) == -HOUR
-    assert clock.bound_ns(0) == 300 * MS
+    assert half_trip_ns(clock.seen, 0) == 300 * MS
 
 
 def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
@@ -256,7 +256,7 @@ def test_vehicles_have_clocks_of_their_own() -> None:
         together = clock.offset_ns(rows)
     clock.forget(1)
     assert together.tolist() == [HOUR, -7 * HOUR, 5 * MS]
-    assert [clock.bound_ns(row) for row in (3, 0, 2)] == [250 * MS, 100 * MS, 200 * MS]
+    assert [half_trip_ns(clock.seen, row) for row in (3, 0, 2)] == [250 * MS, 100 * MS, 200 * MS]
 
 
 def shortest_ms(clock: ClockMap, row: int = 0) -> float:
@@ -275,7 +275,7 @@ def test_the_shortest_of_the_newest_echoes_tells_the_delay_of_now() -> None:
         known.append(shortest_ms(clock))
     assert known[:ECHOES] == [-1.0] * (ECHOES - 1) + [400.0]
     assert known[ECHOES:] == [400.0] * 5 + [700.0, 750.0, 750.0, 410.0, 410.0]
-    assert clock.bound_ns(0) == 400 * MS
+    assert half_trip_ns(clock.seen, 0) == 400 * MS
 
 
 def test_a_word_of_ours_that_is_echoed_again_is_no_new_echo() -> None:
@@ -302,5 +302,5 @@ def test_offset_is_right_to_half_a_step_on_the_papers_network(seed: int) -> None
         if rng.random() > 0.1:
             adopted = observe(clock, now, HOUR, down_ns=int(down_ns), up_ns=int(up_ns))
             errors.append(adopted - HOUR)
-            assert clock.bound_ns(0) >= 400 * MS
+            assert half_trip_ns(clock.seen, 0) >= 400 * MS
     assert max(np.abs(errors[20:])) < 25 * MS

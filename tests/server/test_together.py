@@ -248,7 +248,7 @@ def drawn(rng: np.random.Generator, knots: int, axes: int = 2) -> Motion:
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
     """Also those that boxes around them tell apart; near already, one need only come no nearer."""
     rng = np.random.default_rng(seed)
-    scale, keep_m = np.array([1.0, 0.7]), 1.5
+    scale, keep_m, off_m = np.array([1.0, 0.7]), 1.5, 0.02
     motion, base, *others = (drawn(rng, int(rng.integers(1, 17))) for _ in range(12))
     flown = FlownMotions(scale, DT_S)
     for row, other in enumerate(others):
@@ -257,18 +257,19 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
     flown.replace(3, [], 0, NEVER, 0.0)
 
     def least_m(one: Motion, other: Motion) -> float:
-        steps = apart.pieces_of(begin, max(one.last, other.last))
+        steps = np.arange(begin, max(one.last, other.last, begin) + 1.0, 0.25)
         away = scale * (one.at(steps, DT_S)[0] - other.at(steps, DT_S)[0])
-        along = np.diff(away, axis=0)
-        square = np.maximum((along**2).sum(axis=1), 1e-18)
-        t = np.clip(-(away[:-1] * along).sum(axis=1) / square, 0.0, 1.0)
-        return float(np.linalg.norm(away[:-1] + t[:, None] * along, axis=1).min())
+        return float(np.linalg.norm(away, axis=1).min())
 
     hit = apart.too_near(motion, base, begin, 1, NEVER, flown, keep_m)
     assert sorted(flown.of) == sorted([0, 1, 2, 4, 5, 6, 7, 8, 9] * 2)
     for row, is_hit in zip(flown.of, hit[:-1], strict=True):
         least, already = least_m(motion, others[row]), least_m(base, others[row])
-        assert is_hit == (row != 1 and least < min(keep_m + 0.1 * row, already - 1e-3))
+        keep = keep_m + 0.1 * row
+        if row == 1 or least > keep + off_m or (already < keep - off_m and least > already + off_m):
+            assert not is_hit
+        elif least < keep and (already > keep or least < already - off_m):
+            assert is_hit
 
 
 @given(st.integers(0, 2**31), st.integers(0, 150), st.integers(0, 150))
@@ -355,8 +356,16 @@ def alone() -> Together:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
-    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
     return Together(flown, flown.terms(), 2, roster)
+
+
+def exact(vehicles: int) -> ClockMap:
+    """Clocks that show what the server's does, for certain."""
+    clock = ClockMap(vehicles, round(DT_S * SECOND_NS))
+    for row in range(vehicles):
+        clock.observe(row, 0, 0, heard=1, now_ns=0)
+    return clock
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
@@ -395,10 +404,8 @@ def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> Non
 
 
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
-def test_a_motion_is_too_near_below_the_distance_and_what_pieces_bend(
-    beyond_m: float, is_hit: bool
-) -> None:
-    """D = separation_m + 2 tube_m, and twice what a motion may be off its straight pieces.
+def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) -> None:
+    """D = separation_m + 2 tube_m.
 
     From one that was outside its tube the distance is as much larger.
     """
@@ -408,8 +415,7 @@ def test_a_motion_is_too_near_below_the_distance_and_what_pieces_bend(
     made._roster.meet(np.arange(2), np.array([100, 100]))
     made._roster.known[1].off_m = 0.1
     made._roster.gather()
-    clear = flown.clearances
-    keep_m = clear.apart_m + 2.0 * clear.bend_m + 0.1
+    keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
     assert made._hit(0, near, 100).tolist() == [False, is_hit, False]
 
@@ -442,6 +448,16 @@ def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
     with pytest.raises(ProtocolError) as refused:
         Compensator(terms).offer(told, 101 + terms.join, 90)
     assert refused.value.reason is Drop.TOO_LATE
+
+
+def test_a_motion_is_not_taken_aboard_before_its_first_knot() -> None:
+    """It would be a leap: the motion in force has not come that far. A copy comes in time."""
+    aboard, knots = Compensator(scenario(2).terms()), np.zeros((2, 1, 2), np.float32)
+    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    with pytest.raises(ProtocolError) as refused:
+        aboard.offer(told, 99, 90)
+    assert refused.value.reason is Drop.TOO_EARLY
+    assert aboard.offer(told, 100, 90)
 
 
 def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
@@ -530,15 +546,14 @@ def test_a_link_that_is_cut_leaves_them_apart() -> None:
         assert separation_m(flown) > 0.5
 
 
-@pytest.mark.parametrize("steps", [2, -2, 25, -25])
-def test_clocks_that_are_wrong_are_within_the_tube_or_noticed(
+@pytest.mark.parametrize("steps", [5, -5, 25, -25])
+def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
     steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The theorem's fourth assumption, where the server mistakes the steps of half the vehicles.
+    """The server mistakes the steps of half the vehicles, and what is known of their clocks holds.
 
-    By 0.1 s, which the tube has room for, they keep apart and arrive. By more than `link.join_s` it
-    is seen: vehicles whose steps come too early leave their tubes, and those whose steps come too
-    late take no motion aboard, which is told as lost.
+    Miscounted by 0.25 s, they arrive. By more than `link.join_s` they take no motion aboard, for
+    each comes too early or too late, which is told as lost.
     """
     real = ClockMap.steps
 
@@ -548,15 +563,12 @@ def test_clocks_that_are_wrong_are_within_the_tube_or_noticed(
     monkeypatch.setattr(ClockMap, "steps", mistaken)
     flown = flight.fly(scenario(8, duration=30.0), vehicles=8)
     counts = flown.figures["server"]["counts"]
-    if abs(steps) == 2:
-        assert separation_m(flown) > 0.5
+    assert separation_m(flown) > 0.5
+    assert "left_tube" not in counts
+    if abs(steps) == 5:
         assert max(left_m(flown, 8)) < 0.3
-        assert "left_tube" not in counts
-    elif steps > 0:
-        assert counts["left_tube"] > 10
     else:
-        assert separation_m(flown) > 0.5
-        assert counts["horizons_lost"] > 100
+        assert counts["horizons_lost"] > 20
 
 
 @pytest.mark.long
@@ -1001,7 +1013,7 @@ def test_when_a_vehicle_may_begin_to_land(
     flown = reading.check(in_space(tmp_path, "1,0,0,0,2\n"), "hover")
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
-    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1)
+    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
     assert roster.lands(0) == NEVER
     state = np.zeros((3, 2))
     for k, does in ((400, before), (500, mode)):

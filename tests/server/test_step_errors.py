@@ -1,0 +1,376 @@
+"""Vehicles whose present steps the server cannot know: how far motions keep apart for that.
+
+A delay that is another one way than the other is an error of a vehicle's clock that nobody sees. So
+every motion is compared with all that another one may be at a time, and no delay brings two
+vehicles together.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skytether.netem.fate import Fates
+from skytether.netem.proxy import Proxy
+from skytether.server.control import apart
+from skytether.server.control.apart import NEVER, FlownMotions
+from skytether.server.control.clock import DRIFT, EXACT, ClockMap, StepError
+from skytether.shared.base.units import MILLISECOND_NS as MS
+from skytether.shared.base.units import SECOND_NS as S
+from skytether.shared.law.model import Array
+from skytether.shared.law.motion import SPACING, Motion, resting
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import least_separation
+from skytether.sim import flight
+
+DT_S, DT_NS = 0.05, 50 * MS
+SCALE = np.array([1.0, 0.7])
+
+errors = st.builds(
+    lambda late, width: StepError(width - late, late), st.floats(-20.0, 20.0), st.floats(0.0, 30.0)
+)
+"""Errors of steps; a vehicle may for certain be ahead of the step that is counted, or behind it."""
+
+
+def drawn(rng: np.random.Generator, axes: int = 2) -> Motion:
+    """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
+    T, knots = SPACING * DT_S, int(rng.integers(1, 17))
+    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, axes)), axis=0)
+    velocity[-1] = 0.0
+    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
+    position = rng.uniform(-4.0, 4.0, axes) + np.vstack([np.zeros((1, axes)), moved])
+    return Motion(int(rng.integers(10)) * SPACING, position, velocity)
+
+
+def least_m(
+    one: Motion, other: Motion, begin: int, mine: StepError, its: StepError, scale: Array = SCALE
+) -> float:
+    """Least distance over all steps and all errors of both, by trying them [m]."""
+    steps = np.arange(begin, max(one.last, other.last) + 80.0, 0.5)
+    here = one.at(steps, DT_S)[0]
+    shifts = np.append(
+        np.arange(-its.late - mine.early, its.early + mine.late, 0.5), its.early + mine.late
+    )
+    nearest = [
+        np.linalg.norm(scale * (here - other.at(steps + d, DT_S)[0]), axis=1).min() for d in shifts
+    ]
+    return float(min(nearest))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(0, 60), errors, errors, st.integers(2, 3))
+def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
+    seed: int, begin: int, mine: StepError, its: StepError, axes: int
+) -> None:
+    """What comes too near for any error of both is refused; little else is."""
+    rng, keep_m = np.random.default_rng(seed), 1.5
+    scale = np.array([1.0, 0.7, 0.5])[:axes]
+    motion, *others = (drawn(rng, axes) for _ in range(9))
+    flown, far = FlownMotions(scale, DT_S), resting(0, np.full(axes, 100.0))
+    for row, other in enumerate(others, start=1):
+        flown.add(row, other, 0, NEVER, 0.0, its)
+    hit = apart.too_near(motion, far, begin, 0, NEVER, flown, keep_m, mine)
+    for other, is_hit in zip(others, hit, strict=False):
+        least = least_m(motion, other, begin, mine, its, scale)
+        # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.
+        assert is_hit >= (least < keep_m)
+        assert is_hit <= (least < keep_m + 0.06)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), errors)
+def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
+    seed: int, error: StepError
+) -> None:
+    """And a motion at rest is where it is, however little is known of its clock."""
+    rng, keep_m = np.random.default_rng(seed), 1.5
+    one, other, far = drawn(rng), drawn(rng), resting(0, np.array([100.0, 0.0]))
+    there = resting(0, other.position[-1])
+    for second, mine, its in ((other, error, EXACT), (other, EXACT, error), (there, error, error)):
+        flown = FlownMotions(SCALE, DT_S)
+        flown.add(1, second, 0, NEVER, 0.0, its)
+        hit = apart.too_near(one, far, 0, 0, NEVER, flown, keep_m, mine)[0]
+        least = least_m(one, second, 0, mine, its)
+        assert (least < keep_m) <= hit <= (least < keep_m + 0.06)
+    flown = FlownMotions(SCALE, DT_S)
+    flown.add(1, there, 0, NEVER, 0.0, StepError(1e4, 1e4))
+    known = least_m(resting(0, one.position[-1]), there, 0, EXACT, EXACT)
+    hit = apart.too_near(resting(0, one.position[-1]), far, 0, 0, NEVER, flown, known - 1e-6)
+    assert not hit[0]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), errors, errors)
+def test_half_planes_are_in_front_of_all_that_another_may_be_at_a_time(
+    seed: int, mine: StepError, its: StepError
+) -> None:
+    """And the motion in force, which is the way out, is never behind one."""
+    rng, times, apart_m = np.random.default_rng(seed), np.arange(0.0, 121.0, 5.0), 0.9
+    other, base = drawn(rng), drawn(rng)
+    flown, held = FlownMotions(np.ones(2), DT_S), base.at(times, DT_S)[0]
+    flown.add(1, other, 0, NEVER, 0.0, its)
+    reach_m = np.full(len(times), 9.0)
+    found = apart.half_planes(times, held, reach_m, 0, NEVER, flown, apart_m, mine)
+    assert len(found.at) > 0
+    for at, normal, least in zip(found.at, found.normal, found.least, strict=True):
+        shifts = np.arange(-its.late - mine.early, its.early + mine.late, 0.25)
+        ways = other.at(times[at] + shifts, DT_S)[0] if len(shifts) else np.zeros((0, 2))
+        own = float(normal @ held[at])
+        assert own > least
+        furthest = float((ways @ normal).max(initial=-np.inf))
+        assert least > min(furthest + apart_m - 0.01, own - 1e-3)
+
+
+def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
+    """A vehicle that lands two seconds before it is counted to is below its motion then."""
+    above = resting(0, np.array([0.0, 0.0, 6.0]))
+    T = SPACING * DT_S
+    velocity = np.array([[0.0], *[[0.8]] * 9, [0.0]]) * np.array([1.0, 0.0, 0.0])
+    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
+    passes = Motion(0, np.array([-2.0, 0.0, 2.0]) + np.vstack([np.zeros((1, 3)), moved]), velocity)
+    far = resting(0, np.full(3, 100.0))
+    for error, is_hit in (
+        (EXACT, False),
+        (StepError(60.0, 0.0), True),
+        (StepError(0.0, 60.0), False),
+    ):
+        flown = FlownMotions(np.ones(3), DT_S)
+        flown.add(1, above, 0, 100, 0.0, error)
+        assert apart.too_near(passes, far, 0, 0, NEVER, flown, 0.9)[0] == is_hit
+
+
+def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> None:
+    """The bound of the motion in force is another one at another step: that is not too near yet."""
+    rng, far = np.random.default_rng(5), resting(0, np.array([100.0, 0.0]))
+    for _ in range(200):
+        base, other = drawn(rng), drawn(rng)
+        flown = FlownMotions(np.ones(2), DT_S)
+        flown.add(1, other, 0, NEVER, 0.0)
+        low, high = 0.0, 20.0
+        for _ in range(40):  # the largest distance that is kept
+            keep_m = 0.5 * (low + high)
+            is_hit = apart.too_near(base, far, 0, 0, NEVER, flown, keep_m)[0]
+            low, high = (low, keep_m) if is_hit else (keep_m, high)
+        nearer = base._replace(
+            position=base.position + 0.02 * np.sign(other.position[-1] - base.position[-1])
+        )
+        for begin in range(0, 10, 3):
+            least = least_m(nearer, other, begin, EXACT, EXACT, np.ones(2))
+            if least < low - 1e-3:
+                assert apart.too_near(nearer, base, begin, 0, NEVER, flown, low)[0]
+
+
+# -- what is known of a clock ----------------------------------------------------------------------
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.integers(0, 2**31),
+    st.integers(-(10**15), 10**15),
+    st.floats(-0.999e-3, 0.999e-3),
+    st.lists(st.tuples(st.floats(0.01, 4.0), st.floats(0.0, 3.0), st.floats(0.0, 3.0)), min_size=1),
+)
+def test_no_delay_makes_the_bounds_of_an_offset_false(
+    seed: int, offset_ns: int, drift: float, packets: list[tuple[float, float, float]]
+) -> None:
+    """Also with clocks that drift, echoes that are old, and sessions that begin anew."""
+    rng, known = np.random.default_rng(seed), ClockMap(1, DT_NS)
+    now_ns, rows = 1000 * S, np.array([0])
+    known.forget(0, 7)
+    early, late = np.zeros((2, 1))
+
+    def true_ns(at_ns: int) -> int:
+        return offset_ns + round(drift * (at_ns - 1000 * S))
+
+    came_ns, heard, backward_ns = now_ns, 0, 0
+    for after_s, down_s, up_s in packets:
+        sent_ns = now_ns + round(after_s * S)
+        if rng.random() < 0.7 or not heard:  # an echo came since the last observation
+            heard, came_ns = heard + 1, now_ns + round(rng.random() * (sent_ns - now_ns))
+            backward_ns = true_ns(came_ns) + round(up_s * S)
+        arrived_ns = sent_ns + round(down_s * S)
+        known.observe(
+            0, round(down_s * S) - true_ns(sent_ns), backward_ns, heard=heard, now_ns=arrived_ns
+        )
+        now_ns = arrived_ns
+        tick_ns = now_ns // DT_NS * DT_NS + DT_NS
+        steps = known.steps(rows, tick_ns)
+        known.step_errors(rows, steps, early, late)
+        step = (tick_ns + true_ns(tick_ns)) / DT_NS
+        assert -late[0] - 1e-6 <= step - steps[0] <= early[0] + 1e-6
+        assert known.seen.vehicles["steps"][0] == 0
+        if rng.random() < 0.1:
+            known.forget(0, 7)
+
+
+def test_a_bound_that_was_found_is_kept_but_for_the_drift_of_clocks() -> None:
+    """The estimate forgets after 20 s; a short delay that was met once counts for long."""
+    known, rows, width = ClockMap(1, DT_NS), np.array([0]), []
+    for at_s in range(100):
+        delay_ns = (10 if at_s == 3 else 400) * MS
+        known.observe(0, delay_ns, delay_ns, heard=at_s, now_ns=at_s * S)
+        early, late = np.zeros((2, 1))
+        known.step_errors(rows, known.steps(rows, at_s * S), early, late)
+        width.append(float(early[0] + late[0]) * DT_S)
+    assert width[2] == pytest.approx(0.8, abs=0.01)
+    assert width[3] == pytest.approx(0.02, abs=0.01)
+    assert width[99] == pytest.approx(0.02 + 2 * 96 / DRIFT, abs=0.01)
+
+
+def test_another_life_of_a_vehicle_has_another_clock() -> None:
+    """Another session of the same life has not."""
+    known, rows = ClockMap(1, DT_NS), np.array([0])
+    known.forget(0, 1)
+    known.observe(0, 10 * MS, 10 * MS, heard=0, now_ns=S)
+    for life, width_s in ((1, 0.02), (2, 0.8)):
+        known.forget(0, life)
+        known.observe(0, 400 * MS, 400 * MS, heard=1, now_ns=2 * S)
+        early, late = np.zeros((2, 1))
+        known.step_errors(rows, known.steps(rows, 2 * S), early, late)
+        assert float(early[0] + late[0]) * DT_S == pytest.approx(width_s, abs=0.04)
+
+
+def test_a_clock_that_was_set_is_noticed_and_known_anew() -> None:
+    """By less than a round trip it is not noticed: clocks that are set end the guarantee."""
+    known, rows = ClockMap(1, DT_NS), np.array([0])
+    for at_s in range(20):
+        offset_ns = 5 * S if at_s > 9 else 0
+        known.observe(0, 100 * MS - offset_ns, 100 * MS + offset_ns, heard=at_s, now_ns=at_s * S)
+    assert known.seen.vehicles["steps"][0] == 1
+    early, late = np.zeros((2, 1))
+    known.step_errors(rows, known.steps(rows, 19 * S), early, late)
+    assert float(early[0] + late[0]) * DT_S == pytest.approx(0.2, abs=0.01)
+
+
+def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the midst of a flight by where vehicles may be; at rest nothing, whatever is known."""
+    delay(monkeypatch, turns(0.05, 0.85))
+    for duration, at_least_m, at_most_m in ((7.0, 0.2, 0.7), (2.0, 0.0, 0.01)):
+        flown = flight.fly(mission("swap", "swap(2)", duration), vehicles=2)
+        told = flown.figures["server"]["by_vehicle"]["1"]
+        assert 440.0 < told["clock_bound_ms"] < 500.0
+        assert at_least_m <= told["clock_m"] <= at_most_m
+    assert "clock_steps" not in flown.figures["server"]["counts"]
+
+
+# -- flights over delays that differ ---------------------------------------------------------------
+
+Delays = Callable[[int], tuple[float, float]]
+"""Delay of a vehicle up and down [s], by the number of its flow."""
+
+
+def turns(up_s: float, down_s: float) -> Delays:
+    """Vehicles by turns with the one delay up and the other down, and the reverse."""
+    return lambda flow: (up_s, down_s) if flow % 2 else (down_s, up_s)
+
+
+def odd(up_s: float, down_s: float) -> Delays:
+    """One vehicle unlike all others."""
+    return lambda flow: (up_s, down_s) if flow == 3 else (down_s, up_s)
+
+
+def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
+    """Give each vehicle its own constant delays."""
+
+    def fates(_: Proxy, name: Literal["uplink", "downlink"], flow: int) -> Fates:
+        delay_s = delays(flow)[name == "downlink"]
+        return Fates(DirectionConfig(impairments=f"constant({delay_s})"), 1, name, flow)
+
+    monkeypatch.setattr(Proxy, "_fates", fates)
+
+
+def mission(name: str, shape: str = "", duration: float = 30.0) -> Scenario:
+    """A mission that comes with Skytether."""
+    table = reading.to_table(reading.load(name)) | {"duration": duration, "seed": 1}
+    if shape:
+        table["reference"]["shape"] = shape
+    return reading.check(table, name)
+
+
+def separation_m(flown: Record) -> float:
+    """Smallest distance between two vehicles [m]."""
+    told, rows = flown.figures["client"]["by_vehicle"], flown.client
+    numbers = np.unique(rows["vehicle"])
+    began_s = [told[str(number)]["began_s"] for number in numbers]
+    least = least_separation([rows[rows["vehicle"] == each] for each in numbers], began_s, DT_S)
+    assert least is not None
+    return least
+
+
+def left_m(flown: Record, scenario: Scenario) -> float:
+    """Largest distance of a vehicle from its goal at the end [m]."""
+    goals, rows = scenario.make_reference(), flown.client
+    assert isinstance(goals, Mission)
+    return max(
+        float(np.linalg.norm(each["state"][-1, :, 0] - goals.of(number)(np.array(1e3))[:, 0]))
+        for number in np.unique(rows["vehicle"])
+        for each in [rows[rows["vehicle"] == number]]
+    )
+
+
+SWAP = mission("swap", "swap(8)", 20.0)
+
+
+def test_delays_that_differ_do_not_bring_vehicles_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight that swap places came as near as 6 cm, with no packet lost and nobody out of a tube."""
+    delay(monkeypatch, turns(0.05, 0.85))
+    flown = flight.fly(SWAP, vehicles=8)
+    assert separation_m(flown) > 0.5
+    assert "left_tube" not in flown.figures["server"]["counts"]
+
+
+def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What the bounds of the clocks are for: without them the same flight ends badly."""
+    delay(monkeypatch, turns(0.05, 0.85))
+
+    monkeypatch.setattr(ClockMap, "step_errors", lambda *_: None)  # they stay 0
+    flown = flight.fly(SWAP, vehicles=8)
+    assert separation_m(flown) < 0.4
+    assert "left_tube" not in flown.figures["server"]["counts"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "shape", "delays"),
+    [
+        ("swap", "swap(8)", turns(0.05, 0.85)),
+        ("swap", "swap(8)", turns(0.05, 1.25)),
+        ("swap", "swap(8)", odd(0.05, 0.85)),
+        ("rings", "", turns(0.05, 0.65)),
+        ("corridor", "", turns(0.05, 0.85)),
+        ("warehouse", "", turns(0.05, 0.85)),
+    ],
+)
+def test_missions_over_delays_that_differ(
+    name: str, shape: str, delays: Delays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With each of these vehicles came nearer than asked for, as near as 5 cm; now they arrive."""
+    scenario = mission(name, shape, 60.0)
+    delay(monkeypatch, delays)
+    goals = scenario.make_reference()
+    assert isinstance(goals, Mission)
+    flown = flight.fly(scenario, vehicles=len(goals.vehicles))
+    assert separation_m(flown) >= scenario.mission.separation_m
+    assert "left_tube" not in flown.figures["server"]["counts"]
+    if name != "warehouse":  # where goals change until 150 s
+        assert left_m(flown, scenario) < 0.3
+
+
+@pytest.mark.long
+def test_the_flight_of_seed_9114_keeps_its_distance() -> None:
+    """Delays that stay for a minute, drawn: 0.132 m without bounds of the clocks."""
+    scenario = mission("swap", "swap(8)", 60.0)
+    table = reading.to_table(msgspec.structs.replace(scenario, seed=9114))
+    for way in ("uplink", "downlink"):
+        table["network"][way] = {"impairments": "uniform(0.05, 0.9, correlation_s=60)"}
+    flown = flight.fly(reading.check(table, "swap"), vehicles=8)
+    assert separation_m(flown) > 0.5
