@@ -521,7 +521,7 @@ class State:
         return said if isinstance(said, str) else ""
 
     def clock(self, number: int) -> tuple[float, float]:
-        """What is not known of the clock of a vehicle of a mission: half of the time that it may
+        """Uncertainty of the clock of a vehicle of a mission: half of the time that it may
         lie apart [ms], and the distance by which the vehicle may be elsewhere for that [m]; NaN
         where the server does not say.
         """

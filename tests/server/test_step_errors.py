@@ -89,7 +89,7 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
 def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     seed: int, error: StepError
 ) -> None:
-    """And a motion at rest is where it is, however little is known of its clock."""
+    """A motion at rest is where it is, however little is known of its clock."""
     rng, keep_m = np.random.default_rng(seed), 1.5
     one, other, far = drawn(rng), drawn(rng), resting(0, np.array([100.0, 0.0]))
     there = resting(0, other.position[-1])
@@ -111,7 +111,7 @@ def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
 def test_half_planes_are_in_front_of_all_that_another_may_be_at_a_time(
     seed: int, mine: StepError, its: StepError
 ) -> None:
-    """And the motion in force, which is the way out, is never behind one."""
+    """The motion in force, which is the way out, is never behind one."""
     rng, times, apart_m = np.random.default_rng(seed), np.arange(0.0, 121.0, 5.0), 0.9
     other, base = drawn(rng), drawn(rng)
     flown, held = FlownMotions(np.ones(2), DT_S), base.at(times, DT_S)[0]
