@@ -8,8 +8,11 @@ if __name__ == "__main__":  # before the imports below, which take a while
     sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated
 
@@ -19,17 +22,27 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.client.fleet import Fleet, apart_ns
 from skytether.client.link import ClientLink, PlainLink
+from skytether.client.memory import Kept, recall
+from skytether.client.vehicle import Frame, Vehicle
 from skytether.shared.core.aboard import ParametersUnsafe
-from skytether.shared.core.events import NoSession, SessionRefused
+from skytether.shared.core.events import (
+    Event,
+    NoSession,
+    NotRecalled,
+    Recalled,
+    SessionRefused,
+)
 from skytether.shared.core.line import parse_line
 from skytether.shared.core.steady import Steady
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys
+from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.log import LogFormat
+from skytether.shell.memory import MemoryFile, folder
 from skytether.shell.options import Argument
 
 
@@ -69,6 +82,9 @@ class ClientOptions:
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    new_flight: bool = False
+    """Begin a new flight: what an earlier run has kept in `vehicle.memory` does not count. A person
+    says so; the command of a service must not."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
     plugin: command.Plugins = ()
@@ -91,6 +107,7 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
     keyring = keys.load(options.keys) if options.keys else None
+    flying = [vehicles.make(scenario, number) for number in numbers]
 
     def link(number: int) -> ClientLink:
         if keyring is None:
@@ -100,8 +117,10 @@ def fly(argv: Sequence[str]) -> None:
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
+    warnings = command.flight_warnings(scenario)
     columns = client_columns(scenario.model.axes)
     with (
+        _memory(options, flying, keyring) as memory,
         (
             process.recorded(part, columns)
             if (part := process.part_of(options.record))
@@ -112,7 +131,7 @@ def fly(argv: Sequence[str]) -> None:
         ) as feed,
     ):
         recorder = process.recorder("client", columns, recording, feed)
-        flying = [vehicles.make(scenario, number) for number in numbers]
+        before = _before(memory, scenario, numbers[0], warnings) if memory else None
         if kernel := sys.modules.get("skytether.shared.base.kernel"):  # what flies has some
             terminal.prepare(kernel.missing())
             kernel.load()
@@ -132,6 +151,8 @@ def fly(argv: Sequence[str]) -> None:
                 boot_id=secrets.randbits(64),
                 link=link(number),
                 recorder=recorder,
+                keeps=memory is not None,
+                before=before,
             )
             for number, flies in zip(numbers, flying, strict=True)
         ]
@@ -154,7 +175,8 @@ def fly(argv: Sequence[str]) -> None:
             metrics=command.optional_address("--metrics", options.metrics),
             line=line,
             is_patient=True,
-            warnings=command.flight_warnings(scenario),
+            memory=memory,
+            warnings=warnings,
         )
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)
@@ -167,3 +189,54 @@ def fly(argv: Sequence[str]) -> None:
             refused = isinstance(failure, SessionRefused | NoSession | ParametersUnsafe)
             said = failure.brief if isinstance(failure, ParametersUnsafe) else str(failure)
             raise CommandError(said, command.CONFIGURATION if refused else command.RUN)
+
+
+@contextmanager
+def _memory(
+    options: ClientOptions, flying: Sequence[Vehicle], keyring: Keyring | None
+) -> Iterator[MemoryFile | None]:
+    """Memory of the vehicle; None where its scenario wants none.
+
+    Raises:
+        CommandError: it cannot be kept, or another process keeps it.
+    """
+    given, number = options.config.vehicle.memory, options.number
+    if given == "none" or (given == "auto" and flying[0].port is None):
+        yield None
+        return
+    if len(flying) > 1:
+        raise CommandError("vehicle.memory: got a folder, expected none with --vehicles", 2)
+    key = keyring.of(number, options.key_id) if keyring else None
+    identity = {
+        "vehicle": str(number),
+        "key": str(key.number) if key else "none",
+        "autopilot": options.config.vehicle.address,
+        "terms": blake2b(repr(options.config.terms()).encode(), digest_size=8).hexdigest(),
+    }
+    path = folder(given) / f"client-{number}"
+    try:
+        memory = MemoryFile(path, identity, key.mac if key else b"")
+        if options.new_flight:
+            memory.forget()
+    except OSError as error:
+        said = f"vehicle.memory: {error.strerror or error}"
+        raise CommandError(f"{said}; expected a folder of its own, or none", 2) from None
+    with closing(memory):
+        yield memory
+
+
+def _before(
+    memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
+) -> Kept | None:
+    """What an earlier life has kept, and what there is to say of it."""
+    try:
+        found = memory.read()
+        if found is None:
+            return None
+        before = recall(*found, time.monotonic_ns(), scenario.terms())
+    except ValueError as error:
+        warnings.append(NotRecalled(vehicle=number, reason=str(error)))
+        # It may have been armed: nothing is, before a person says so.
+        return Kept(frame=Frame(armed=True))
+    warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
+    return before

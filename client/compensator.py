@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.shared.law import rule, spline
 from skytether.shared.law.model import Array, advance
@@ -64,6 +65,8 @@ class Compensator:
         """The horizon on each axis; without one the input that was flown when it was dropped."""
         self.guides: list[Guide] = []
         """Spline on each axis; empty where inputs are held."""
+        self.knots = np.zeros((terms.axes, 0, 2), dtype=np.float32)
+        """Knots of the newest spline that was sent; shape (axes, knots, 2)."""
         self.feeds_back = False
         """Whether what is flown is told and feedback on top of that."""
         self.lead: list[tuple[float, float]] = []
@@ -133,20 +136,38 @@ class Compensator:
         is_late = bool(self._join) and step - horizon.step > self._join
         if is_late or self._comes_too_late(step - horizon.step, given - self._H, length):
             raise ProtocolError(Drop.TOO_LATE)
-        self.in_force = self.newest = horizon.step
-        self._new = True
-        self.observed = observed
-        self.begins = horizon.step
         if isinstance(horizon, Trajectory):
-            knots = horizon.knots.reshape(len(horizon.knots), -1).tolist()
-            self._guide(knots, horizon.spacing, length)
+            self.go_on_along(horizon.step, observed, horizon.spacing, horizon.knots)
             return True
+        self._put_in_force(horizon.step, observed)
         self._hold(
             horizon.inputs.tolist(),
             length,
             horizon.feedback.tolist() if horizon.feedback.size else (),
         )
         return True
+
+    def go_on_along(
+        self, made_for: int, observed: int, spacing: int, knots: NDArray[np.float32]
+    ) -> None:
+        """Fly along a spline from now on, be it one that an earlier life has accepted.
+
+        Args:
+            made_for: step of the first knot.
+            observed: step of the observation that it was planned from.
+            spacing: steps from one knot to the next.
+            knots: position [m] and velocity [m/s] of each; shape (axes, knots, 2).
+        """
+        self._put_in_force(made_for, observed)
+        self.knots = knots
+        length = lasting(self._age_max + self._H, made_for, observed, self._age_max)
+        self._guide(knots.reshape(len(knots), -1).tolist(), spacing, length)
+
+    def _put_in_force(self, made_for: int, observed: int) -> None:
+        """Let a horizon be in force from the step on that is chosen next."""
+        self.in_force = self.newest = self.begins = made_for
+        self._new = True
+        self.observed = observed
 
     def drop(self, step: int, flown_last: Array) -> None:
         """Drop the horizon; what was flown last is braked along, however often this is called.

@@ -9,8 +9,11 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
+
 from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.link import ClientLink, PlainLink
+from skytether.client.memory import FlownMotion, Kept, Memory
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
@@ -30,10 +33,12 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import CLOSES, Close, Mode
+from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode
 
 VEHICLE_SOCKET = 1
 """Number of the socket through which the vehicle's own port talks; the server's is 0."""
+ARMED = keys_of(InFlight.ARMED)
+"""Key with which a person says that plans may be flown."""
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which it is said again that the fence holds the vehicle back [ns]."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
@@ -52,6 +57,8 @@ class Client(Endpoint):
         link: how messages become datagrams.
         recorder: takes one row a step.
         pilot: class of what flies the vehicle.
+        keeps: whether what the next life must know is kept, see `client.memory`.
+        before: what the life before has kept; None of none.
     """
 
     def __init__(
@@ -65,13 +72,20 @@ class Client(Endpoint):
         link: ClientLink | None = None,
         recorder: Recorder | None = None,
         pilot: type[Pilot] = Pilot,
+        keeps: bool = False,
+        before: Kept | None = None,
     ) -> None:
         super().__init__()
         terms = scenario.terms()
+        self.keeps = keeps or before is not None
+        self._memory = Memory(terms, boot_id, before)
+        self._is_mission, self._axes = bool(terms.join), terms.axes
         self.vehicle, self._server = vehicle, server
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
-        self.changeable = flies.changeable | keys_of(InFlight.ARMED)
+        if before is not None:
+            flies.recall(before.frame)
+        self.changeable = flies.changeable | ARMED
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
@@ -83,7 +97,7 @@ class Client(Endpoint):
         self._session = ServerSession(
             terms,
             vehicle=vehicle,
-            boot_id=boot_id,
+            boot_id=self._memory.boot_id,
             server=server,
             connect_s=scenario.link.connect_s,
             link=link or PlainLink(),
@@ -147,6 +161,8 @@ class Client(Endpoint):
             horizon = self._session.hear(datagram.payload, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
+            elif self._failsafe.mode is Mode.INIT:  # it has gone on before there was a session
+                self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)
                 self.horizons += 1
@@ -154,11 +170,58 @@ class Client(Endpoint):
             self.dropped[error.reason] += 1
 
     def _begin(self, now_ns: int) -> None:
-        """Begin the flight once its first session is open and the vehicle can be flown."""
-        if self._session.number is not None and self._flies.take_off(now_ns=now_ns):
-            self._pilot.begin(now_ns=now_ns)
+        """Begin the flight once its first session is open and the vehicle can be flown.
+
+        '        A flight of an earlier life goes on at once, and the server is asked for a session
+                meanwhile: along the motion that was in force, or it hovers.
+        """
+        before, flies = self._memory.before, self._flies
+        if self._session.number is not None:
+            if not flies.take_off(now_ns=now_ns):
+                return
+        elif before.began_ns is None or not flies.is_up(now_ns=now_ns):
+            return
+        self._pilot.begin(now_ns=now_ns, began_ns=before.began_ns)
+        if before.began_ns is None or flies.took_off:
             self._events.append(Flying(vehicle=self.vehicle))
             self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
+            return
+        if motion := before.motion:
+            knots = motion.knots(self._axes)
+            self._pilot.compensator.go_on_along(motion.step, motion.observed, motion.spacing, knots)
+        cause = Reason.RESUMED if motion else Reason.LOST
+        self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
+
+    # -- what is kept ------------------------------------------------------------------------
+
+    def _to_keep(self) -> Kept:
+        """What the next life needs to know now."""
+        pilot, compensator = self._pilot, self._pilot.compensator
+        if pilot.next_ns is None:  # the flight of the life before may still go on
+            return msgspec.structs.replace(self._memory.before, frame=self._flies.frame)
+        motion = None
+        if self._is_mission and compensator.in_force != NO_HORIZON:
+            motion = FlownMotion(
+                step=compensator.in_force,
+                observed=compensator.observed,
+                spacing=compensator.guides[0].spacing,
+                numbers=compensator.knots.tobytes(),
+            )
+        return Kept(
+            boot_id=self._memory.boot_id,
+            began_ns=pilot.began_ns,
+            heard_ns=self._failsafe.heard_ns or pilot.began_ns,
+            motion=motion,
+            frame=self._flies.frame,
+        )
+
+    def keep(self, *, now_ns: int) -> bytes | None:
+        """See `Endpoint`."""
+        return self._memory.keep(self._to_keep(), now_ns=now_ns) if self.keeps else None
+
+    def kept(self) -> None:
+        """See `Endpoint`."""
+        self._memory.kept()
 
     def next_wake_ns(self) -> int | None:
         """Start of the next step, before the first the time of the next HELLO, or the port's."""
@@ -183,6 +246,8 @@ class Client(Endpoint):
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
                 self._port.wake(now_ns=now_ns)
+        if self._pilot.next_ns is None and self._memory.before.began_ns is not None:
+            self._begin(now_ns)
         due_ns = self._due_ns()
         if due_ns is not None and due_ns <= now_ns:
             if self._pilot.next_ns is not None:
@@ -211,6 +276,10 @@ class Client(Endpoint):
             self._events.append(FenceHolds(vehicle=self.vehicle))
         if pilot.step >= pilot.steps:
             self._end(now_ns)
+        # Nothing is told before it is kept: the server would forget a motion that the next life
+        # flies.
+        if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
+            return
         observation = pilot.observation(session)
         if observation is not None:
             session.send(observation)
@@ -227,9 +296,15 @@ class Client(Endpoint):
             self._not_flown = NotFlown(vehicle=vehicle, covered=covered, steps=pilot.steps, why=why)
             self._events.append(self._not_flown)
 
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """See `Endpoint`."""
+        return self._flies.objection(scenario, keys)
+
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         """See `Endpoint`."""
         self._failsafe.armed = scenario.armed
+        if keys & ARMED and scenario.armed:
+            self._flies.arm()
         if keys & self._flies.changeable:
             self._flies.change(scenario)
 

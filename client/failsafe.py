@@ -83,6 +83,8 @@ _YIELDS = {
 TABLE: Table = MappingProxyType(
     {
         (Mode.INIT, Reason.OPENED): Mode.SYNC,
+        (Mode.INIT, Reason.RESUMED): Mode.TRACK,
+        (Mode.INIT, Reason.LOST): Mode.HOVER,
         (Mode.SYNC, Reason.GOOD): Mode.READY,
         (Mode.READY, Reason.UNARMED): Mode.READY,
         (Mode.READY, Reason.GOOD): Mode.READY,
@@ -194,6 +196,11 @@ class Failsafe:
         """Times of the newest horizons for impossible times."""
 
     @property
+    def heard_ns(self) -> int | None:
+        """Time of the newest packet of the session; None without a session."""
+        return self._heard_ns
+
+    @property
     def takes(self) -> bool:
         """Whether a horizon that comes now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
@@ -240,6 +247,17 @@ class Failsafe:
         if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns
+
+    def resume(self, cause: Reason, *, heard_ns: int, now_ns: int) -> None:
+        """Go on with the flight of an earlier life.
+
+        Args:
+            cause: RESUMED along its motion, LOST without one.
+            heard_ns: time at which that life has heard the server.
+            now_ns: time now.
+        """
+        self._heard_ns = self._good_ns = self._horizon_ns = heard_ns
+        self.meet(cause, now_ns=now_ns)
 
     def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
         """Note a horizon newer than those before, whether or not it is taken.

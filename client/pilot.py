@@ -129,10 +129,20 @@ class Pilot:
         assert self._epoch_ns is not None
         return self._epoch_ns + step * self._dt_ns
 
-    def begin(self, *, now_ns: int) -> None:
-        """Begin the flight: step 0 is now."""
-        self._epoch_ns = self.next_ns = now_ns
-        self._navigate(0)
+    def begin(self, *, now_ns: int, began_ns: int | None = None) -> None:
+        """Begin the flight, or go on with that of an earlier life.
+
+        Args:
+            now_ns: time now.
+            began_ns: begin of step 0; None for now.
+        """
+        if began_ns is None:
+            self._epoch_ns = self.next_ns = now_ns
+            self._navigate(0)
+            return
+        self._epoch_ns = began_ns
+        self.step = self._covered_last = -(-(now_ns - began_ns) // self._dt_ns)
+        self.flown, self.next_ns = self.step - 1, self.starts_ns(self.step)
 
     # -- horizons ----------------------------------------------------------------------------
 
@@ -316,10 +326,11 @@ class Pilot:
         Args:
             session: session that it is sent in.
         """
-        assert session.number is not None
         failsafe, compensator = self._failsafe, self.compensator
         states, flown = self._navigation.predicted, self._input.tolist()
-        if not self._navigation.is_known or not self._reporter.is_due(
+        if session.number is None or not self._navigation.is_known:
+            return None
+        if not self._reporter.is_due(
             session.number,
             self.flown,
             failsafe.mode,

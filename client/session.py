@@ -250,7 +250,9 @@ class ServerSession:
 
     def ask(self, *, now_ns: int) -> None:
         """Say HELLO where nobody is heard, or where the link needs new keys."""
-        wanted = self._failsafe.is_lost(now_ns) or self.link.wants_hello(now_ns)
+        # A motion of an earlier life is flown before there is a session.
+        silent = self.number is None or self._failsafe.is_lost(now_ns)
+        wanted = silent or self.link.wants_hello(now_ns)
         if wanted and now_ns >= self.hello_ns:
             unheard = self.number is None and self._refusal is None
             self.hello_ns = now_ns + (self.link.hello_ns if unheard else AGAIN_NS)

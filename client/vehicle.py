@@ -8,7 +8,9 @@ time. `client.vehicles` has the table of all.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+import msgspec
 
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
@@ -26,6 +28,24 @@ class Measurement(NamedTuple):
     """Position on each axis [m]; None where it was not measured."""
     velocity: list[float] | None
     """Velocity on each axis [m/s]; None where it was not measured."""
+
+
+Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+"""Coordinate of an origin that is believed [m]."""
+
+
+class Frame(msgspec.Struct, frozen=True, kw_only=True):
+    """What a vehicle keeps for the next life of its client, see `client.memory`."""
+
+    armed: bool = False
+    """Whether a client has armed it since a person last said that it may be armed."""
+    origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None where it
+    is not known."""
+    boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
+    """Time since the autopilot's boot at which that was so last [ms]."""
+    at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
+    """The same time by the clock of the host [ns]; as bytes, relative to that of writing."""
 
 
 class Vehicle(ABC):
@@ -67,6 +87,15 @@ class Vehicle(ABC):
         """Whether the vehicle can be flown by velocities; asked until it can, it sees to that."""
         return True
 
+    def is_up(self, *, now_ns: int) -> bool:  # noqa: ARG002 - most fly from the start
+        """Whether the vehicle is in the air, and can be flown by velocities; it is not armed."""
+        return True
+
+    @property
+    def took_off(self) -> bool:
+        """Whether it has taken off since its client began: no earlier motion of it goes on."""
+        return False
+
     def hindrance(self, *, now_ns: int) -> Reason | None:  # noqa: ARG002 - most know of none
         """Cause on the vehicle's side for which it must not follow a plan now, if there is any."""
         return None
@@ -79,6 +108,21 @@ class Vehicle(ABC):
     def is_down(self) -> bool:
         """Whether the vehicle needs no more care after its flight."""
         return True
+
+    @property
+    def frame(self) -> Frame:
+        """What the next life of its client needs to know of it."""
+        return Frame()
+
+    def recall(self, frame: Frame) -> None:  # noqa: B027 - most keep nothing
+        """Take what an earlier life of the client has kept; before anything else, if at all."""
+
+    def arm(self) -> None:  # noqa: B027 - most need not be armed
+        """Take a person's word that the vehicle may be armed, given in flight."""
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
+        """Why a change of `changeable` keys is refused; empty where it is not."""
+        return ""
 
     def truth(self) -> Array | None:
         """True position [m] and velocity [m/s] now, shape (axes, 2); None where nobody knows."""

@@ -14,6 +14,7 @@ from skytether.autopilot.faults import parse as parse_fault
 from skytether.autopilot.flavours import FlavourName
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
+from skytether.client.memory import Kept, recall
 from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
@@ -171,26 +172,52 @@ class Air:
         self.tap = Tap(self.autopilot)
         self.events: list[tuple[int, str, Event]] = []
         self.world = World(lambda time_ns, host, event: self.events.append((time_ns, host, event)))
-        self._sink = io.BytesIO()
+        self._sink, self.lives = io.BytesIO(), 0
         columns = client_columns(self.scenario.model.axes)
         flies = vehicles.make(self.scenario, 1)
         if sets:
             assert flies.set_parameters()
         self.flies: Any = flies
-        self.client = Client(
-            self.scenario,
-            flies,
-            server=("netem", 0),
-            vehicle=1,
-            boot_id=2**60,
-            recorder=Recorder(columns, self._sink),
-        )
+        self._recorder = Recorder(columns, self._sink)
+        self.client = self._client(0, None)
         clock = Clock(OFFSET_NS, round(1000 * drift_ppm))
         self.world.add(host, self.tap, clock=Clock(0, round(1000 * autopilot_ppm)))
         self.world.add("netem", Proxy(self.scenario, server=("server", 0), flows=1))
         self.world.add("client", self.client, clock=clock)
         server = Server(self.scenario, boot_id=2**60, entropy=bytes)
         self.world.add("server", server, clock=Clock(OFFSET_NS))
+
+    def _client(self, life: int, before: Kept | None) -> Client:
+        return Client(
+            self.scenario,
+            self.flies,
+            server=("netem", 0),
+            vehicle=1,
+            boot_id=2**60 + life,
+            recorder=self._recorder,
+            keeps=True,
+            before=before,
+        )
+
+    def restart(self, down_s: float = 1.0, *, remembers: bool = True, **table: Any) -> None:
+        """Let the client's process die, and start again after a while.
+
+        Args:
+            down_s: time until then [s].
+            remembers: whether it finds what the life before has kept.
+            table: keys of the scenario that are others then.
+        """
+        self.world.stop("client")
+        self.run(down_s)
+        if table:
+            self.scenario = scenario(**table)
+        self.flies, before, self.lives = vehicles.make(self.scenario, 1), None, self.lives + 1
+        kept = self.world.memory("client")
+        if remembers and kept:
+            now_ns = OFFSET_NS + self.world.now_ns
+            before = recall(*kept, now_ns, self.scenario.terms())
+        self.client = self._client(self.lives, before)
+        self.world.restart("client", self.client)
 
     @property
     def flight(self) -> Any:

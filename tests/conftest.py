@@ -1,7 +1,9 @@
 """Requirements of the tests on the machine."""
 
+import atexit
 import fcntl
 import os
+import shutil
 import signal
 import socket
 import tempfile
@@ -36,6 +38,10 @@ kernel.check_types()
 os.environ.setdefault("SKYTETHER_PAGE", "none")
 # Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What a client keeps for its next life is not found by that of another test.
+_STATES = tempfile.mkdtemp(prefix="skytether-states-")
+atexit.register(shutil.rmtree, _STATES, ignore_errors=True)
+os.environ["XDG_STATE_HOME"] = _STATES
 
 
 @cache
@@ -50,6 +56,12 @@ def has_ipv6() -> bool:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Give each test a state folder of its own, and skip those that this machine cannot run."""
+    os.environ["XDG_STATE_HOME"] = str(Path(_STATES) / f"{abs(hash(item.nodeid))}")
+    _skip_without_ipv6(item)
+
+
+def _skip_without_ipv6(item: pytest.Item) -> None:
     """Skip what needs IPv6 where there is none."""
     if item.get_closest_marker("ipv6") and not has_ipv6():
         pytest.skip("this machine has no IPv6")

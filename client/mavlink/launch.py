@@ -5,6 +5,10 @@
 A step is done when the autopilot's own state says so, and its command is repeated until then. We
 arm only what stands on the ground and whose scenario is armed, and leave a mode of a pilot to him:
 once the vehicle is armed, its mode is never changed but from one of ours.
+
+What an earlier life of the client has armed, or somebody else, is not armed again before a person
+says so: a process that is started again after a landing must not take off. And a vehicle that is in
+the air while nobody knows where the scenario's origin is hovers until somebody says that.
 """
 
 from enum import Enum, auto
@@ -15,7 +19,12 @@ from skytether.client.mavlink.positions import Positions
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.aboard import AutopilotRefused, NotTakenOff
+from skytether.shared.core.aboard import (
+    ArmingAwaited,
+    AutopilotRefused,
+    NotTakenOff,
+    OriginAwaited,
+)
 from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = SECOND_NS
@@ -103,6 +112,15 @@ class Launch:
         """Time at which its command was sent last."""
         self._accepted = False
         """Whether the take-off was accepted."""
+        self.waits_for_word = ""
+        """Why it is not armed before a person says that it may be; empty where it is."""
+        self._asks_for_word = False
+        """Whether the operator was told so."""
+        self._hovers_ns: int | None = None
+        """Time since which it hovers until somebody says where the origin is; None while it does
+        not."""
+        self.took_off = False
+        """Whether it was armed in this life of the client."""
         self._closed = False
         """Whether nothing is to begin any more."""
         self._words = ""
@@ -151,19 +169,52 @@ class Launch:
         elif not self._is_placed(now_ns):
             self._wait("not ready", "it does not tell where it is", now_ns)
         elif condition.is_flying and condition.mode == flavour.guided:
-            self._enter(Phase.FLYING, now_ns)
+            self._go_on(now_ns)
         elif condition.armed and condition.is_airborne:
+            self.waits_for_word = "it was in the air when this client began"
             expected = f"expected it on the ground, or in {guided}"
             self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
         elif condition.armed and condition.mode not in flavour.own:
+            self.waits_for_word = "it was armed by somebody else"
             expected = f"expected it disarmed, or in {guided}"
             self._wait("not flown", f"it was armed by somebody else in {mode}; {expected}", now_ns)
         elif may_arm and condition.battery_is_weak:
             self._wait("not armed", "its battery is low, see mavlink.battery_min", now_ns)
+        elif may_arm and self.waits_for_word:
+            self._ask_for_word()
         elif may_arm:
+            self.took_off = True
             self._enter(Phase.CLIMBING, now_ns)
         else:
             self._since_ns = None
+
+    def _go_on(self, now_ns: int) -> None:
+        """Fly a vehicle on that is in the air, or let it hover until its origin is known."""
+        if self._positions.has_origin:
+            self._hovers_ns = None
+            self._enter(Phase.FLYING, now_ns)
+        elif self._hovers_ns is None:
+            self._hovers_ns = now_ns
+            place = self._positions.position
+            assert place is not None
+            self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
+        elif now_ns - self._hovers_ns > self._patience_ns:
+            waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
+            self._enter(Phase.FLYING, now_ns)  # it is ours, and lands
+            self._fail(waited, "nobody has said where its origin is, see mavlink.origin", now_ns)
+
+    def _ask_for_word(self) -> None:
+        """Say once that a person has to say that the vehicle may be armed."""
+        self._since_ns = None
+        if not self._asks_for_word:
+            self._asks_for_word = True
+            self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.waits_for_word))
+
+    def arm(self) -> None:
+        """Take a person's word that the vehicle may be armed; it counts on the ground alone."""
+        condition = self._condition
+        if self.phase is Phase.GROUND and not (condition.armed or condition.is_airborne):
+            self.waits_for_word, self._asks_for_word = "", False
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase = phase
@@ -234,7 +285,11 @@ class Launch:
 
     @property
     def streams_zeros(self) -> bool:
-        """Whether setpoints of zero have to run, for the next mode needs a stream of them."""
+        """Whether setpoints of zero have to run: the next mode needs a stream of them, or it
+        hovers.
+        """
+        if self.phase is Phase.GROUND and self._hovers_ns is not None:
+            return self._condition.mode == self._flavour.guided
         if self.phase is not Phase.CLIMBING or not self._flavour.streams_first:
             return False
         return self._flavour.steps[self._step] is LaunchStep.GUIDE

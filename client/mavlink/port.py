@@ -15,6 +15,7 @@ from skytether.client.mavlink.launch import Launch, Phase
 from skytether.client.mavlink.positions import Positions, Vector
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
+from skytether.client.vehicle import Frame
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
@@ -36,7 +37,7 @@ TICK_NS = 100 * MILLISECOND_NS
 """Time between two looks at what is due beside setpoints [ns]."""
 HEARTBEAT_NS = SECOND_NS
 """Time between two heartbeats of ours [ns]."""
-CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, SECOND_NS
+CLOCK_BEGIN_NS, CLOCK_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Time between two questions for the autopilot's clock [ns]: before it is known, and then."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
@@ -77,6 +78,18 @@ def _start(scenario: Scenario, vehicle: int) -> Vector:
     return x, y, 0.0
 
 
+def given_origin(scenario: Scenario) -> Vector | None:
+    """Origin that a scenario states, in our axes [m]; None of one that is where it takes off."""
+    match scenario.mavlink.origin:
+        case "takeoff":
+            return None
+        case "autopilot":
+            return 0.0, 0.0, 0.0
+        case (x, y, *up):
+            return float(x), float(y), float(up[0]) if up else 0.0
+    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused it
+
+
 class Port(Endpoint):
     """Line to one autopilot.
 
@@ -96,7 +109,10 @@ class Port(Endpoint):
         self._clock = BootClock()
         self._condition = Condition(keys.battery_min, keys.battery_min_v)
         self.positions = Positions(
-            scenario.model.axes, self._clock, start=_start(scenario, vehicle)
+            scenario.model.axes,
+            self._clock,
+            start=_start(scenario, vehicle),
+            origin=given_origin(scenario),
         )
         """Measurements."""
         self._texts = Texts()
@@ -127,6 +143,8 @@ class Port(Endpoint):
         each = scenario.dt_ns
         parts = -(-each * keys.setpoints_hz // SECOND_NS)
         self._repeat_ns = round(LATE * each / parts)
+        self._was_armed = False
+        """Whether a life of the client has armed it since a person last said that it may be."""
         self._was_disarmed = False
         """Whether it was disarmed since it flew: it is not flown again."""
 
@@ -152,9 +170,34 @@ class Port(Endpoint):
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
         """Go on with the take-off, see `Launch`."""
         self.now_ns = now_ns
-        if self._launch is None or not self.is_ready or self.failure:
+        # Where an earlier life has flown it since this boot, its parameters were safe.
+        may_fly = self.is_ready or self.positions.is_recalled
+        if self._launch is None or not may_fly or self.failure:
             return False
-        return self._launch.take_off(may_arm=may_arm, now_ns=now_ns)
+        return self._launch.take_off(may_arm=may_arm and self.is_ready, now_ns=now_ns)
+
+    @property
+    def took_off(self) -> bool:
+        """Whether it was armed in this life of the client."""
+        return self._launch is not None and self._launch.took_off
+
+    def recall(self, frame: Frame) -> None:
+        """Take what an earlier life of the client has kept."""
+        self._was_armed = frame.armed
+        self.positions.recall(frame)
+
+    @property
+    def frame(self) -> Frame:
+        """What the next life of the client needs to know."""
+        return self.positions.frame(armed=self._was_armed or self.took_off)
+
+    def arm(self) -> None:
+        """Take a person's word that the vehicle may be armed."""
+        if self._launch is None:
+            self._was_armed = False
+            return
+        self._launch.arm()
+        self._was_armed = self._was_armed and bool(self._launch.waits_for_word)
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
         """Cause for which the vehicle must not follow a plan now."""
@@ -240,6 +283,8 @@ class Port(Endpoint):
             positions=self.positions,
             events=self._events,
         )
+        if self._was_armed:
+            self._launch.waits_for_word = "an earlier run of its client has armed it"
         estimate = (
             dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
             if flavour is ARDUPILOT

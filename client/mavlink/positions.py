@@ -4,7 +4,7 @@ import math
 from collections import Counter, deque
 
 from skytether.client.mavlink.clock import BootClock
-from skytether.client.vehicle import Measurement
+from skytether.client.vehicle import Frame, Measurement
 from skytether.mavlink.codec import Message
 from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -17,6 +17,13 @@ AHEAD_NS = 20 * MILLISECOND_NS
 impossible."""
 OLD_NS = SECOND_NS
 """Largest age of a measurement that is used, for an autopilot aboard [ns]."""
+RECALLED_MAX_NS = 600 * SECOND_NS
+"""Longest time for which an origin is good that an earlier life has kept [ns]."""
+REBOOT_NS = SECOND_NS
+"""Time by which the autopilot's clock may differ from ours since it was kept [ns], beside its
+drift."""
+DRIFT_PARTS = 40
+"""Part of the time since then that its drift may make: 2.5 %."""
 SPEED_MAX = 1e3
 """Largest speed on an axis that is believed [m/s]."""
 
@@ -31,6 +38,8 @@ class Positions:
         clock: the autopilot's clock.
         old_ns: age of a measurement above which it is not taken [ns].
         start: where in our axes it takes off, once `begin` is called [m].
+        origin: origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None
+            where it is only known once `begin` is called.
     """
 
     def __init__(
@@ -39,6 +48,7 @@ class Positions:
         clock: BootClock,
         old_ns: int = OLD_NS,
         start: Vector = (0.0, 0.0, 0.0),
+        origin: Vector | None = (0.0, 0.0, 0.0),
     ) -> None:
         self._axes, self._clock, self._old_ns, self._start = axes, clock, old_ns, start
         self._waiting: deque[Measurement] = deque(maxlen=WAITING_MAX)
@@ -46,8 +56,16 @@ class Positions:
         self._newest_ns: int | None = None
         """Stamp of the newest measurement."""
         self._jumps = 0
-        self.origin: Vector = (0.0, 0.0, 0.0)
+        self.origin: Vector = origin or (0.0, 0.0, 0.0)
         """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]."""
+        self.has_origin = origin is not None
+        """Whether that is known."""
+        self.is_recalled = False
+        """Whether it is what an earlier life has kept since this boot of the autopilot."""
+        self._recalled: Frame | None = None
+        """What an earlier life has kept, until it is known whether it is of this boot."""
+        self._boot_ms = 0
+        """Time since the autopilot's boot of the newest measurement [ms]."""
         self.position: Vector | None = None
         """Newest position in that frame, in our axes [m]."""
         self.velocity: Vector = (0.0, 0.0, 0.0)
@@ -70,7 +88,9 @@ class Positions:
         if reason:
             self.dropped[reason] += 1
             return
-        boot_ms = message.time_boot_ms
+        boot_ms = self._boot_ms = message.time_boot_ms
+        if self._recalled is not None:
+            self._recall(self._recalled, boot_ms, now_ns)
         stamp_ns = min(self._stamp_ns(boot_ms), now_ns)
         if self._newest_ns is not None:  # the map has moved by less than what lies between them
             stamp_ns = max(stamp_ns, self._newest_ns + 1)
@@ -117,8 +137,38 @@ class Positions:
         """Set our origin: the vehicle's place less its start in the scenario."""
         if self.position is not None:
             x, y, z = (at - start for at, start in zip(self.position, self._start, strict=True))
-            self.origin = x, y, z
-            self._waiting.clear()
+            self.place((x, y, z))
+
+    def place(self, origin: Vector) -> None:
+        """Set our origin [m; the autopilot's local frame, in our axes]."""
+        self.origin, self.has_origin, self._recalled = origin, True, None
+        self._waiting.clear()
+
+    def recall(self, frame: Frame) -> None:
+        """Take the origin that an earlier life has kept, once it is known to be of this boot."""
+        if not self.has_origin and frame.origin is not None:
+            self._recalled = frame
+
+    def _recall(self, frame: Frame, boot_ms: int, now_ns: int) -> None:
+        """Take an origin, if both clocks have gone on alike since: a reboot sets its own to 0."""
+        self._recalled = None
+        passed_ns = now_ns - frame.at_ns
+        apart_ns = abs((boot_ms - frame.boot_ms) * MILLISECOND_NS - passed_ns)
+        is_same = apart_ns <= REBOOT_NS + passed_ns // DRIFT_PARTS
+        if is_same and 0 <= passed_ns <= RECALLED_MAX_NS and frame.origin is not None:
+            self.place(frame.origin)
+            self.is_recalled = True
+
+    def frame(self, *, armed: bool) -> Frame:
+        """What the next life needs to know of the origin.
+
+        Args:
+            armed: see `Frame`.
+        """
+        if not self.has_origin or self.came_ns is None:
+            known = self._recalled or Frame()
+            return Frame(armed=armed, origin=known.origin, boot_ms=known.boot_ms, at_ns=known.at_ns)
+        return Frame(armed=armed, origin=self.origin, boot_ms=self._boot_ms, at_ns=self.came_ns)
 
     def take(self, *, now_ns: int) -> list[Measurement]:
         """Measurements of up to now that were not taken before, the oldest first."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.client.mavlink.port import Port
-from skytether.client.vehicle import Measurement, Vehicle
+from skytether.client.mavlink.port import Port, given_origin
+from skytether.client.vehicle import Frame, Measurement, Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import AboardFailure
 from skytether.shared.core.line import parse_line
@@ -17,6 +17,7 @@ from skytether.shared.telemetry.record import Reason
 
 PLANE_ALTITUDE_M = 3.0
 """Altitude at which a vehicle flies that is flown in the plane [m]."""
+ORIGIN = keys_of(InFlight.ORIGIN)
 ALTITUDE_MIN_M = 0.5
 """Least altitude of take-off [m]."""
 
@@ -32,7 +33,7 @@ class MavlinkVehicle(Vehicle):
         ConfigError: the line to the autopilot is none, or the flight begins on the ground.
     """
 
-    changeable = keys_of(InFlight.ARMED)
+    changeable = keys_of(InFlight.ARMED, InFlight.ORIGIN)
 
     def __init__(self, scenario: Scenario, number: int) -> None:
         line = parse_line("vehicle.address", scenario.vehicle.address)
@@ -67,6 +68,28 @@ class MavlinkVehicle(Vehicle):
         """See `Vehicle`; a vehicle on the ground is armed only where its scenario is."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
 
+    def is_up(self, *, now_ns: int) -> bool:
+        """See `Vehicle`."""
+        return self._port.take_off(may_arm=False, now_ns=now_ns)
+
+    @property
+    def took_off(self) -> bool:
+        """See `Vehicle`."""
+        return self._port.took_off
+
+    @property
+    def frame(self) -> Frame:
+        """See `Vehicle`."""
+        return self._port.frame
+
+    def recall(self, frame: Frame) -> None:
+        """See `Vehicle`."""
+        self._port.recall(frame)
+
+    def arm(self) -> None:
+        """See `Vehicle`."""
+        self._port.arm()
+
     def hindrance(self, *, now_ns: int) -> Reason | None:
         """See `Vehicle`."""
         return self._port.hindrance(now_ns=now_ns)
@@ -84,6 +107,17 @@ class MavlinkVehicle(Vehicle):
     def change(self, scenario: Scenario) -> None:
         """See `Vehicle`; whoever arms the scenario lets the vehicle take off."""
         self._may_arm = scenario.armed
+        origin, positions = given_origin(scenario), self._port.positions
+        if origin is not None and not positions.has_origin:
+            positions.place(origin)
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """See `Vehicle`: an origin that is known stays, or the fence would move in flight."""
+        if keys & ORIGIN and self._port.positions.has_origin:
+            x, y, z = self._port.positions.origin
+            known = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
+            return f"mavlink.origin: got {scenario.mavlink.origin}, but {known}"
+        return ""
 
 
 def altitude(scenario: Scenario, number: int = 1) -> float:

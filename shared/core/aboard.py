@@ -125,6 +125,31 @@ class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: {self.doing}: {self.why}"
 
 
+class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle on the ground is not armed before a person says that it may be."""
+
+    why: str
+
+    def __str__(self) -> str:
+        said = "arm it anew: skytether set SOCKET armed=true, or on the page"
+        return f"vehicle {self.vehicle} is not armed: {self.why}; {said}"
+
+
+class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle in the air hovers, for nobody knows where the scenario's origin is."""
+
+    place: tuple[float, float, float]
+    """Where it is in the autopilot's local frame: north, east, up [m]."""
+
+    def __str__(self) -> str:
+        at = ", ".join(f"{each:.2f}" for each in self.place)
+        said = "say where its origin lies there: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        return (
+            f"vehicle {self.vehicle} hovers at [{at}] of its autopilot's local frame "
+            f"(north, east, up), and its origin is not known; {said}"
+        )
+
+
 AboardFailure = ParametersUnsafe | NotTakenOff
 """Events after which a vehicle is not flown."""
 AboardEvent = (
@@ -134,5 +159,7 @@ AboardEvent = (
     | AutopilotRefused
     | AutopilotText
     | AutopilotMode
+    | ArmingAwaited
+    | OriginAwaited
     | AboardFailure
 )

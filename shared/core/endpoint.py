@@ -89,6 +89,8 @@ class Endpoint(ABC):
 
     changeable: frozenset[str] = frozenset()
     """Keys of its scenario that may change in flight, see `shared.core.change`."""
+    keeps = False
+    """Whether there is anything that the next life of the process must know, see `keep`."""
     patience_ns = 0
     """Longest time that datagrams wait to be received together, on sockets to which many come [ns].
 
@@ -155,6 +157,16 @@ class Endpoint(ABC):
         reason in `dropped`, an edge [ms] in `ticks_within_ms`.
         """
         return {}
+
+    def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002 - most keep nothing
+        """What the next life of this process must know, where it has changed.
+
+        It is handed out once, and to be written where that life finds it.
+        """
+        return None
+
+    def kept(self) -> None:  # noqa: B027 - see `keep`
+        """Take note that what was handed out last was written."""
 
     @property
     def finished(self) -> bool:

@@ -446,6 +446,36 @@ class NotFlown(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} {flown if self.covered else 'was never flown'}: {self.why}"
 
 
+class Recalled(VehicleEvent, frozen=True, kw_only=True):
+    """A client has found what an earlier run of it has kept."""
+
+    goes_on: bool
+    """Whether the flight of that run goes on."""
+
+    def __str__(self) -> str:
+        if self.goes_on:
+            return f"vehicle {self.vehicle} goes on with the flight of an earlier run"
+        return f"vehicle {self.vehicle}: the flight of an earlier run is too long ago to go on"
+
+
+class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
+    """A client does not follow what an earlier run seems to have kept."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: what an earlier run kept is not followed: {self.reason}"
+
+
+class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """What the next run of a process must know cannot be written."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return f"what the next run of this process must know cannot be kept: {self.reason}"
+
+
 class Finished(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle has begun the last step of its flight."""
 
@@ -500,5 +530,8 @@ Event = (
     | FenceHolds
     | PlanningResumed
     | NotFlown
+    | Recalled
+    | NotRecalled
+    | NotKept
     | Finished
 )

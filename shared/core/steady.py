@@ -37,6 +37,7 @@ class Steady(Endpoint):
         super().__init__()
         self._inner = inner
         self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
+        self.keeps = inner.keeps
         self._seen_ns: int | None = None
         """Time that the clock showed last."""
         self._jumps_ns = 0
@@ -83,6 +84,14 @@ class Steady(Endpoint):
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`."""
         self._inner.change(scenario, keys, now_ns=self._steady(now_ns))
+
+    def keep(self, *, now_ns: int) -> bytes | None:
+        """See `Endpoint`; what is kept names times by how long ago they were."""
+        return self._inner.keep(now_ns=self._steady(now_ns))
+
+    def kept(self) -> None:
+        """See `Endpoint`."""
+        self._inner.kept()
 
     def tell(self, event: Event) -> None:
         """See `Endpoint`."""

@@ -54,6 +54,9 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     ):
         if isinstance(values, tuple) and len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
+    origin = scenario.mavlink.origin
+    if isinstance(origin, tuple) and len(origin) not in (2, 3):
+        yield "mavlink.origin", list(origin), "north and east, or north, east and up"
     for key, values in (
         ("vehicle.start_m", vehicle.start_m),
         ("reference.velocity_mps", scenario.reference.velocity_mps),

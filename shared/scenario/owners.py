@@ -36,6 +36,8 @@ class InFlight(Enum):
     """Position and velocity of a live point."""
     ARMED = auto()
     """Whether plans may be flown."""
+    ORIGIN = auto()
+    """Where the scenario's origin is, of a vehicle in the air that does not know."""
     WIND = auto()
     """Wind and gusts."""
     IMPAIRMENT = auto()

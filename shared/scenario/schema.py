@@ -209,6 +209,9 @@ class VehicleConfig(Section, frozen=True):
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""
+    memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
+    """Folder in which its client keeps what it needs to go on after a restart; auto: the state
+    folder of its service or user, for a vehicle with an autopilot; none: it keeps nothing."""
     report: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = (
         "deviation(0.05) | silence(1)"
     )
@@ -356,10 +359,15 @@ class MavlinkConfig(Section, frozen=True):
     takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
     """Altitude to take off to [m]; auto: that at which the desired trajectory begins, and 3 m in
     the plane."""
-    origin: OfVehicle[Literal["takeoff", "autopilot"]] = "takeoff"
-    """Origin of the flight: the point where we arm the vehicle, or the autopilot's own local
-    origin; that is taken as well where the vehicle is in the air already. On a mission a vehicle is
-    armed where it begins: that point is its first goal, on the ground."""
+    origin: Annotated[
+        Literal["takeoff", "autopilot"] | tuple[Position, ...],
+        Key(Owner.VEHICLE, InFlight.ORIGIN),
+    ] = "takeoff"
+    """Origin of the flight: the point where we arm the vehicle, the autopilot's own local origin,
+    or a place in the autopilot's local frame: north, east (and up) [m]. On a mission a vehicle is
+    armed where it begins: that point is its first goal, on the ground. With `takeoff` a client that
+    begins while the vehicle is in the air knows its origin from `vehicle.memory`; else the vehicle
+    hovers until this key is set."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Time that the autopilot may take until it is heard, and for each step on its way into the
     air [s]."""

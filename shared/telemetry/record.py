@@ -60,6 +60,7 @@ class Reason(IntEnum):
     ASTRAY = 22
     MUTE = 23
     WAITED = 24
+    RESUMED = 25
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -91,6 +92,7 @@ REASON_TEXTS = {
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
     Reason.WAITED: "what it waits for has not come for long",
+    Reason.RESUMED: "its process has restarted, and it goes on along its motion",
 }
 
 

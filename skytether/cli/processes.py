@@ -246,7 +246,8 @@ def run(
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
     netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
-    client = [*common("client", recorded=True), *fleet, *keys]
+    # Whoever says `fly` begins a new flight.
+    client = [*common("client", recorded=True), *fleet, *keys, "--new-flight"]
     client += ["--set-parameters"] * set_parameters
 
     def hear(line: LogLine) -> None:

@@ -26,6 +26,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.batch import BATCH_MAX, Batch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
+from skytether.shell.memory import MemoryFile
 from skytether.shell.stream import ByteStream
 from skytether.shell.timer import make_timer
 from skytether.shell.udp import (
@@ -92,6 +93,7 @@ class Shell:
         line: where socket 1 leads, of an endpoint that talks to hardware beside its peers.
         is_patient: whether the endpoint is driven although a peer's name cannot be found yet; the
             name is looked up again until it is.
+        memory: file of what the endpoint keeps for its next life.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be found.
@@ -109,8 +111,10 @@ class Shell:
         line: Line | None = None,
         *,
         is_patient: bool = False,
+        memory: MemoryFile | None = None,
     ) -> None:
         self.endpoint = endpoint
+        self._memory = memory
         self._stopwatch = stopwatch or Stopwatch()
         self._control, self._feed = control, feed
         self.send_errors = 0
@@ -185,6 +189,8 @@ class Shell:
             self._control.begin(self._loop, self._changed)
         if self._feed:
             self._feed.begin(self._loop)
+        if self._memory:
+            self._memory.begin(self.endpoint, self._loop)
         beside = [self._loop.create_task(self._keep_resolving())]
         if self._stream:
             beside.append(self._loop.create_task(self._stream.run()))
@@ -201,6 +207,8 @@ class Shell:
                 self._slices.close()
             self.endpoint.close(now_ns=time.monotonic_ns())
             self._send_all(self.endpoint.outbox())
+            if self._memory:
+                self._memory.look()
             self._drops = self.kernel_drops()
             for sock in self._sockets.values():
                 self._loop.remove_reader(sock)
@@ -383,6 +391,8 @@ class Shell:
             self._done.set_result(None)
         for event in endpoint.events():
             self._on_event(event)
+        if self._memory:
+            self._memory.look()
         if self._feed:
             self._feed.take()
 

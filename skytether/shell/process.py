@@ -35,6 +35,7 @@ from skytether.shell.driver import Shell, run
 from skytether.shell.feed import Feed
 from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
+from skytether.shell.memory import MemoryFile
 from skytether.shell.recording import RecordFile
 from skytether.shell.udp import AddressError, is_loopback
 
@@ -101,6 +102,7 @@ def drive(
     metrics: Address | None = None,
     line: Line | None = None,
     is_patient: bool = False,
+    memory: MemoryFile | None = None,
     warnings: Sequence[Event] = (),
     ready: Callable[[], None] = lambda: None,
 ) -> None:
@@ -110,7 +112,7 @@ def drive(
         process: name of the process in its log.
         endpoint: what to run.
         options: its options, with the scenario and its name.
-        bind, peers, forms, stopwatch, line, is_patient: see `Shell`.
+        bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
         waiting_for: the peer whose datagrams it waits for, named to the operator.
         secure: whether it has keys; None for one that only forwards datagrams.
         insecure: whether it may run without keys even where other machines can reach it.
@@ -143,6 +145,7 @@ def drive(
                 feed,
                 line,
                 is_patient=is_patient,
+                memory=memory,
             )
         except LocalError as error:
             raise CommandError(f"--control: {error}", CONFIGURATION) from None
@@ -173,8 +176,9 @@ def drive(
             return counted | ({"feed": feed.figures()} if feed else {})
 
         def each_second(*, last: bool = False) -> None:
-            if recording and (news := recording.news()):
-                out.say(news)
+            for source in (recording, memory):
+                if source and (news := source.news()):
+                    out.say(news)
             out.each_second(last=last)
             if feed or served:
                 snapshot = figures()

@@ -5,9 +5,9 @@ well. Every host has its own clock, with offset and drift. A host may take time 
 is woken: only at the end of that time do its datagrams leave, and only then can it be woken again.
 It receives datagrams meanwhile, so computing for one peer does not delay what another sends. A host
 can be stopped and restarted, frozen for a while, and have its clock set, by actions scheduled with
-their time (`World.at`). Time is integer nanoseconds, and events of one instant happen in a fixed
-order: equal inputs give equal outcomes on every machine, and hosts that exchange no datagrams do
-not affect each other.
+their time (`World.at`). What an endpoint keeps for its next life stays with its host. Time is
+integer nanoseconds, and events of one instant happen in a fixed order: equal inputs give equal
+outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
 """
 
 from collections import deque
@@ -106,6 +106,8 @@ class Host:
     """Time of the world at which the host is to be woken, or None."""
     due_ns: int | None = None
     """Time on the host's clock that `armed_ns` was computed from; None to compute it again."""
+    memory: tuple[bytes, int] | None = None
+    """What its endpoints have kept last, and when [ns; the host's clock]; None of nothing."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -204,6 +206,10 @@ class World:
         host = self._hosts[name]
         host.endpoint, host.busy_until_ns = endpoint, self.now_ns
         self._arm(host)
+
+    def memory(self, name: str) -> tuple[bytes, int] | None:
+        """What an endpoint on a host has kept last, and when [ns; its clock]; None of nothing."""
+        return self._hosts[name].memory
 
     def freeze(self, name: str) -> None:
         """Freeze a host: datagrams are queued for it, up to a bound.
@@ -321,6 +327,11 @@ class World:
     def _after(self, host: Host, leaves_ns: int) -> None:
         """Let a host's datagrams leave, report its events, and arm its next wake."""
         endpoint = host.endpoint
+        if endpoint.keeps:
+            now_ns = host.clock.local(self.now_ns)
+            if (content := endpoint.keep(now_ns=now_ns)) is not None:
+                host.memory = content, now_ns
+                endpoint.kept()
         for payload, (name, socket), source in endpoint.outbox():
             receiver = self._hosts.get(name)
             if receiver is None:

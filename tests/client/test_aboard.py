@@ -319,8 +319,8 @@ def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: Flavou
 
 
 def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
-    """It is flown where it is, from the autopilot's own origin."""
-    air = Air("ardupilot", duration=5.0)
+    """It is flown where it is, from the autopilot's own origin where the scenario says so."""
+    air = Air("ardupilot", duration=5.0, mavlink={"origin": "autopilot"})
     in_the_air(air, FlightMode.GUIDED)
     air.fly()
     assert not air.commands(ARM)

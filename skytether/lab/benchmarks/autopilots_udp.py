@@ -112,7 +112,7 @@ async def fly(scenario: Scenario, cell: Cell, parts: Path, *, cut: bool) -> Reco
             autopilot = await start("autopilot", *pilot, *ANYWHERE)
             line = f"--vehicle.address=udpout:{address_text(*autopilot.address)}"
             to_netem = ("--server", address_text(*netem.address))
-            last = await start("client", *keys, *to_netem, line, "--set-parameters")
+            last = await start("client", *keys, *to_netem, line, "--set-parameters", "--new-flight")
         else:
             await start("autopilot", *pilot, "--to", address_text(*netem.address))
             last = ground

@@ -1,0 +1,235 @@
+"""Memory of a client on the disk of its computer, where the next life of the process finds it.
+
+    MAGIC | digest of the rest, with the vehicle's key | host, time and identity | what is kept
+
+A file is written beside its place by a thread, and renamed: a step never waits for a disk, and a
+file is whole or the one before. It need not outlive the computer: there the motion in it is over.
+One that is damaged, or of another vehicle, key or flight, is refused in words, and not followed.
+"""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import threading
+import time
+from collections.abc import Mapping
+from hashlib import blake2b
+from pathlib import Path
+
+import msgspec
+
+from skytether.shared.base import files
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.core.events import NotKept
+
+MAGIC = b"skytether memory 1\n"
+DIGEST_BYTES = 32
+FILE_BYTES_MAX = 65_536
+"""Largest size of a file [B]."""
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+"""File that names this run of the host, on Linux; its monotonic clock begins anew with each."""
+AGAIN_S = 1.0
+"""Time after which a file that could not be written is tried again [s]."""
+
+
+class MemoryRefused(ValueError):
+    """Error: a file is there that cannot be followed; the message says why."""
+
+
+class _Envelope(msgspec.Struct, frozen=True, array_like=True):
+    """What stands around what is kept."""
+
+    host: str
+    """Run of the host; empty where the system does not tell it."""
+    written_ns: int
+    """Monotonic clock of the host when it was written [ns]."""
+    identity: dict[str, str]
+    """Whose it is."""
+    content: bytes
+
+
+def folder(given: str) -> Path:
+    """Folder of the memory that a scenario asks for.
+
+    Args:
+        given: `vehicle.memory`: a path, or "auto" for the state folder of a service of systemd,
+            else of the user.
+    """
+    if given != "auto":
+        return Path(given).expanduser()
+    service = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if service:
+        return Path(service)
+    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(state).expanduser() / "skytether"
+
+
+class MemoryFile:
+    """File of what one client keeps.
+
+    Args:
+        path: its path; the folder is made where there is none.
+        identity: whose it is: names and values, all of which must be the same to be followed.
+        secret: key of the vehicle, with which nobody else can make such a file; empty without.
+
+    Raises:
+        OSError: the folder cannot be made, or another process has this file.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
+        self._path, self._identity, self._secret = path, dict(identity), secret
+        self._host = _host()
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = path.with_name(path.name + ".lock")
+        self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise OSError(f"{path}: another process keeps its memory there") from None
+        self._wanted: bytes | None = None
+        """Content to be written next."""
+        self._changed = threading.Condition()
+        self._ends = False
+        self._thread: threading.Thread | None = None
+        self._failure = self._told = ""
+        """Why the newest content could not be written, and what of that was told; empty where it
+        was."""
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self._path
+
+    def read(self) -> tuple[bytes, int | None] | None:
+        """What the life before has kept, and when; None of nothing.
+
+        The time is of the monotonic clock [ns], and None where that has begun anew since.
+
+        Raises:
+            MemoryRefused: there is a file that cannot be followed.
+        """
+        try:
+            held = files.read(self._path, FILE_BYTES_MAX, private=True)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise MemoryRefused(f"{self._path}: {error.strerror or error}") from None
+        found = self._opened(held)
+        for name, expected in self._identity.items():
+            given = found.identity.get(name, "")
+            if given != expected:
+                said = f"{name}: got {given or 'nothing'}, expected {expected}"
+                raise MemoryRefused(f"{self._path}: it was kept by another flight: {said}")
+        is_now = bool(self._host) and found.host == self._host
+        return found.content, found.written_ns if is_now else None
+
+    def _opened(self, held: bytes) -> _Envelope:
+        digest, body = held[len(MAGIC) :][:DIGEST_BYTES], held[len(MAGIC) + DIGEST_BYTES :]
+        if not held.startswith(MAGIC) or digest != self._digest(body):
+            raise MemoryRefused(f"{self._path}: it is damaged, or was kept with another key")
+        try:
+            return msgspec.msgpack.decode(body, type=_Envelope)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise MemoryRefused(f"{self._path}: it is damaged: {error}") from None
+
+    def _digest(self, body: bytes) -> bytes:
+        return blake2b(body, key=self._secret, digest_size=DIGEST_BYTES, person=b"memory").digest()
+
+    def sealed(self, content: bytes, written_ns: int) -> bytes:
+        """File of this content."""
+        envelope = _Envelope(self._host, written_ns, self._identity, content)
+        body = msgspec.msgpack.encode(envelope)
+        return MAGIC + self._digest(body) + body
+
+    def forget(self) -> None:
+        """Remove the file: a person begins a new flight.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        self._path.unlink(missing_ok=True)
+
+    # -- in flight -----------------------------------------------------------------------------
+
+    def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
+        """Keep from now on what an endpoint hands out, which is told when it is written."""
+        self._endpoint, self._loop = endpoint, loop
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def look(self) -> None:
+        """Take over what the endpoint wants kept; it is written by the thread."""
+        now_ns = time.monotonic_ns()
+        content = self._endpoint.keep(now_ns=now_ns)
+        if content is not None:
+            with self._changed:
+                self._wanted = self.sealed(content, now_ns)
+                self._changed.notify()
+
+    def news(self) -> NotKept | None:
+        """Why nothing can be written, where it was not told before."""
+        failure, told = self._failure, self._told
+        self._told = failure
+        return NotKept(reason=failure) if failure and failure != told else None
+
+    def close(self) -> None:
+        """Write what is left, for a bounded time, and let another process have the file."""
+        with self._changed:
+            self._ends = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(AGAIN_S)
+        with contextlib.suppress(OSError):
+            os.close(self._lock)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while self._wanted is None and not self._ends:
+                    self._changed.wait()
+                if self._wanted is None:
+                    return
+                held = self._wanted
+            try:
+                _replace(self._path, held)
+                self._failure = ""
+            except OSError as error:
+                self._failure = f"{self._path}: {error.strerror or error}"
+            with self._changed:
+                is_newest = self._wanted is held
+                if is_newest and not self._failure:
+                    self._wanted = None
+                elif self._failure:
+                    if self._ends:
+                        return
+                    self._changed.wait(AGAIN_S)
+            if is_newest and not self._failure:
+                with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+                    self._loop.call_soon_threadsafe(self._tell)
+
+    def _tell(self) -> None:
+        """Tell the endpoint that what it handed out last is written, if it still is the last."""
+        if self._wanted is None:
+            self._endpoint.kept()
+
+
+def _host() -> str:
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file beside its place and move it there."""
+    beside = path.with_name(path.name + ".new")
+    with contextlib.suppress(FileNotFoundError):
+        beside.unlink()
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    with os.fdopen(os.open(beside, flags, 0o600), "wb", buffering=0) as file:
+        left = memoryview(content)
+        while left:
+            left = left[file.write(left) :]
+    beside.rename(path)

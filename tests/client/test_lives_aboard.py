@@ -1,0 +1,156 @@
+"""A client whose process dies while its autopilot flies, and starts again, in virtual time."""
+
+from math import dist
+
+import pytest
+
+from airborne import Air, scenario
+from skytether.autopilot.flavours import FlavourName, FlightMode
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
+from skytether.shared.core.change import Running
+from skytether.shared.core.events import Flying
+from skytether.shared.wire.protocol import Mode
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+ARM, SET_MODE = 400, 176
+NORTH_M, EAST_M = 20.0, -12.0
+
+
+def away(flavour: FlavourName, **table: object) -> Air:
+    """A flight whose vehicle takes off far from the origin of its autopilot's local frame."""
+    air = Air(flavour, duration=40.0, reference={"radius_m": 2.0}, **table)
+    air.flight.quadrotor._quad.x[:2] = NORTH_M, EAST_M
+    air.fly()
+    air.run(4.0)
+    return air
+
+
+def off_m(air: Air) -> float:
+    """Distance of the vehicle from the place where it was armed, in the plane [m]."""
+    x, y, _ = air.flight.position()
+    return dist((x, y), (NORTH_M, EAST_M))
+
+
+def farthest_m(air: Air, seconds: float) -> float:
+    """Largest such distance over the next seconds [m]."""
+    most = 0.0
+    for _ in range(round(seconds / 0.5)):
+        air.run(0.5)
+        most = max(most, off_m(air))
+    return most
+
+
+def say(air: Air, **values: object) -> None:
+    """Say something to the client, as an operator does."""
+    running = Running(air.client, air.scenario)
+    keys = {name.replace("__", "."): value for name, value in values.items()}
+    air.world.act("client", lambda now_ns: running.change(keys, now_ns=now_ns))
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: FlavourName) -> None:
+    """Figure and fence stay where they were: the origin outlives the process."""
+    air = away(flavour)
+    air.restart(0.3)
+    assert farthest_m(air, 12.0) < 3.5
+    assert air.client._pilot.step > 300, "steps go on counting"
+    assert air.client._failsafe.mode is Mode.TRACK
+    assert not air.of(OriginAwaited)
+    assert len(air.commands(ARM)) == 1
+
+
+def test_without_its_origin_a_vehicle_in_the_air_hovers_until_somebody_says_where_it_is() -> None:
+    """It keeps its place under a stream of zeros, and then flies its figure where that belongs."""
+    air = away("ardupilot")
+    air.restart(1.0, remembers=False)
+    air.run(5.0)
+    x, y, _ = air.flight.position()
+    air.run(10.0)
+    assert dist(air.flight.position()[:2], (x, y)) < 0.3
+    assert not air.client._pilot.step
+    (awaited,) = air.of(OriginAwaited)
+    assert dist(awaited.place[:2], (x, y)) < 1.0
+    say(air, mavlink__origin=[NORTH_M, EAST_M])
+    air.fly(5.0)
+    assert farthest_m(air, 12.0) < 3.5
+    with pytest.raises(ConfigError, match=r"the origin is known"):
+        say(air, mavlink__origin=[0.0, 0.0])
+
+
+def test_where_nobody_says_where_the_origin_is_it_lands_where_it_is() -> None:
+    """After the patience that each step into the air has."""
+    air = away("ardupilot", mavlink={"patience_s": 20.0})
+    air.restart(1.0, remembers=False)
+    air.end(60.0)
+    assert isinstance(air.client.failure, NotTakenOff)
+    assert not air.flight.armed
+    assert off_m(air) < 3.5
+
+
+def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
+    """Its local frame has begun anew, as its clock has."""
+    air = away("ardupilot")
+    air.world.stop("client")
+    air.autopilot._began_ns += 8_000_000_000
+    air.restart(1.0)
+    air.run(14.0)
+    assert air.of(OriginAwaited)
+    assert not air.client._pilot.next_ns
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+@pytest.mark.parametrize("down_s", [0.5, 30.0])
+def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
+    flavour: FlavourName, down_s: float
+) -> None:
+    """A process that starts is no person: it waits for one, and then takes off."""
+    air = away(flavour)
+    air.world.stop("client")
+    air.run(40.0, lambda: not air.flight.armed)
+    assert not air.flight.armed, "the autopilot's own failsafe has landed it"
+    arms = len(air.commands(ARM))
+    air.restart(down_s)
+    air.run(20.0)
+    assert len(air.commands(ARM)) == arms
+    assert not air.flight.armed
+    (awaited,) = air.of(ArmingAwaited)
+    assert awaited.why == "an earlier run of its client has armed it"
+    say(air, armed=True)
+    air.fly(30.0)
+    assert len(air.commands(ARM)) > arms
+
+
+def test_a_client_that_finds_its_vehicle_landing_arms_nothing_even_without_a_memory() -> None:
+    """It was restarted while the failsafe lands: on disarming it does not take off again."""
+    air = away("ardupilot")
+    air.world.stop("client")
+    air.run(40.0, lambda: air.flight.mode is FlightMode.LAND)
+    air.restart(0.5, remembers=False)
+    air.run(60.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+    air.run(10.0)
+    assert len(air.commands(ARM)) == 1
+    assert air.of(ArmingAwaited)
+
+
+def test_a_word_counts_on_the_ground_alone() -> None:
+    """Said in the air, it does not let the next life take off after a landing."""
+    air = away("ardupilot")
+    air.restart(0.3)
+    air.run(3.0)
+    say(air, armed=True)
+    air.world.stop("client")
+    air.run(40.0, lambda: not air.flight.armed)
+    air.restart(1.0)
+    air.run(10.0)
+    assert not air.flight.armed
+
+
+def test_a_first_life_takes_off_as_before() -> None:
+    """There is nothing that anybody has to say twice."""
+    air = Air("ardupilot", duration=3.0)
+    air.fly()
+    assert air.of(Flying)
+    assert not air.of(ArmingAwaited)
+    assert scenario().armed

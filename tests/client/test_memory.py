@@ -1,0 +1,168 @@
+"""What a client keeps for its next life: the motion in force, step 0, and its boot id."""
+
+import contextlib
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.client.memory import FlownMotion, Kept, Memory, age_max_ns, recall
+from skytether.client.vehicle import Frame
+from skytether.lab.lives import Lives, Restart
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+
+SWAP = reading.load("swap")
+TERMS = SWAP.terms()
+NOW_NS = 50 * SECOND_NS
+KNOTS = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+MOTION = FlownMotion(step=200, observed=180, spacing=10, numbers=KNOTS.tobytes())
+KEPT = Kept(
+    boot_id=2**64 - 1,
+    began_ns=38 * SECOND_NS,
+    heard_ns=49 * SECOND_NS,
+    motion=MOTION,
+    frame=Frame(armed=True, origin=(20.0, -12.0, 0.5), boot_ms=61_000, at_ns=NOW_NS),
+)
+
+
+def swap(seed: int) -> Scenario:
+    """Eight vehicles that swap places over the paper's network, of whose packets 10 % are lost."""
+    table = reading.to_table(SWAP)
+    table |= {"duration": 20.0, "seed": seed}
+    table["reference"]["shape"] = "swap(8)"
+    for way in ("uplink", "downlink"):
+        table["network"][way] |= {"loss": 0.1}
+    return reading.check(table, "swap")
+
+
+def flown(*restarts: Restart) -> Lives:
+    """Such a flight in which processes restart."""
+    flight = Lives(swap(1), restarts)
+    flight.fly()
+    return flight
+
+
+def test_a_vehicle_whose_process_restarts_goes_on_along_its_motion_and_others_keep_apart() -> None:
+    """The server notices nothing but a silence: session, steps and motion are those of before."""
+    flight = flown(Restart(5, 7.6))
+    assert flight.least_m() > SWAP.mission.separation_m
+    assert flight.server.controller.counts["left_tube"] == 0
+    (resumed,) = (
+        event
+        for _, host, event in flight.events
+        if host == "client 5"
+        and isinstance(event, ModeChanged)
+        and event.reason == str(Reason.RESUMED)
+    )
+    assert resumed.after == str(Mode.TRACK)
+    assert sum("vehicle 5 flies, from" in str(event) for _, _, event in flight.events) == 1
+
+
+def test_without_its_memory_two_vehicles_come_much_nearer_than_asked_for() -> None:
+    """The ablation: what the test above shows is due to what was kept, and to nothing else."""
+    flight = flown(Restart(5, 7.6, remembers=False))
+    assert flight.least_m() < 0.5 * SWAP.mission.separation_m
+
+
+def test_what_is_kept_comes_back_as_it_was_by_whichever_clock_it_was_written() -> None:
+    """Times are kept relative to that of writing."""
+    for written_ns in (0, NOW_NS, 10**6 * NOW_NS):
+        found = Kept.decode(KEPT.after(written_ns).encode(written_ns), NOW_NS, axes=2)
+        assert found == KEPT.after(NOW_NS)
+    assert (MOTION.knots(2) == KNOTS).all()
+
+
+@pytest.mark.parametrize("passed_ns", [-1, age_max_ns(TERMS) + 1])
+def test_what_was_kept_too_long_ago_counts_as_lost_but_for_the_vehicles_own_part(
+    passed_ns: int,
+) -> None:
+    """A motion is over by then; whether the vehicle was armed is not."""
+    content = KEPT.encode(NOW_NS)
+    assert recall(content, NOW_NS, NOW_NS, TERMS) == KEPT
+    for lost in (recall(content, NOW_NS, NOW_NS + passed_ns, TERMS),):
+        assert (lost.boot_id, lost.began_ns, lost.motion) == (None, None, None)
+        assert lost.frame == KEPT.frame
+
+
+def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_armed() -> None:
+    """Its clock has begun anew, so neither step 0 nor the age of the origin is known."""
+    lost = recall(KEPT.encode(NOW_NS), None, NOW_NS, TERMS)
+    assert lost == Kept(frame=Frame(armed=True))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"boot_id": -1},
+        {"boot_id": 2**64},
+        {"boot_id": None},
+        {"began_ns": None},
+        {"began_ns": 2**63 - 1},
+        {"motion": msgspec.structs.replace(MOTION, numbers=MOTION.numbers[:-4])},
+        {"motion": msgspec.structs.replace(MOTION, numbers=b"")},
+        {"motion": msgspec.structs.replace(MOTION, numbers=b"\xff" * 48)},
+        {"motion": msgspec.structs.replace(MOTION, spacing=0)},
+        {"motion": msgspec.structs.replace(MOTION, step=-1)},
+        {"frame": Frame(origin=(float("nan"), 0.0, 0.0))},
+        {"frame": Frame(origin=(1e9, 0.0, 0.0))},
+    ],
+)
+def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object]) -> None:
+    """Nothing of it reaches the vehicle."""
+    wrong_kept = msgspec.structs.replace(KEPT, **wrong)
+    if wrong == {"boot_id": 2**64}:
+        return  # msgpack cannot hold it
+    with pytest.raises(ValueError, match=r".+"):
+        Kept.decode(wrong_kept.encode(0), 0, axes=2)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused_or_are_something_kept(content: bytes) -> None:
+    """No other exception comes out of them."""
+    with contextlib.suppress(ValueError):
+        assert isinstance(Kept.decode(content, 0, axes=2), Kept)
+
+
+def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
+    """Else it would forget a motion that the next life follows."""
+    memory = Memory(TERMS, 1, None)
+    assert memory.may_tell(KEPT, now_ns=NOW_NS)  # there is nothing yet that would be followed
+    assert memory.keep(KEPT, now_ns=NOW_NS) is not None
+    memory.kept()
+    assert memory.may_tell(KEPT, now_ns=NOW_NS)
+    newer = msgspec.structs.replace(KEPT, motion=msgspec.structs.replace(MOTION, step=230))
+    assert not memory.may_tell(newer, now_ns=NOW_NS)
+    assert memory.keep(newer, now_ns=NOW_NS) is not None
+    assert not memory.may_tell(newer, now_ns=NOW_NS)
+    memory.kept()
+    assert memory.may_tell(newer, now_ns=NOW_NS)
+
+
+def test_a_disk_that_fails_keeps_a_vehicle_silent_only_until_the_file_on_it_is_too_old() -> None:
+    """From then on no next life would follow it."""
+    memory = Memory(TERMS, 1, KEPT)
+    assert memory.boot_id == KEPT.boot_id
+    newer = msgspec.structs.replace(KEPT, motion=None)
+    assert memory.may_tell(KEPT, now_ns=NOW_NS)
+    assert not memory.may_tell(newer, now_ns=NOW_NS)
+    assert not memory.may_tell(newer, now_ns=NOW_NS + age_max_ns(TERMS))
+    assert memory.may_tell(newer, now_ns=NOW_NS + age_max_ns(TERMS) + 1)
+
+
+def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_each_step() -> None:
+    """Twice a minute, where the bound is 60 s."""
+    memory, writes = Memory(TERMS, 1, None), 0
+    for step in range(60 * 20):
+        now_ns = NOW_NS + step * TERMS.dt_ns
+        heard = msgspec.structs.replace(KEPT, heard_ns=now_ns)
+        if memory.keep(heard, now_ns=now_ns) is not None:
+            memory.kept()
+            writes += 1
+    assert writes == 3

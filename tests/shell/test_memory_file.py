@@ -1,0 +1,190 @@
+"""The file of a client's memory: whole or refused in words, of this vehicle, and of one process."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shell import memory
+from skytether.shell.memory import MAGIC, MemoryFile, MemoryRefused
+
+IDENTITY = {"vehicle": "1", "key": "2", "autopilot": "udpout:127.0.0.1:14551", "terms": "0a1b"}
+SECRET = bytes(range(32))
+CONTENT = bytes(range(256))
+WRITTEN_NS = 12_345_678_901
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Place of a file in a folder that is not there yet."""
+    return tmp_path / "state" / "client-1"
+
+
+def put(path: Path, held: bytes) -> None:
+    """Write a file by hand, as only its owner may read it."""
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    path.write_bytes(held)
+    path.chmod(0o600)
+
+
+def a_file(path: Path) -> bytes:
+    """A file that was kept."""
+    kept = MemoryFile(path, IDENTITY, SECRET)
+    held = kept.sealed(CONTENT, WRITTEN_NS)
+    kept.close()
+    return held
+
+
+class Keeps(Endpoint):
+    """An endpoint that keeps what it is told to."""
+
+    keeps = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted: list[bytes] = []
+        self.written = 0
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+
+    def next_wake_ns(self) -> None:
+        """See `Endpoint`."""
+
+    def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002
+        """See `Endpoint`."""
+        return self.wanted.pop(0) if self.wanted else None
+
+    def kept(self) -> None:
+        """See `Endpoint`."""
+        self.written += 1
+
+
+async def until(so: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    while not so():
+        await asyncio.sleep(0.01)
+
+
+def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
+    """In the same run of the host, whose clock goes on."""
+    put(path, a_file(path))
+    kept = MemoryFile(path, IDENTITY, SECRET)
+    assert kept.read() == (CONTENT, WRITTEN_NS)
+    kept.close()
+
+
+def test_without_a_file_there_is_nothing(path: Path) -> None:
+    """The folder is made for the owner alone."""
+    kept = MemoryFile(path, IDENTITY)
+    assert kept.read() is None
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+    kept.close()
+
+
+def test_after_a_restart_of_the_host_its_clock_says_nothing(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was kept is there, and its time is not known."""
+    put(path, a_file(path))
+    monkeypatch.setattr(memory, "_host", lambda: "another run")
+    kept = MemoryFile(path, IDENTITY, SECRET)
+    assert kept.read() == (CONTENT, None)
+    kept.close()
+
+
+def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
+    """Each byte of it, and each length."""
+    held = a_file(path)
+    kept = MemoryFile(path, IDENTITY, SECRET)
+    cut = [held[:size] for size in range(len(held))]
+    flipped = [held[:i] + bytes([held[i] ^ (1 << i % 8)]) + held[i + 1 :] for i in range(len(held))]
+    for wrong in (*cut, *flipped, held + b"\0"):
+        put(path, wrong)
+        with pytest.raises(MemoryRefused, match=r"it is damaged, or was kept with another key"):
+            kept.read()
+    put(path, held)
+    assert kept.read() == (CONTENT, WRITTEN_NS)
+    kept.close()
+
+
+@pytest.mark.parametrize("name", IDENTITY)
+def test_what_another_flight_has_kept_is_refused_with_what_differs(name: str, path: Path) -> None:
+    """Another vehicle, key, autopilot or rule of flight."""
+    put(path, a_file(path))
+    kept = MemoryFile(path, IDENTITY | {name: "other"}, SECRET)
+    with pytest.raises(MemoryRefused, match=rf"{name}: got {IDENTITY[name]}, expected other"):
+        kept.read()
+    kept.close()
+
+
+def test_a_file_made_with_another_secret_is_refused(path: Path) -> None:
+    """Nobody without the vehicle's key can make one."""
+    put(path, a_file(path))
+    kept = MemoryFile(path, IDENTITY, SECRET[::-1])
+    with pytest.raises(MemoryRefused, match=r"another key"):
+        kept.read()
+    kept.close()
+
+
+def test_a_file_that_others_may_write_is_refused(path: Path) -> None:
+    """As a key is."""
+    put(path, a_file(path))
+    path.chmod(0o666)
+    kept = MemoryFile(path, IDENTITY, SECRET)
+    with pytest.raises(MemoryRefused, match=r"expected 0600"):
+        kept.read()
+    kept.close()
+
+
+def test_two_processes_do_not_share_a_memory(path: Path) -> None:
+    """The second is refused until the first has ended."""
+    first = MemoryFile(path, IDENTITY)
+    with pytest.raises(OSError, match=r"another process keeps its memory there"):
+        MemoryFile(path, IDENTITY)
+    first.close()
+    MemoryFile(path, IDENTITY).close()
+
+
+async def test_a_thread_writes_the_newest_and_says_so(path: Path) -> None:
+    """What comes while it writes is written after that, and only the last is told."""
+    kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
+    kept.begin(endpoint, asyncio.get_running_loop())
+    for content in (b"one", b"two", b"three"):
+        endpoint.wanted.append(content)
+        kept.look()
+    await until(lambda: endpoint.written > 0)
+    found = kept.read()
+    assert found
+    assert found[0] == b"three"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert sorted(each.name for each in path.parent.iterdir()) == ["client-1", "client-1.lock"]
+    kept.close()
+
+
+async def test_a_disk_that_fails_is_told_once_and_tried_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The endpoint hears nothing of it until the file is there."""
+    monkeypatch.setattr(memory, "AGAIN_S", 0.01)
+    kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
+    elsewhere = path.parent.rename(path.parent.with_name("gone"))
+    kept.begin(endpoint, asyncio.get_running_loop())
+    endpoint.wanted.append(CONTENT)
+    kept.look()
+    told: list[str] = []
+    while not told:
+        await asyncio.sleep(0.01)
+        told += [str(news) for news in (kept.news(),) if news]
+    assert "No such file or directory" in told[0]
+    assert kept.news() is None
+    assert not endpoint.written
+    elsewhere.rename(path.parent)
+    await until(lambda: endpoint.written == 1)
+    assert path.read_bytes().startswith(MAGIC)
+    kept.close()
