@@ -80,7 +80,7 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     """What the vehicle itself keeps."""
 
     def after(self, time_ns: int) -> "Kept":
-        """The same with all times later by this."""
+        """Copy in which all times are later by this."""
         began_ns = None if self.began_ns is None else self.began_ns + time_ns
         heard_ns = self.heard_ns + time_ns
         frame = msgspec.structs.replace(self.frame, at_ns=self.frame.at_ns + time_ns)

@@ -45,7 +45,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which that was so last [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
-    """The same time by the clock of the host [ns]; as bytes, relative to that of writing."""
+    """Time of the host's clock then [ns]; as bytes, relative to that of writing."""
 
 
 class Vehicle(ABC):

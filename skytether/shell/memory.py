@@ -38,7 +38,7 @@ class MemoryRefused(ValueError):
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """What stands around what is kept."""
+    """Frame of a file: whose it is, when it was written, and the content."""
 
     host: str
     """Run of the host; empty where the system does not tell it."""
@@ -103,7 +103,7 @@ class MemoryFile:
         return self._path
 
     def read(self) -> tuple[bytes, int | None] | None:
-        """What the life before has kept, and when; None of nothing.
+        """Content that the life before has kept, and its time; None of nothing.
 
         The time is of the monotonic clock [ns], and None where that has begun anew since.
 

@@ -107,7 +107,7 @@ class Host:
     due_ns: int | None = None
     """Time on the host's clock that `armed_ns` was computed from; None to compute it again."""
     memory: tuple[bytes, int] | None = None
-    """What its endpoints have kept last, and when [ns; the host's clock]; None of nothing."""
+    """Content that its endpoints kept last, and when [ns; the host's clock]; None of none."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -208,7 +208,7 @@ class World:
         self._arm(host)
 
     def memory(self, name: str) -> tuple[bytes, int] | None:
-        """What an endpoint on a host has kept last, and when [ns; its clock]; None of nothing."""
+        """Content that an endpoint on a host kept last, and when [ns; its clock]; None of none."""
         return self._hosts[name].memory
 
     def freeze(self, name: str) -> None:
