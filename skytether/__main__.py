@@ -19,6 +19,7 @@ reorders and loses their packets.
   margins [SCENARIO]    whether its loop is stable, and with which vehicles, computed
   identify KIND         a vehicle's gain, time constant and dead time, from small steps it flies
   torture               flights through faults and attacks, and whether anything unsafe is flown
+  adversary [MISSION]   a search for what brings vehicles of a mission together
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
@@ -74,6 +75,7 @@ COMMANDS = {
     "margins": "skytether.lab.commands.margins:margins",
     "identify": "skytether.lab.commands.identify:identify",
     "torture": "skytether.lab.commands.torture:torture",
+    "adversary": "skytether.lab.commands.adversary:adversary",
     "reproduce": "skytether.lab.commands.reproduce:reproduce",
     "compare": "skytether.lab.commands.compare:compare",
     "calibrate": "skytether.lab.commands.calibrate:calibrate",

@@ -273,8 +273,8 @@ def least_separation(
 
     See `separations`.
     """
-    _, nearest = separations(each, began_s, dt_s, height_scale)
-    return float(np.nanmin(nearest)) if np.isfinite(nearest).any() else None
+    _, least_m = separations(each, began_s, dt_s, height_scale)
+    return float(np.nanmin(least_m)) if np.isfinite(least_m).any() else None
 
 
 def separations(
@@ -294,14 +294,44 @@ def separations(
         times of that clock [s; shape (n,)], none of fewer than two vehicles, and distances [m],
         NaN where fewer fly.
     """
-    tracks = []
-    for rows, began in zip(each, began_s, strict=True):
-        tracking = np.flatnonzero(rows["mode"] == Mode.TRACK)
-        if len(tracking):
-            flown = rows[tracking[0] :]
-            at = flown["state"][:, :, 0].copy()
-            at[:, 2:] *= height_scale
-            tracks.append((began + flown["step"] * dt_s, at))
+    tracks = [
+        track(rows, began, dt_s, height_scale)
+        for rows, began in zip(each, began_s, strict=True)
+        if (rows["mode"] == Mode.TRACK).any()
+    ]
+    return nearest(tracks, dt_s)
+
+
+Track = tuple[Array, Array]
+"""Times [s; shape (n,)] and positions of a vehicle then, heights scaled [m; shape (n, axes)]."""
+
+
+def track(
+    rows: Rows, began_s: float, dt_s: float, height_scale: float = 1.0, *, whole: bool = False
+) -> Track:
+    """Track of a vehicle, see `separations`.
+
+    Args:
+        rows: rows of the client's part of it.
+        began_s: time at which its step 0 began [s].
+        dt_s: length of a step [s].
+        height_scale: see `separations`.
+        whole: whether it begins with the first row, and not at the first step on a mission.
+    """
+    flown = rows if whole else rows[np.argmax(rows["mode"] == Mode.TRACK) :]
+    at = flown["state"][:, :, 0].copy()
+    at[:, 2:] *= height_scale
+    return began_s + flown["step"] * dt_s, at
+
+
+def nearest(tracks: Sequence[Track], dt_s: float) -> tuple[Array, Array]:
+    """Distance between the two vehicles that are nearest to each other, over time; see
+    `separations`.
+
+    Args:
+        tracks: one of each vehicle.
+        dt_s: time from one distance to the next [s].
+    """
     if len(tracks) < 2:
         return np.zeros(0), np.zeros(0)
     begin, end = min(times[0] for times, _ in tracks), max(times[-1] for times, _ in tracks)
@@ -310,8 +340,8 @@ def separations(
         np.stack([np.interp(grid_s, times, x, np.nan, np.nan) for x in at.T], axis=1)
         for times, at in tracks
     ]
-    nearest = np.full(len(grid_s), np.nan)
+    least_m = np.full(len(grid_s), np.nan)
     for number, one in enumerate(places):
         for other in places[:number]:
-            np.fmin(nearest, np.linalg.norm(one - other, axis=1), out=nearest)
-    return grid_s, nearest
+            np.fmin(least_m, np.linalg.norm(one - other, axis=1), out=least_m)
+    return grid_s, least_m

@@ -8,7 +8,7 @@ that still fails, and kept as a line of JSON with the seed of the flight.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any, Protocol, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -191,9 +191,18 @@ def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
     return low if low == high else float(low * (high / low) ** rng.random())
 
 
-def shrink(
-    faults: Sequence[ScheduledFault], fails: Callable[[tuple[ScheduledFault, ...]], bool]
-) -> tuple[ScheduledFault, ...]:
+class Timed(Protocol):
+    """Data class of something that lasts for a while."""
+
+    @property
+    def length_ns(self) -> int:
+        """Duration [ns]."""
+
+
+T = TypeVar("T", bound=Timed)
+
+
+def shrink(faults: Sequence[T], fails: Callable[[tuple[T, ...]], bool]) -> tuple[T, ...]:
     """Shrink a schedule to one that still fails, and no longer does without any one of its faults.
 
     Delta debugging: faults are left out, first many at a time and finally one by one; then each is
@@ -215,7 +224,7 @@ def shrink(
                 first += size
     for n in range(len(kept)):
         while kept[n].length_ns >= 2 * SHORTEST_NS:
-            shorter = replace(kept[n], length_ns=kept[n].length_ns // 2)
+            shorter = cast(T, replace(cast(Any, kept[n]), length_ns=kept[n].length_ns // 2))
             if not fails((*kept[:n], shorter, *kept[n + 1 :])):
                 break
             kept = (*kept[:n], shorter, *kept[n + 1 :])

@@ -1,0 +1,695 @@
+"""Adversary: chooses what network, server and operator do, to bring two vehicles together.
+
+    clients ── air ── server          on a mission, in virtual time
+
+A flight follows from its scenario and the adversary's moves: delays, losses, cuts and copies of
+packets, restarts of the server and of clients, goals and zones that are set in flight. The search
+climbs: it changes the best moves so far, keeps the change where it brings two vehicles nearer to
+each other, or one nearer to a zone, and begins anew where changes no longer help. Some changes aim
+at single packets of the nearest two, shortly before they are nearest. Moves are data: flown again,
+they give the same distance to the last bit.
+"""
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import partial
+from heapq import heappop, heappush
+from itertools import combinations, product
+from typing import Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+
+from skytether.client.simulated.sensor import Sensor
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.client.vehicle import Measurement
+from skytether.lab.faults import shrink
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.change import Running
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.scenario import mission
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.summary import Track, nearest, track
+from skytether.shared.wire.protocol import Mode
+from skytether.sim.ahead import AheadClient
+from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER
+from skytether.sim.world import Clock, World
+
+AIR: Address = ("air", 0)
+CLOCK = Clock(MIDNIGHT_NS)
+"""Clock of all hosts: the map of clocks does not depend on what they show."""
+BASE_NS = 50 * MILLISECOND_NS
+"""Delay of every packet before any move [ns]."""
+HOLD_NS = 3 * SECOND_NS
+"""Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
+ARRIVED_M, RESTS_MPS = 0.3, 0.1
+"""Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
+AIMED_NS = 10 * SECOND_NS
+"""Time before two vehicles are nearest that changes aim at [ns]."""
+ONE_NS = MILLISECOND_NS
+"""Length of a move against a single packet [ns]."""
+MOVES_MAX = 64
+"""Largest number of moves by default."""
+DRAWN = 10
+"""Tries drawn at random, with the best of which a climb begins."""
+PATIENCE = 40
+"""Tries without gain after which the search begins anew."""
+CLIMB = 100
+"""Most tries of one climb."""
+
+
+class Kind(StrEnum):
+    """Kind of a move."""
+
+    DELAYS = "delays"
+    """Packets take longer: by the first amount at the begin, by the second at the end [s]."""
+    LOSSES = "losses"
+    """A share of the packets is lost."""
+    CUTS = "cuts"
+    """All packets are lost."""
+    COPIES = "copies"
+    """Each packet comes once more, later by the amount [s]."""
+    SERVER = "server"
+    """The server is down, and begins anew without memory."""
+    CLIENT = "client"
+    """The client of a vehicle is down, and begins anew."""
+    GOALS = "goals"
+    """The vehicle is sent to the place of the amounts [m], and at the end to its own goal again."""
+    ZONES = "zones"
+    """There is a cylinder more, of x, y and a radius [m]."""
+
+
+NETWORK = (Kind.DELAYS, Kind.LOSSES, Kind.CUTS, Kind.COPIES)
+OPERATOR = (Kind.GOALS, Kind.ZONES)
+LENGTHS_S = {
+    Kind.CUTS: (0.2, 40.0),
+    Kind.SERVER: (0.2, 20.0),
+    Kind.CLIENT: (0.2, 3.0),
+}
+"""Shortest and longest move of a kind [s]."""
+LENGTH_S = (1.0, 60.0)
+"""Shortest and longest move of other kinds [s]."""
+AMOUNTS = {
+    Kind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
+    Kind.LOSSES: ((0.1, 1.0),),
+    Kind.COPIES: ((0.0, 1.5),),
+}
+"""Least and greatest of each amount of a kind; places are anywhere on the mission."""
+RADIUS_M = (0.4, 1.5)
+"""Least and greatest radius of a zone [m]."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """Something that the adversary does."""
+
+    kind: Kind
+    vehicle: Annotated[int, msgspec.Meta(ge=0)]
+    """Number of the vehicle; 0 for all of them."""
+    way: str
+    """`uplink` or `downlink` of packets; empty for both ways, and for other kinds."""
+    start_ns: Annotated[int, msgspec.Meta(ge=0)]
+    """Time of the world at which it begins [ns]."""
+    length_ns: Annotated[int, msgspec.Meta(ge=1)]
+    """Duration [ns]."""
+    amounts: tuple[float, ...] = ()
+    """Amounts, see `Kind`."""
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the world at which it ends [ns]."""
+        return self.start_ns + self.length_ns
+
+    def is_on(self, now_ns: int) -> bool:
+        """Whether it is done at a time of the world."""
+        return self.start_ns <= now_ns < self.end_ns
+
+
+Moves = tuple[Move, ...]
+
+
+class Packet(NamedTuple):
+    """A packet that entered the air."""
+
+    time_ns: int
+    way: str
+    vehicle: int
+
+
+class Near(msgspec.Struct, frozen=True):
+    """Smallest distance in a flight."""
+
+    distance_m: float
+    """Infinite where there is none."""
+    at_s: float
+    """Time of the world [s]."""
+    vehicles: tuple[int, ...]
+    """Numbers of those that were so near."""
+
+
+NOWHERE = Near(math.inf, 0.0, ())
+
+
+class Approach(msgspec.Struct, frozen=True, kw_only=True):
+    """Result of a flight."""
+
+    moves: Moves
+    apart: Near
+    """Distance of two vehicles from each other."""
+    clear: Near
+    """Distance of a vehicle from a zone that the operator has set; negative inside."""
+    left: int
+    """Observations outside a tube, as far as the server that lives at the end knows."""
+
+
+class Air(Endpoint):
+    """Network that does what the adversary wants.
+
+    Args:
+        moves: what the adversary does.
+        seed: seed of losses.
+    """
+
+    def __init__(self, moves: Moves, seed: int) -> None:
+        super().__init__()
+        self._moves = [move for move in moves if move.kind in NETWORK]
+        self._seed, self._chance = seed, dict[tuple[str, int], np.random.Generator]()
+        self._held: list[tuple[int, int, Datagram]] = []
+        """Heap of the packets under way: time of arrival, order, and packet."""
+        self.packets: list[Packet] = []
+        """All packets that have entered."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Decide on a packet; vehicle n is socket n to the server."""
+        payload, (host, _), socket = datagram
+        way, vehicle = ("uplink", socket) if socket else ("downlink", int(host.split()[1]))
+        onward = Datagram(payload, (f"client {vehicle}", 0) if socket else SERVER, vehicle - socket)
+        self.packets.append(Packet(now_ns, way, vehicle))
+        # Drawn for every packet, so that a packet's luck does not depend on other moves.
+        drawn = self._draw(way, vehicle)
+        late_s, copies_s = 0.0, []
+        for move in self._moves:
+            if move.vehicle not in (0, vehicle) or move.way not in ("", way):
+                continue
+            if not move.is_on(now_ns):
+                continue
+            match move.kind:
+                case Kind.DELAYS:
+                    at = (now_ns - move.start_ns) / move.length_ns
+                    late_s += move.amounts[0] + at * (move.amounts[1] - move.amounts[0])
+                case Kind.COPIES:
+                    copies_s.append(move.amounts[0])
+                case Kind.CUTS:
+                    return
+                case Kind.LOSSES if drawn < move.amounts[0]:
+                    return
+        for each_s in (0.0, *copies_s):
+            due_ns = now_ns + BASE_NS + seconds_to_ns(late_s + each_s)
+            heappush(self._held, (due_ns, len(self.packets), onward))
+
+    def _draw(self, way: str, vehicle: int) -> float:
+        """Random number of the next packet of a vehicle."""
+        if (way, vehicle) not in self._chance:
+            self._chance[way, vehicle] = stream(self._seed, "adversary", way, vehicle)
+        return float(self._chance[way, vehicle].random())
+
+    def wake(self, *, now_ns: int) -> None:
+        """Send the packets that are due."""
+        while self._held and self._held[0][0] <= now_ns:
+            self._out.append(heappop(self._held)[2])
+
+    def next_wake_ns(self) -> int | None:
+        """Time at which the next packet is due."""
+        return self._held[0][0] if self._held else None
+
+
+class Body(SimulatedVehicle):
+    """Simulated vehicle that outlives its clients: without one it keeps its last velocity.
+
+    Args:
+        scenario: what is flown.
+        number: number of the vehicle.
+    """
+
+    def __init__(self, scenario: Scenario, number: int) -> None:
+        made = simulated(scenario, number)
+        super().__init__(scenario.dt_ns, made.plant, made.sensor)
+        self._lost_ns: int | None = None
+        """Time at which its client went down, until there is another."""
+        self.unflown: list[tuple[float, list[float]]] = []
+        """Times [s; client's clock] and positions [m] of steps without a client."""
+
+    def lose_client(self, sensor: Sensor) -> None:
+        """Fly without a client from the present step on, and then by one with another sensor."""
+        if self._step >= 0:
+            self._lost_ns, self._step = self.starts_ns(self._step), -1
+        self.sensor = sensor
+
+    def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
+        """See `Vehicle`."""
+        if self._lost_ns is not None:
+            at_ns = self._lost_ns
+            while at_ns + self._dt_ns <= now_ns:
+                is_held = at_ns < self._lost_ns + HOLD_NS
+                self.plant.advance(self._velocity if is_held else 0.0 * self._velocity)
+                at_ns += self._dt_ns
+                self.unflown.append((at_ns / SECOND_NS, [p for p, _ in self.plant.x]))
+            self._lost_ns = None
+        return super().measurements(now_ns=now_ns)
+
+
+class Life(NamedTuple):
+    """Run of a vehicle's client."""
+
+    client: AheadClient
+    sink: io.BytesIO
+    """Record of its steps."""
+
+
+class Raid:
+    """Flight of a mission against the adversary.
+
+    Args:
+        scenario: what is flown; the network is the adversary's.
+        moves: what the adversary does.
+    """
+
+    def __init__(self, scenario: Scenario, moves: Moves) -> None:
+        made = scenario.make_reference()
+        assert isinstance(made, Mission)
+        self._scenario, self._moves, self._goals = scenario, moves, made
+        self._world, self._air = World(), Air(moves, scenario.seed)
+        self._world.add(AIR[0], self._air)
+        self._lives: dict[int, list[Life]] = {number: [] for number in made.vehicles}
+        mortal = {move.vehicle for move in moves if move.kind is Kind.CLIENT}
+        is_mortal = {number: number in mortal or 0 in mortal for number in made.vehicles}
+        make = {True: Body, False: simulated}
+        self._bodies = {n: make[each](scenario, n) for n, each in is_mortal.items()}
+        phase_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
+        for number in made.vehicles:
+            start_ns = phase_ns + number * scenario.dt_ns
+            client = self._new_client(number)
+            self._world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
+        self._servers = 0
+        self._running: Running | None = None
+        """Server and its scenario, while it is up."""
+        self._world.add(SERVER[0], self._new_server(), clock=CLOCK)
+        self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
+        """Zones that the operator has set, and since when [s; the hosts' clocks]."""
+        for move in moves:
+            if move.kind not in NETWORK:
+                self._plan(move)
+
+    def _new_server(self) -> Server:
+        """The next life of the server."""
+        self._servers += 1
+        entropy = stream(self._scenario.seed, "entropy", self._servers).bytes
+        boot_id, room = BOOT_ID + self._servers, len(self._goals.vehicles)
+        self._server = Server(self._scenario, boot_id=boot_id, entropy=entropy, room=room)
+        self._running = Running(self._server, self._scenario)
+        return self._server
+
+    def _new_client(self, number: int) -> AheadClient:
+        """The next life of a vehicle's client."""
+        lives, sink, world = self._lives[number], io.BytesIO(), self._world
+        client = AheadClient(
+            self._scenario,
+            self._bodies[number],
+            server=AIR,
+            vehicle=number,
+            boot_id=BOOT_ID + len(lives),
+            recorder=Recorder(client_columns(self._scenario.model.axes), sink),
+            clock=CLOCK,
+            world_ns=lambda: world.now_ns,
+        )
+        lives.append(Life(client, sink))
+        return client
+
+    def _plan(self, move: Move) -> None:
+        """Schedule a move that is not of the network."""
+        match move.kind:
+            case Kind.SERVER:
+                begin, end = self._stop_server, self._start_server
+            case Kind.CLIENT:
+                begin = partial(self._stop_clients, move.vehicle)
+                end = partial(self._start_clients, move.vehicle)
+            case _:
+                begin = end = self._set
+        self._world.at(move.start_ns, begin)
+        self._world.at(move.end_ns, end)
+
+    def _stop_server(self) -> None:
+        self._running = None
+        self._world.stop(SERVER[0])
+
+    def _start_server(self) -> None:
+        self._world.restart(SERVER[0], self._new_server())
+
+    def _stop_clients(self, vehicle: int) -> None:
+        for number in self._hit(vehicle):
+            self._lives[number][-1].client.catch_up()
+            self._world.stop(f"client {number}")
+
+    def _start_clients(self, vehicle: int) -> None:
+        for number in self._hit(vehicle):
+            body, lives = self._bodies[number], len(self._lives[number])
+            assert isinstance(body, Body)
+            noise = stream(self._scenario.seed, "sensor", number, lives)
+            body.lose_client(Sensor(self._scenario, noise))
+            self._world.restart(f"client {number}", self._new_client(number))
+
+    def _hit(self, vehicle: int) -> list[int]:
+        """Numbers of the vehicles that a move is against."""
+        return [number for number in self._lives if vehicle in (0, number)]
+
+    def _set(self) -> None:
+        """Set goals and zones as the moves of now say; the server may refuse them."""
+        running, now_ns, given = self._running, self._world.now_ns, self._scenario.mission
+        if running is None:
+            return
+        now = [move for move in self._moves if move.is_on(now_ns)]
+        goals = {move.vehicle: np.array(move.amounts) for move in now if move.kind is Kind.GOALS}
+        more = [
+            f"cylinder({', '.join(map(str, move.amounts))})"
+            for move in now
+            if move.kind is Kind.ZONES
+        ]
+        texts = {
+            "mission.goals": " & ".join(filter(None, [given.goals, mission.written(goals)])),
+            "mission.zones": " & ".join(filter(None, [given.zones, *more])),
+        }
+        for key, text in texts.items():
+            with suppress(ConfigError):
+                self._world.act(SERVER[0], partial(running.change, {key: text}))
+        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, running.scenario.zones))
+
+    # -- what is flown -----------------------------------------------------------------------------
+
+    def run(self) -> Approach:
+        """Fly until all have arrived and only the network may still change, or to the end."""
+        scenario, later = self._scenario, [m for m in self._moves if m.kind not in NETWORK]
+        look_ns = max((move.end_ns for move in later), default=0)
+
+        def over() -> bool:
+            nonlocal look_ns
+            if self._world.now_ns <= look_ns:
+                return False
+            look_ns = self._world.now_ns + SECOND_NS
+            return self._has_arrived()
+
+        self._world.run(over, limit_ns=seconds_to_ns(scenario.duration + scenario.link.connect_s))
+        tracks = {number: self._track(number) for number in self._lives}
+        left = self._server.figures()["counts"].get("left_tube", 0)
+        apart, clear = self._apart(tracks), self._clear(tracks)
+        return Approach(moves=self._moves, apart=apart, clear=clear, left=left)
+
+    @property
+    def packets(self) -> Sequence[Packet]:
+        """Packets that have entered the air."""
+        return self._air.packets
+
+    def _has_arrived(self) -> bool:
+        """Whether all vehicles are at rest at their last goals."""
+        for number, body in self._bodies.items():
+            goal = self._goals.of(number)(np.array(self._scenario.duration))[:, 0]
+            p, v = body.plant.state().T
+            if math.dist(p, goal) > ARRIVED_M or math.hypot(*v) > RESTS_MPS:
+                return False
+        return True
+
+    def _track(self, number: int) -> Track:
+        """Where a vehicle truly was, from its first step on a mission on, through all its lives."""
+        dt_s, scale = self._scenario.control.dt, self._scenario.mission.height_scale
+        tracks: list[Track] = []
+        for client, sink in self._lives[number]:
+            client.catch_up()
+            rows = parse(sink.getvalue())
+            if tracks or (rows["mode"] == Mode.TRACK).any():
+                began_s = client.began_ns / SECOND_NS
+                tracks.append(track(rows, began_s, dt_s, scale, whole=bool(tracks)))
+        body = self._bodies[number]
+        if tracks and isinstance(body, Body) and body.unflown:
+            times, at = (np.array(each) for each in zip(*body.unflown, strict=True))
+            at[:, 2:] *= scale
+            since = times > tracks[0][0][0]
+            tracks.append((times[since], at[since]))
+        if not tracks:
+            return np.zeros(0), np.zeros((0, self._scenario.model.axes))
+        times, at = (np.concatenate(each) for each in zip(*tracks, strict=True))
+        order = np.argsort(times, kind="stable")
+        return times[order], at[order]
+
+    def _apart(self, tracks: Mapping[int, Track]) -> Near:
+        """Smallest distance between two vehicles."""
+        flown = {number: each for number, each in tracks.items() if len(each[0])}
+        times, apart_m = nearest(list(flown.values()), self._scenario.control.dt)
+        if not np.isfinite(apart_m).any():
+            return NOWHERE
+        least = int(np.nanargmin(apart_m))
+        places = {
+            number: [np.interp(times[least], at_s, x, np.nan, np.nan) for x in at.T]
+            for number, (at_s, at) in flown.items()
+        }
+        by_m = {pair: math.dist(*map(places.__getitem__, pair)) for pair in combinations(places, 2)}
+        pair = min(by_m, key=lambda each: (math.isnan(by_m[each]), by_m[each]))
+        return Near(float(apart_m[least]), _world_s(times[least]), pair)
+
+    def _clear(self, tracks: Mapping[int, Track]) -> Near:
+        """Smallest distance of a vehicle from a zone, while there was that zone."""
+        scale, found = self._scenario.mission.height_scale, NOWHERE
+        ends = [since for since, _ in self._zones[1:]] + [math.inf]
+        for (since, zones), end in zip(self._zones, ends, strict=True):
+            for number, (times, at) in tracks.items():
+                here = np.flatnonzero((times >= since) & (times < end))
+                if zones and len(here):
+                    points = at[here] / np.array([1.0, 1.0, scale])[: at.shape[1]]
+                    clear_m = zones.clearance(points).min(axis=1)
+                    i = int(clear_m.argmin())
+                    if clear_m[i] < found.distance_m:
+                        found = Near(float(clear_m[i]), _world_s(times[here[i]]), (number,))
+        return found
+
+
+def _world_s(time_s: float) -> float:
+    """Time of the world, of one of the hosts' clocks [s]."""
+    return float(time_s) - MIDNIGHT_NS / SECOND_NS
+
+
+# -- search --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Climb:
+    """A climb of the search."""
+
+    scenario: Scenario
+    kinds: tuple[Kind, ...]
+    """Kinds of moves that the adversary may do."""
+    number: int
+    """Number of the climb, from which all its chance follows."""
+    tries: int
+    """Number of flights."""
+    moves: int = MOVES_MAX
+    """Largest number of moves."""
+    patience: int = PATIENCE
+    """Tries without gain after which it begins anew; 0: all moves are drawn at random."""
+
+    @property
+    def seeks_zones(self) -> bool:
+        """Whether it brings vehicles near to zones: every other one, where there are any."""
+        may = bool(self.scenario.zones) or Kind.ZONES in self.kinds
+        return may and bool(self.number % 2)
+
+
+class Climbed(NamedTuple):
+    """Result of a climb."""
+
+    best: Approach
+    spares_m: list[float]
+    """What was left of the distances asked for, of each try [m]."""
+
+
+def fly(scenario: Scenario, moves: Moves) -> Approach:
+    """Fly a mission against the adversary."""
+    return Raid(scenario, moves).run()
+
+
+def spare_m(scenario: Scenario, found: Approach) -> float:
+    """What is left of the distances asked for [m]; negative: one was not kept."""
+    return min(found.apart.distance_m - scenario.mission.separation_m, found.clear.distance_m)
+
+
+def climb(task: Climb) -> Climbed:
+    """Search for the moves that bring vehicles nearest."""
+    scenario, rng = task.scenario, stream(task.scenario.seed, "climb", task.number)
+    draws, spares_m = Draws(task, rng), list[float]()
+    best: Approach | None = None
+    here: Approach | None = None
+    drawn, since, packets = 0, 0, list[Packet]()
+
+    def value(found: Approach) -> float:
+        return (found.clear if task.seeks_zones else found.apart).distance_m
+
+    for _ in range(task.tries):
+        if since >= task.patience:
+            here, drawn, since = None, 0, 0
+        if here is None or drawn < DRAWN:
+            moves, drawn = draws.some(), drawn + 1
+        else:
+            near, since = here.clear if task.seeks_zones else here.apart, since + 1
+            moves = draws.changed(here.moves, near, packets)
+        raid = Raid(scenario, moves)
+        found = raid.run()
+        if here is None or value(found) < value(here):
+            here, packets, since = found, list(raid.packets), 0
+        if best is None or spare_m(scenario, found) < spare_m(scenario, best):
+            best = found
+        spares_m.append(spare_m(scenario, found))
+    assert best is not None
+    return Climbed(best, spares_m)
+
+
+class Draws:
+    """Moves that are drawn at random.
+
+    Args:
+        task: climb that they are for.
+        rng: random generator.
+    """
+
+    def __init__(self, task: Climb, rng: np.random.Generator) -> None:
+        made = task.scenario.make_reference()
+        assert isinstance(made, Mission)
+        self._rng, self._most = rng, task.moves
+        self._kinds, self._vehicles = task.kinds, made.vehicles
+        self._low, self._high = made.places.min(axis=0), made.places.max(axis=0)
+        self._last_ns = seconds_to_ns(task.scenario.duration)
+
+    def some(self) -> Moves:
+        """Moves to begin with."""
+        rng, moves = self._rng, list[Move]()
+        kinds = [kind for kind in self._kinds if kind is not Kind.DELAYS]
+        if Kind.DELAYS in self._kinds:
+            high_s = float(rng.uniform(0.0, AMOUNTS[Kind.DELAYS][0][1]))
+            for vehicle, way in product(self._vehicles, ("uplink", "downlink")):
+                if rng.random() < 0.5:
+                    amounts = (high_s, high_s)
+                    moves.append(Move(Kind.DELAYS, vehicle, way, 0, self._last_ns, amounts))
+        if kinds:
+            moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
+        return tuple(moves[-self._most :])
+
+    def _one(self, kinds: Sequence[Kind]) -> Move:
+        """One move of some kinds."""
+        rng, kind = self._rng, kinds[int(self._rng.integers(len(kinds)))]
+        low_s, high_s = LENGTHS_S.get(kind, LENGTH_S)
+        length_ns = seconds_to_ns(low_s * (high_s / low_s) ** rng.random())
+        start_ns = int(rng.integers(self._last_ns))
+        vehicle, way = int(rng.choice(self._vehicles)), ""
+        if kind is Kind.SERVER or (kind in NETWORK and rng.random() < 0.2):
+            vehicle = 0
+        if kind in NETWORK:
+            way = ("uplink", "downlink", "")[rng.integers(3)]
+        return Move(kind, vehicle, way, start_ns, length_ns, self._amounts(kind))
+
+    def _amounts(self, kind: Kind) -> tuple[float, ...]:
+        """Amounts of a move."""
+        rng = self._rng
+        if kind in OPERATOR:
+            place = rng.uniform(self._low, self._high)
+            if kind is Kind.ZONES:
+                place = np.append(place[:2], rng.uniform(*RADIUS_M))
+            return tuple(round(each, 3) for each in place.tolist())
+        return tuple(float(rng.uniform(*each)) for each in AMOUNTS.get(kind, ()))
+
+    def changed(self, moves: Moves, near: Near, packets: Sequence[Packet]) -> Moves:
+        """Moves with a change or two.
+
+        Args:
+            moves: moves of the best flight so far.
+            near: what was nearest in it.
+            packets: packets of it.
+        """
+        rng, now = self._rng, list(moves)
+        for _ in range(1 + rng.poisson(0.5)):
+            i = int(rng.integers(len(now))) if now else -1
+            match rng.choice(5, p=(0.4, 0.2, 0.1, 0.1, 0.2)):
+                case 0 if now:
+                    now[i] = self._tuned(now[i])
+                case 2 if len(now) > 1:
+                    del now[i]
+                case 3 if now and now[i].vehicle:
+                    now[i] = replace(now[i], vehicle=int(rng.choice(self._vehicles)))
+                case 4:
+                    now.append(self._aimed(near, packets))
+                case _:
+                    now.append(self._one(self._kinds))
+        # The newest stay: a change must change something.
+        return tuple(now[-self._most :])
+
+    def _tuned(self, move: Move) -> Move:
+        """A move a little earlier, later, longer, shorter, stronger or weaker."""
+        rng = self._rng
+        low_s, high_s = LENGTHS_S.get(move.kind, LENGTH_S)
+        match rng.integers(3):
+            case 0:
+                start_ns = move.start_ns + seconds_to_ns(float(rng.normal(0.0, 1.0)))
+                return replace(move, start_ns=min(max(start_ns, 0), self._last_ns))
+            case 1 if low_s < high_s:
+                length_s = move.length_ns / SECOND_NS * float(np.exp(rng.normal(0.0, 0.5)))
+                length_ns = seconds_to_ns(min(max(length_s, low_s), high_s))
+                return replace(move, length_ns=length_ns)
+            case _:
+                other = self._amounts(move.kind)
+                share = rng.random() ** 2
+                pairs = zip(move.amounts, other, strict=True)
+                return replace(move, amounts=tuple(a + share * (b - a) for a, b in pairs))
+
+    def _aimed(self, near: Near, packets: Sequence[Packet]) -> Move:
+        """A move shortly before what was nearest, against one of those that were."""
+        rng, at_ns = self._rng, seconds_to_ns(near.at_s)
+        move, those = self._one(self._kinds), near.vehicles or self._vehicles
+        start_ns = max(at_ns - int(rng.integers(AIMED_NS)), 0)
+        vehicle = int(rng.choice(those)) if move.vehicle else 0
+        mine = [
+            each
+            for each in packets
+            if each.vehicle in those and at_ns - AIMED_NS <= each.time_ns <= at_ns
+        ]
+        if move.kind in NETWORK and mine and rng.random() < 0.7:
+            time_ns, way, vehicle = mine[int(rng.integers(len(mine)))]
+            return replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS)
+        return replace(move, vehicle=vehicle, start_ns=start_ns)
+
+
+def shrunk(scenario: Scenario, found: Approach) -> Approach:
+    """The fewest and shortest moves with which a distance is still not kept."""
+    moves = shrink(found.moves, lambda moves: spare_m(scenario, fly(scenario, moves)) < 0.0)
+    return fly(scenario, moves)
+
+
+def dumps(moves: Moves) -> str:
+    """Line of JSON for moves."""
+    return msgspec.json.encode(moves).decode()
+
+
+def loads(line: str) -> Moves:
+    """Moves in a line of JSON.
+
+    Raises:
+        ConfigError: the line has no moves.
+    """
+    try:
+        return msgspec.json.decode(line, type=Moves)
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"moves: {error}") from None

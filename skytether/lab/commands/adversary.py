@@ -1,0 +1,207 @@
+"""`skytether adversary`: a search for what brings vehicles of a mission together."""
+
+import shlex
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from rich.table import Table
+from rich.text import Text
+
+from skytether.lab.adversary import (
+    CLIMB,
+    MOVES_MAX,
+    PATIENCE,
+    Approach,
+    Climb,
+    Climbed,
+    Kind,
+    Moves,
+    climb,
+    dumps,
+    fly,
+    loads,
+    shrunk,
+    spare_m,
+)
+from skytether.lab.commands.pool import Flags, crew
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command, terminal
+from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.options import Argument
+
+TRIES_MAX = 10**6
+
+
+class Kept(msgspec.Struct, frozen=True):
+    """Results in the file of `--json`."""
+
+    nearest: Approach
+    """Flight with the least spare distance."""
+    spares_m: Sequence[float]
+    """What was left of the distances asked for, of each flight [m]."""
+
+
+OWN = ("with", "tries", "moves", "first", "workers", "json")
+"""Options with a value that are about the search, and not about a flight."""
+
+
+@dataclass(frozen=True)
+class AdversaryOptions:
+    """Options of `skytether adversary`."""
+
+    scenario: ScenarioName = "swap"
+    """Name of a mission (swap, sphere, rings, corridor, warehouse) or a .toml file."""
+    kinds: Annotated[str, Argument(name="with", metavar="KINDS")] = "delays,losses,cuts,copies"
+    """Kinds of moves, with commas: delays, losses, cuts, copies, server, client, goals, zones."""
+    tries: Annotated[int, Argument(metavar="N")] = 200
+    """Number of flights."""
+    moves: Annotated[int, Argument(metavar="N")] = MOVES_MAX
+    """Largest number of moves of a flight."""
+    random: bool = False
+    """Draw the moves of each flight at random, without a search."""
+    first: Annotated[int, Argument(metavar="N")] = 0
+    """Number of the first climb: another number begins elsewhere."""
+    workers: Annotated[int | None, Argument(metavar="N")] = None
+    """Number of worker processes; one per core unless given."""
+    attack: Annotated[str | None, Argument(metavar="JSON|FILE")] = None
+    """Moves to fly once: as printed by a search, or the file of its --json."""
+    json: Path | None = None
+    """File for the moves that brought vehicles nearest, and for what was left of the distances
+    asked for in each flight."""
+    plugin: command.Plugins = ()
+    config: ScenarioFlags = Scenario()
+
+
+def adversary(argv: Sequence[str]) -> None:
+    """Search for delays, losses, restarts, goals and zones that bring vehicles together.
+
+    The adversary has the network of a mission in his hands: packets of each vehicle are delayed,
+    lost and copied as he likes, each way; if asked, server and clients die and begin anew, and
+    goals and zones change. The search climbs towards the flight in which two vehicles are nearest,
+    or a vehicle is nearest to a zone. If a distance that is asked for is not kept, the exit code is
+    1, and the fewest moves with which it is not are printed; --attack flies them again.
+    """
+    options = command.parse(AdversaryOptions(), argv, "skytether adversary", adversary.__doc__)
+    if not isinstance(options.config.given_reference(), Mission):
+        said = f"{options.scenario}: got no mission, expected one, such as swap"
+        raise CommandError(said, command.CONFIGURATION)
+    title = f"{options.scenario}, seed {options.config.seed}"
+    if options.attack is not None:
+        found, spares_m = fly(options.config, _moves(options.attack)), list[float]()
+    else:
+        found, spares_m = _search(options, title)
+    _finish(options, argv, title, found, spares_m)
+
+
+def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float]]:
+    """Flight with the least spare distance, and the spare distances of all flights [m]."""
+    command.check_count("--tries", options.tries, TRIES_MAX)
+    command.check_count("--moves", options.moves, MOVES_MAX)
+    pool, patience = Flags(workers=options.workers), 0 if options.random else PATIENCE
+    pool.check()
+    numbers = range(-(-options.tries // CLIMB))
+    tasks = [
+        Climb(
+            options.config,
+            _kinds(options.kinds),
+            options.first + number,
+            min(CLIMB, options.tries - number * CLIMB),
+            options.moves,
+            patience,
+        )
+        for number in numbers
+    ]
+    done: dict[int, Climbed] = {}
+    with crew(pool, f"against {title}", options.tries, "flights") as flyers:
+
+        def keep(number: int, climbed: Climbed) -> None:
+            done[number] = climbed
+            least_m = min(min(each.spares_m) for each in done.values())
+            flyers.advance(len(climbed.spares_m), f"{least_m:.3f} m left")
+
+        flyers.share(climb, tasks, keep)
+    spares_m = [each for number in numbers for each in done[number].spares_m]
+    bests = [done[number].best for number in numbers]
+    return min(bests, key=lambda each: spare_m(options.config, each)), spares_m
+
+
+def _moves(text: str) -> Moves:
+    """Moves in a text, or in the file of `--json` that it names.
+
+    Raises:
+        CommandError: the file cannot be read.
+        ConfigError: there are none.
+    """
+    if text.startswith("["):
+        return loads(text)
+    try:
+        return msgspec.json.decode(Path(text).read_bytes(), type=Kept).nearest.moves
+    except OSError as error:
+        raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"--attack: {text}: {error}") from None
+
+
+def _kinds(text: str) -> tuple[Kind, ...]:
+    """Kinds that a text names.
+
+    Raises:
+        CommandError: it names something else.
+    """
+    try:
+        return tuple(map(Kind, dict.fromkeys(text.split(","))))
+    except ValueError:
+        expected = f"expected some of {','.join(Kind)}"
+        raise CommandError(f"--with: got {text}, {expected}", command.CONFIGURATION) from None
+
+
+def _finish(
+    options: AdversaryOptions,
+    argv: Sequence[str],
+    title: str,
+    found: Approach,
+    spares_m: Sequence[float],
+) -> None:
+    """Write and print what was found.
+
+    Raises:
+        CommandError: a distance was not kept.
+    """
+    if options.json is not None:
+        command.write(options.json, msgspec.json.encode(Kept(found, spares_m)))
+    failed, apart, clear = sum(each < 0.0 for each in spares_m), found.apart, found.clear
+    asked_m = options.config.mission.separation_m
+    table = Table(title=f"adversary against {title}", title_justify="left", show_header=False)
+    if spares_m:
+        table.add_row("flights", f"{len(spares_m)}, {options.kinds}")
+        table.add_row("in which a distance was not kept", str(failed))
+    # With all digits: the same moves give the same distance.
+    table.add_row(Text("least separation, asked for [m]"), f"{apart.distance_m!r}, {asked_m:g}")
+    table.add_row(Text("  at [s], of vehicles"), f"{apart.at_s:.2f}, {apart.vehicles}")
+    if clear.vehicles:
+        table.add_row(Text("least distance from a zone [m]"), repr(clear.distance_m))
+        table.add_row(Text("  at [s], of vehicle"), f"{clear.at_s:.2f}, {clear.vehicles[0]}")
+    table.add_row("observations outside a tube", str(found.left))
+    table.add_row("moves", ", ".join(sorted({each.kind for each in found.moves})) or "none")
+    terminal.show(table)
+    if spare_m(options.config, found) < 0.0:
+        if spares_m:
+            fewest = shrunk(options.config, found)
+            again = shlex.join(["adversary", *_of_flight(argv), "--attack", dumps(fewest.moves)])
+            print(f"fewest moves, {fewest.apart.distance_m!r} m:\n    skytether {again}")
+        raise CommandError("a distance that is asked for was not kept")
+
+
+def _of_flight(argv: Sequence[str]) -> list[str]:
+    """Command line without the options of the search."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    for option in (*OWN, "attack"):
+        parser.add_argument(f"--{option}")
+    parser.add_argument("--random", action="store_true")
+    return parser.parse_known_args(list(argv))[1]
