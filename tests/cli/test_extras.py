@@ -34,6 +34,7 @@ LAB = (
     "margins",
     "identify",
     "torture",
+    "adversary",
     "reproduce",
     "compare",
     "calibrate",

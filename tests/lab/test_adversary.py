@@ -1,20 +1,25 @@
 """The adversary: what it does, that it finds planted faults, and that what it found comes again."""
 
 import math
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
-from skytether.lab import adversary
+import skytether.lab.commands.adversary as commands
+from skytether.__main__ import main
 from skytether.lab.adversary import (
     Air,
-    Approach,
+    Body,
     Climb,
     Kind,
     Move,
-    Moves,
     climb,
     dumps,
     fly,
@@ -22,26 +27,51 @@ from skytether.lab.adversary import (
     shrunk,
     spare_m,
 )
-from skytether.server.control import roster
+from skytether.lab.commands.adversary import Kept
 from skytether.server.control.known import Known
+from skytether.server.control.roster import Roster
 from skytether.server.control.together import Together
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 Patch = Callable[[pytest.MonkeyPatch], None]
+replaced = msgspec.structs.replace
 
 
-def scenario(shape: str, duration: float = 40.0) -> Scenario:
+class Alone:
+    """Crew of this process: what is patched here is patched for it, too."""
+
+    def advance(self, amount: float, text: str = "") -> None:
+        """Count nothing."""
+
+    def share(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[Any],
+        on_done: Callable[[int, Any], None],
+    ) -> None:
+        """Run a function for all items, one after the other."""
+        for number, item in enumerate(items):
+            on_done(number, function(item))
+
+
+@contextmanager
+def alone(*_: object) -> Iterator[Alone]:
+    """Crew without workers."""
+    yield Alone()
+
+
+def scenario(shape: str, duration: float = 30.0) -> Scenario:
     """A mission, by its name or shape."""
     loaded = reading.load(shape.partition("(")[0])
     if "(" in shape:
-        reference = msgspec.structs.replace(loaded.reference, shape=shape)
-        loaded = msgspec.structs.replace(loaded, reference=reference)
-    return msgspec.structs.replace(loaded, duration=duration)
+        reference = replaced(loaded.reference, shape=shape)
+        loaded = replaced(loaded, reference=reference)
+    return replaced(loaded, duration=duration)
 
 
 def move(
@@ -55,6 +85,67 @@ def move(
 FOUR = scenario("swap(4)")
 
 
+# -- what the adversary does ---------------------------------------------------------------------
+
+
+def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -> list[float]:
+    """Times after which packets of vehicle 2 arrive that enter the air at one time [s]."""
+    air, entered_ns = Air(moves, seed=1), seconds_to_ns(at_s)
+    for _ in range(count):
+        if way == "downlink":
+            air.receive(Datagram(b"", ("client 2", 0), 0), now_ns=entered_ns)
+        else:
+            air.receive(Datagram(b"", ("server", 0), 2), now_ns=entered_ns)
+    found = []
+    while (due_ns := air.next_wake_ns()) is not None:
+        air.wake(now_ns=due_ns)
+        to = ("server", 0) if way == "downlink" else ("client 2", 0)
+        found += [(due_ns - entered_ns) / SECOND_NS for each in air.outbox() if each.peer == to]
+    return found
+
+
+def test_a_delay_is_of_one_vehicle_and_one_way_and_grows_as_it_says() -> None:
+    """Others take the base delay, and what lasts long changes slowly; delays add up."""
+    grows = move(Kind.DELAYS, 2, "downlink", 10.0, 10.0, 0.2, 0.4)
+    assert arrivals(grows, at_s=9.9) == [0.05]
+    assert arrivals(grows, at_s=10.0) == pytest.approx([0.25])
+    assert arrivals(grows, at_s=15.0) == pytest.approx([0.35])
+    assert arrivals(grows, grows, at_s=15.0) == pytest.approx([0.65])
+    assert arrivals(grows, at_s=20.0) == [0.05]
+    assert arrivals(grows, at_s=15.0, way="uplink") == [0.05]
+    assert arrivals(replace(grows, vehicle=1), at_s=15.0) == [0.05]
+    assert arrivals(replace(grows, vehicle=0, way=""), at_s=15.0, way="uplink") == [0.35]
+
+
+def test_packets_are_cut_lost_and_copied() -> None:
+    """A cut takes all, a loss its share, and a copy comes later than the packet."""
+    assert arrivals(move(Kind.CUTS, 2, "", 1.0, 1.0), at_s=1.5) == []
+    lost = move(Kind.LOSSES, 2, "", 0.0, 9.0, 0.3)
+    assert 600 < len(arrivals(lost, at_s=1.0, count=1000)) < 800
+    copied = move(Kind.COPIES, 2, "", 0.0, 9.0, 0.7)
+    assert arrivals(copied, at_s=1.0) == pytest.approx([0.05, 0.75])
+
+
+def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
+    """Its last velocity, for three seconds; the observer knows where it was meanwhile."""
+    body = Body(FOUR, 1)
+    body.measurements(now_ns=0)
+    body.fly(np.array([0.5, 0.0]))
+    body.measurements(now_ns=4 * SECOND_NS)
+    began = body.plant.state()[0, 0]
+    body.lose_client(body.sensor)
+    body.measurements(now_ns=14 * SECOND_NS)
+    assert len(body.unflown) == 200
+    times = np.array([at_s for at_s, _ in body.unflown])
+    x = np.array([place[0] for _, place in body.unflown])
+    assert times[0] == pytest.approx(4.05)
+    assert x[59] - began == pytest.approx(1.5, abs=0.3)
+    assert abs(x[-1] - x[120]) < 0.3  # it has stopped, but for the wind
+
+
+# -- what it finds -------------------------------------------------------------------------------
+
+
 def newest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the server keep apart from the newest motion alone."""
     motions = Known.motions
@@ -66,8 +157,14 @@ def newest(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have a new server not wait for the end of motions of the one before."""
-    monkeypatch.setattr(roster, "LONGEST", -(10**6))
+    """Have a new server plan before it has heard all vehicles."""
+    init = Roster.__init__
+
+    def begin(self: Roster, *args: Any) -> None:
+        init(self, *args)
+        self.absent.clear()
+
+    monkeypatch.setattr(Roster, "__init__", begin)
 
 
 def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,22 +173,135 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kinds", "ablation", "tries"),
+    ("kinds", "first", "ablation"),
     [
-        ("losses,cuts", newest, 40),
-        ("server", hasty, 40),
-        ("zones", heedless, 20),
-        ("goals", newest, 40),
-        ("copies", newest, 40),
+        pytest.param("losses", 4, newest, marks=pytest.mark.long),
+        ("cuts", 2, newest),
+        ("delays", 4, newest),
+        pytest.param("goals,losses", 5, newest, marks=pytest.mark.long),
+        pytest.param("server,cuts", 1, hasty, marks=pytest.mark.long),
+        ("zones", 0, heedless),
     ],
 )
 def test_each_kind_of_move_finds_a_planted_fault(
-    kinds: str, ablation: Patch, tries: int, monkeypatch: pytest.MonkeyPatch
+    kinds: str, first: int, ablation: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A safeguard is off; with it, the same moves do no harm."""
-    task = Climb(FOUR, tuple(map(Kind, kinds.split(","))), 1, tries)
+    """One safeguard is off; with it the same moves do no harm."""
+    flown = replaced(FOUR, duration=80.0) if "server" in kinds else FOUR
+    named = tuple(map(Kind, kinds.split(",")))
     with monkeypatch.context() as without:
         ablation(without)
-        best = climb(task).best
-        assert spare_m(FOUR, best) < 0.0
-    assert spare_m(FOUR, fly(FOUR, best.moves)) > 0.0
+        climbs = (climb(Climb(flown, named, first + n, 7)).best for n in range(20))
+        best = next(each for each in climbs if spare_m(flown, each) < 0.0)
+    assert spare_m(flown, fly(flown, best.moves)) > 0.0
+
+
+# -- what is found comes again -------------------------------------------------------------------
+
+DIES = move(Kind.CUTS, 0, "", 3.0, 2.0)
+IN_THE_WAY = move(Kind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)
+
+
+def test_a_flight_comes_again_to_the_last_bit() -> None:
+    """Also from its line of JSON, with moves of all kinds."""
+    moves = (
+        DIES,
+        move(Kind.DELAYS, 1, "uplink", 0.0, 30.0, 0.1, 0.7),
+        move(Kind.LOSSES, 3, "", 0.0, 30.0, 0.4),
+        move(Kind.COPIES, 4, "downlink", 0.0, 30.0, 0.3),
+        move(Kind.GOALS, 2, "", 4.0, 3.0, 1.0, -3.0),
+        move(Kind.CLIENT, 3, "", 6.0, 0.2),
+        move(Kind.SERVER, 0, "", 7.0, 1.0),
+    )
+    found = fly(FOUR, moves)
+    assert math.isfinite(found.apart.distance_m)
+    assert fly(FOUR, loads(dumps(moves))) == found
+
+
+def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A zone is flown into; a cut and a goal that do nothing to that are left out."""
+    heedless(monkeypatch)
+    found = fly(FOUR, (DIES, IN_THE_WAY, move(Kind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
+    assert found.clear.distance_m < 0.0
+    fewest = shrunk(FOUR, found)
+    assert [each.kind for each in fewest.moves] == [Kind.ZONES]
+    assert fewest.moves[0].length_ns < IN_THE_WAY.length_ns
+    assert spare_m(FOUR, fewest) < 0.0
+
+
+def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None:
+    """All its chance follows from the seed and the number."""
+    tasks = [Climb(replaced(FOUR, duration=8.0), (Kind.DELAYS,), number, 3) for number in (1, 2)]
+    one, other = map(climb, tasks)
+    assert one.best.moves != other.best.moves
+    assert climb(tasks[0]) == one
+
+
+def test_what_is_no_list_of_moves_is_refused() -> None:
+    """In a sentence that says what is wrong."""
+    for line in ("[", '[{"kind":"rain"}]', dumps((replace(DIES, start_ns=-1),))):
+        with pytest.raises(ConfigError, match="moves: "):
+            loads(line)
+
+
+SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "15")
+
+
+def test_the_command_prints_what_flies_it_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The line with the fewest moves, and the file with the nearest flight."""
+    heedless(monkeypatch)
+    monkeypatch.setattr(commands, "crew", alone)
+    monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
+    kept = tmp_path / "found.json"
+    search = (*SHORT, "--with", "zones", "--tries", "4", "--json", str(kept))
+    assert main(["adversary", *search]) == 1
+    printed = capsys.readouterr().out
+    (again,) = (line for line in printed.splitlines() if line.startswith("    skytether "))
+    nearest = msgspec.json.decode(kept.read_bytes(), type=Kept).nearest
+    assert repr(nearest.apart.distance_m) in printed
+    for attack, shown in (
+        (again, "zones"),
+        (
+            f"skytether adversary {shlex.join(SHORT)} --attack {kept}",
+            repr(nearest.apart.distance_m),
+        ),
+    ):
+        assert main(shlex.split(attack)[1:]) == 1
+        assert shown in capsys.readouterr().out
+
+
+def test_the_command_ends_well_where_all_distances_are_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Moves drawn at random, too."""
+    monkeypatch.setattr(commands, "crew", alone)
+    assert main(["adversary", *SHORT, "--with", "losses,copies", "--tries", "2", "--random"]) == 0
+    assert "2, losses,copies" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("demo",), "demo: got no mission, expected one, such as swap"),
+        (("swap", "--with", "rain"), "--with: got rain, expected some of delays,losses"),
+        (("swap", "--tries", "0"), "--tries: got 0, expected 1 to"),
+        (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(
+    options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the option and what was expected."""
+    assert main(["adversary", *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["sphere", "rings", "corridor", "warehouse"])
+def test_each_mission_can_be_searched(name: str) -> None:
+    """Every one that comes with Skytether is flown against moves of all kinds."""
+    found = climb(Climb(replaced(reading.load(name), duration=30.0), tuple(Kind), 1, 2))
+    assert math.isfinite(found.best.apart.distance_m)
+    assert len(found.spares_m) == 2

@@ -283,6 +283,7 @@ def test_every_documented_command_is_tested() -> None:
     known += ("skytether compare",)  # by test_compare.py
     known += ("skytether keygen ",)  # by test_keyring.py
     known += ("skytether torture",)  # by test_torture.py
+    known += ("skytether adversary ",)  # by test_adversary.py
     known += ("skytether set ", "skytether report ", "skytether export ", "skytether recover ")
     known += ("skytether replay ", "skytether duel ", "skytether page ")
     known += ("skytether autopilot ",)  # by test_autopilot.py
