@@ -17,14 +17,26 @@ import math
 import re
 import typing
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NewType, TypeVar, overload
 
+import msgspec
 from msgspec import Meta
 
 from skytether.shared.base.errors import ConfigError
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+LOW, HIGH = {"ge": "<=", "gt": "<"}, {"le": "<=", "lt": "<"}
+"""Bounds of a number from below and above, by their names in msgspec.Meta."""
+FURTHER = {
+    "multiple_of": "a multiple of",
+    "pattern": "with the pattern",
+    "min_length": "of a length from",
+    "max_length": "of a length up to",
+}
+"""All other bounds, by their names in msgspec.Meta, as a message has them."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 
@@ -45,14 +57,9 @@ class Parameter:
     """A number that an entry takes, or one of some words, or the name of a file."""
 
     name: str
-    low: float = -math.inf
-    """Smallest value; it is finite in any case."""
-    high: float = math.inf
-    """Largest value; it is finite in any case."""
-    whole: bool = False
-    words: tuple[str, ...] = ()
-    """Words of which it is one; empty for a number or a file."""
-    file: bool = False
+    type: Any = float
+    """Type as msgspec converts to it, with bounds: of a number, of words (Literal), or of a text
+    that names a file."""
     default: float | str | None = None
     """Value where the entry stands without arguments."""
     key: str = ""
@@ -60,10 +67,16 @@ class Parameter:
 
     def takes(self, value: Any) -> bool:
         """Whether the parameter may have this value."""
-        if self.words or self.file:
-            return isinstance(value, str) and (value in self.words or self.file)
-        kinds = (int,) if self.whole else (int, float)
-        return type(value) in kinds and self.low <= value <= self.high and math.isfinite(value)
+        try:
+            msgspec.convert(value, self.type)
+        except msgspec.ValidationError:
+            return False
+        return isinstance(value, str) or math.isfinite(value)
+
+    @property
+    def file(self) -> bool:
+        """Whether the value is the name of a file."""
+        return _bounds(self.type)[0] is str
 
     @property
     def may_miss(self) -> bool:
@@ -71,11 +84,26 @@ class Parameter:
         return bool(self.key) or self.default is not None
 
     def __str__(self) -> str:
-        if self.words or self.file:
-            return f"{self.name} {'a file' if self.file else ' or '.join(self.words)}"
-        low = f"{self.low:.15g} <= " if math.isfinite(self.low) else ""
-        high = f" <= {self.high:.15g}" if math.isfinite(self.high) else ""
-        return f"{low}{self.name}{high}{' (whole)' * self.whole}"
+        kind, bounds = _bounds(self.type)
+        if self.file or typing.get_origin(kind) is Literal:
+            what = "a file" if self.file else " or ".join(typing.get_args(kind))
+            return " ".join([self.name, what, *_further(bounds)])
+        low = [f"{bounds[key]:.15g} {sign} " for key, sign in LOW.items() if key in bounds]
+        high = [f" {sign} {bounds[key]:.15g}" for key, sign in HIGH.items() if key in bounds]
+        ends = ["(whole)"] * (kind is int) + _further(bounds)
+        return " ".join(["".join([*low, self.name, *high]), *ends])
+
+
+def _bounds(hint: Any) -> tuple[Any, dict[str, Any]]:
+    """Type without its bounds, and the bounds by their names in msgspec.Meta."""
+    kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+    pairs = [(key, getattr(mark, key)) for mark in marks for key in (*LOW, *HIGH, *FURTHER)]
+    return kind, {key: bound for key, bound in pairs if bound is not None}
+
+
+def _further(bounds: dict[str, Any]) -> list[str]:
+    """Bounds that are no interval, in words."""
+    return [f"({FURTHER[key]} {bounds[key]})" for key in FURTHER if key in bounds]
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,16 +263,26 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     """
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     default = None if taken.default is taken.empty else taken.default
-    bounds = [mark for mark in marks if isinstance(mark, Meta)]
-    low = next((mark.ge for mark in bounds if mark.ge is not None), -math.inf)
-    high = next((mark.le for mark in bounds if mark.le is not None), math.inf)
-    key = next((mark.name for mark in marks if isinstance(mark, DefaultKey)), "")
-    words = typing.get_args(kind) if texts and typing.get_origin(kind) is Literal else ()
-    file = texts and kind is File
-    parameter = Parameter(taken.name, low, high, kind is int, words, file, default, key)
-    written = kind in (int, float) or words or file
-    if taken.kind is not taken.POSITIONAL_OR_KEYWORD or not written:
+    words = texts and typing.get_origin(kind) is Literal and typing.get_args(kind)
+    written = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
+    if taken.kind is not taken.POSITIONAL_OR_KEYWORD or not (written or (texts and kind is File)):
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
+    key = next((mark.name for mark in marks if isinstance(mark, DefaultKey)), "")
+    for mark in marks:
+        if not isinstance(mark, Meta | DefaultKey | str):  # a bound that nobody would check
+            given = f"got {mark!r} with {taken.name}"
+            raise ConfigError(f"{what}: {given}, expected bounds as in msgspec.Meta(ge=0)")
+    bounds = [mark for mark in marks if isinstance(mark, Meta)]
+    bounded: Any = str if kind is File else kind
+    if bounds:
+        bounded = Annotated[(bounded, *bounds)]
+    try:
+        with suppress(msgspec.ValidationError):
+            msgspec.convert(0, bounded)
+    except TypeError as error:
+        said = str(error).partition(" - ")[0]
+        raise ConfigError(f"{what}: bounds of {taken.name}: {said}") from None
+    parameter = Parameter(taken.name, bounded, default, key)
     if default is not None and not parameter.takes(default):
         raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {parameter}")
     return parameter

@@ -39,7 +39,7 @@ METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 NORTH_MAX = 85.0
 """Largest latitude [degrees]."""
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
-"""The one `crs` that means what RFC 7946 means without any."""
+"""Value of the member `crs` with which coordinates are those of RFC 7946."""
 Frame = Callable[[Any], Array]
 """Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
 _NOWHERE: Array = np.zeros((0, 2))

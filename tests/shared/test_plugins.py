@@ -335,6 +335,73 @@ def test_arguments_of_a_plugin_are_checked_like_ours(
     scenario(control={"trigger": "slip(1, 2) | always"})
 
 
+@pytest.mark.parametrize(
+    ("bound", "right", "wrong", "form"),
+    [
+        ("float, Meta(ge=0.5)", "0.5", "0.4", "0.5 <= n"),
+        ("float, Meta(gt=0)", "0.1", "0", "0 < n"),
+        ("float, Meta(le=2)", "2", "2.1", "n <= 2"),
+        ("float, Meta(lt=2)", "1.9", "2", "n < 2"),
+        ("float, Meta(gt=-1, lt=1)", "0", "-1", "-1 < n < 1"),
+        ("float, Meta(gt=0), Meta(lt=1)", "0.5", "1", "0 < n < 1"),
+        ("int, Meta(multiple_of=5)", "10", "12", "n (whole) (a multiple of 5)"),
+    ],
+)
+def test_every_bound_of_msgspec_holds(
+    bound: str, right: str, wrong: str, form: str, tmp_path: Path
+) -> None:
+    """As it does for keys of a scenario: `jolt(-0.2)` does not fly where it is to be above 0."""
+    code = f"""
+        from typing import Annotated
+        from msgspec import Meta
+
+        @trigger
+        def slip(now, n: Annotated[{bound}]):
+            return now.figures["fresh"]
+    """
+    plug(tmp_path, code)
+    said = refusal(lambda: scenario(control={"trigger": f"slip({wrong})"}))
+    assert said.endswith(f"got 'slip({wrong})', expected slip(n) with {form}")
+    scenario(control={"trigger": f"slip({right})"})
+
+
+@pytest.mark.parametrize(
+    ("bound", "right", "wrong", "form"),
+    [
+        ("File, Meta(pattern='^[a-z]+[.]csv$')", "a.csv", "a.txt", "a file (with the pattern"),
+        ("File, Meta(min_length=5)", "a.csv", "a.c", "a file (of a length from 5)"),
+        ("File, Meta(max_length=5)", "a.csv", "ab.csv", "a file (of a length up to 5)"),
+        ("Literal['up', 'down']", "up", "left", "up or down"),
+    ],
+)
+def test_every_bound_of_a_text_holds(
+    bound: str, right: str, wrong: str, form: str, tmp_path: Path
+) -> None:
+    """Impairments take words and names of files."""
+    code = f"""
+        from typing import Annotated, Literal
+        from msgspec import Meta
+        from skytether.plugin import Impairment, impairment
+        from skytether.shared.scenario.registry import File
+
+        @impairment(name="fading")
+        class Fading(Impairment):
+            def __init__(self, n: Annotated[{bound}, "a name"]):
+                pass
+
+            def __call__(self, fate, draws):
+                pass
+    """
+    plug(tmp_path, code)
+    for written, refused in ((right, False), (wrong, True)):
+        call = f'fading("{written}")' if "File" in bound else f"fading({written})"
+        network = {"uplink": {"impairments": call}}
+        if refused:
+            assert form in refusal(partial(scenario, network=network))
+        else:
+            scenario(network=network)
+
+
 def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) -> None:
     """All numbers are written, or none."""
     code = """
@@ -376,6 +443,7 @@ def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path
     assert said.endswith("expected a trigger that can be made (ValueError: low is above high)")
 
 
+IMPORTS = "from typing import Annotated\nfrom msgspec import Meta\n"
 ADDS = "expected @trigger, @reference, @vehicle or @impairment on something, see docs"
 OURS = "skytether.shared.scenario.triggers"
 WRONG = {
@@ -405,6 +473,14 @@ WRONG = {
     "a default out of bounds": (
         "@trigger\ndef slip(now, N: int = 1.5):\n    return 1\n",
         "policy slip: got the default N = 1.5, expected N (whole)",
+    ),
+    "a bound that its type cannot have": (
+        f"{IMPORTS}@trigger\ndef slip(now, n: Annotated[int, Meta(max_length=3)]):\n    return 1\n",
+        "policy slip: bounds of n: Can only set `max_length` on a str, bytes, or collection type",
+    ),
+    "a bound that msgspec does not know": (
+        f"{IMPORTS}@trigger\ndef slip(now, n: Annotated[float, range(3)]):\n    return 1\n",
+        "policy slip: got range(0, 3) with n, expected bounds as in msgspec.Meta(ge=0)",
     ),
     "an impossible name": (
         "@trigger(name='my trigger')\ndef slip(now):\n    return 1\n",

@@ -256,7 +256,7 @@ def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
 
 
 def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -> None:
-    """Of either winding, closed or not, with heights of 0, and on both sides of 180 degrees."""
+    """Rings of either winding, closed or not, with heights of 0, on both sides of 180 degrees."""
     file = tmp_path / "map.geojson"
 
     def corners(points: Any, origin: Any, **more: Any) -> list[list[float]]:
