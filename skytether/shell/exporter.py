@@ -5,7 +5,8 @@
 
 The loop hands over its figures once a second; a thread renders them and answers. The thread never
 touches the endpoint. A connection has a bounded time, and the oldest is closed where there are too
-many, so that no client keeps others out; at most 50 are accepted per second.
+many, so that no client keeps others out; at most 50 are accepted per second. Who comes by the name
+of a website is refused: a stranger may have pointed it here.
 """
 
 import os
@@ -28,6 +29,7 @@ from prometheus_client.samples import Sample
 from skytether.shared.core.endpoint import Address
 from skytether.shell.metrics import OWN, PREFIX, TABLES, families, trouble
 from skytether.shell.udp import from_kernel, look_up
+from skytether.shell.web import HEADERS, host_name, is_ours
 
 CONNECTIONS_MAX = 8
 """Most connections at once; a new one closes the oldest."""
@@ -133,6 +135,8 @@ class Metrics:
 
     def __init__(self, address: Address, collected: Collected) -> None:
         self._collected = collected
+        self._name = address[0].lower()
+        """Name that the user has given this machine."""
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
         self._socket = _listening(address)
@@ -234,6 +238,8 @@ class Metrics:
             return _response(400, b"no request\n")
         if words[0] != b"GET":
             return _response(405, b"GET alone\n", "Allow: GET\r\n")
+        if not all(map(self._is_ours, _hosts(request))):
+            return _response(403, BY_NAME)
         match words[1].split(b"?")[0]:
             case b"/metrics":
                 return _response(200, generate_latest(self._registry), kind=CONTENT_TYPE_LATEST)
@@ -242,10 +248,26 @@ class Metrics:
                 return _response(status, body, kind="application/json")
         return _response(404, b"/metrics or /healthz\n")
 
+    def _is_ours(self, host: str) -> bool:
+        """Whether a Host header is no website's that a stranger may have pointed at this machine."""
+        name = host_name(host)
+        return is_ours(name) or name == self._name or (name != "" and "." not in name)
 
+
+def _hosts(request: bytes) -> list[str]:
+    """Values of the Host headers of a request."""
+    lines = (line.partition(b":") for line in request.split(b"\r\n")[1:])
+    return [value.decode("latin-1").strip() for name, _, value in lines if name.lower() == b"host"]
+
+
+BY_NAME = (
+    b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
+)
+"""Answer to who comes by the name of a website."""
 _REASONS = {
     200: "OK",
     400: "Bad Request",
+    403: "Forbidden",
     404: "Not Found",
     405: "Method Not Allowed",
     431: "Request Header Fields Too Large",
@@ -256,9 +278,10 @@ _REASONS = {
 def _response(
     status: int, body: bytes, more: str = "", kind: str = "text/plain; charset=utf-8"
 ) -> bytes:
+    framing = "".join(f"{name}: {value}\r\n" for name, value in HEADERS.items())
     head = (
         f"HTTP/1.1 {status} {_REASONS[status]}\r\nContent-Type: {kind}\r\n"
-        f"Content-Length: {len(body)}\r\n{more}Connection: close\r\n\r\n"
+        f"Content-Length: {len(body)}\r\n{framing}{more}Connection: close\r\n\r\n"
     )
     return head.encode() + body
 

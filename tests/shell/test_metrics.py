@@ -313,6 +313,55 @@ def test_anything_else_is_refused(served: Metrics, request_: bytes, status: byte
     assert asked(served, b"GET /healthz HTTP/1.0\r\n\r\n")[0] == b"HTTP/1.1 200 OK"
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:9464", b"200 OK"),
+        ("[::1]:9464", b"200 OK"),
+        ("192.0.2.1", b"200 OK"),
+        ("localhost:9464", b"200 OK"),
+        ("netem:9464", b"200 OK"),
+        ("evil.example:9464", b"403 Forbidden"),
+        ("evil.example", b"403 Forbidden"),
+        ("127.0.0.1.evil.example", b"403 Forbidden"),
+        ("localhost.", b"403 Forbidden"),
+        ("", b"403 Forbidden"),
+        ("netem:9464\r\nHOST: evil.example", b"403 Forbidden"),
+        ("\xff[", b"403 Forbidden"),
+    ],
+)
+def test_who_comes_by_the_name_of_a_website_is_refused(
+    served: Metrics, host: str, status: bytes
+) -> None:
+    """A stranger may have pointed it at this machine; nobody can do so with a number, or with the
+    name of a container.
+    """
+    request = f"GET /metrics HTTP/1.1\r\nHost: {host}\r\n\r\n".encode("latin-1")
+    said_, text = asked(served, request)
+    assert said_ == b"HTTP/1.1 " + status
+    assert (b"skytether_netem_flows" in text) == (status == b"200 OK")
+
+
+def test_the_name_that_the_user_has_given_may_be_used() -> None:
+    """That of --metrics, and no other."""
+    with closing(Metrics(("localhost", 0), Collected("netem", "demo", 0.05))) as one:
+        one.take({"flows": 1, **PROCESS})
+        one._name = "vehicle.fleet.example"
+        request = b"GET /metrics HTTP/1.1\r\nHost: %s\r\n\r\n"
+        assert asked(one, request % b"Vehicle.fleet.example:9464")[0] == b"HTTP/1.1 200 OK"
+        assert asked(one, request % b"other.fleet.example:9464")[0] == b"HTTP/1.1 403 Forbidden"
+
+
+@pytest.mark.parametrize("path", ["/metrics", "/healthz", "/", "/ HTTP/2"])
+def test_no_answer_may_be_shown_in_a_frame(served: Metrics, path: str) -> None:
+    """Nor may a refusal."""
+    with calling(served) as sock:
+        sock.sendall(f"GET {path} HTTP/1.1\r\n\r\n".encode())
+        head = said(sock).partition(b"\r\n\r\n")[0].split(b"\r\n")
+    assert b"Content-Security-Policy: frame-ancestors 'none'" in head
+    assert b"X-Frame-Options: DENY" in head
+
+
 def test_a_request_may_come_in_pieces(served: Metrics) -> None:
     """Byte by byte."""
     with calling(served) as sock:

@@ -133,6 +133,37 @@ def test_a_page_by_a_name_says_why_it_stays_empty(page: Page) -> None:
             assert sock.recv(64).split()[1] == status
 
 
+@pytest.mark.parametrize(
+    ("request_", "status"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", b"200"),
+        (b"GET /nothing HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", b"404"),
+        (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", b"403"),
+        (b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n", b"500"),
+        (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n\r\n", None),
+    ],
+)
+def test_no_answer_may_be_shown_in_a_frame(
+    page: Page, request_: bytes, status: bytes | None
+) -> None:
+    """Neither the page nor a refusal: a website would catch clicks in it."""
+    with socket.create_connection(("127.0.0.1", page.port)) as sock:
+        sock.sendall(request_)
+        head = sock.recv(4096).partition(b"\r\n\r\n")[0].split(b"\r\n")
+    assert status is None or head[0].split()[1] == status
+    assert b"Content-Security-Policy: frame-ancestors 'none'" in head
+    assert b"X-Frame-Options: DENY" in head
+
+
+def test_a_refused_websocket_may_not_be_shown_in_a_frame(page: Page) -> None:
+    """Nor what a browser shows in its place."""
+    with pytest.raises(InvalidStatus) as refused:
+        joined(page, "http://evil.example")
+    headers = refused.value.response.headers
+    assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert headers["X-Frame-Options"] == "DENY"
+
+
 def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> None:
     """With the name of an element of the browser's own; nothing of it is kept."""
     with joined(page) as browser:

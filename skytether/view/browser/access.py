@@ -7,11 +7,12 @@ or fly it. A visitor with the token is not checked for either.
 """
 
 import hmac
-import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from urllib.parse import parse_qs, urlsplit
+
+from skytether.shell.web import host_name, is_ours, numeric
 
 HOST_PORT = "127.0.0.1:8080"
 """Default address of a page."""
@@ -48,16 +49,9 @@ def is_loopback(host: str) -> bool:
     """Whether a name or address always means this machine."""
     if host == "localhost":
         return True
-    address = _number(host)
+    address = numeric(host)
     mapped = getattr(address, "ipv4_mapped", None)
     return bool(address and (mapped or address).is_loopback)
-
-
-def _number(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(host.strip("[]").partition("%")[0])
-    except ValueError:
-        return None
 
 
 def knows(token: str, given: str) -> bool:
@@ -73,11 +67,7 @@ def _named(visitor: Visitor) -> tuple[str, str, str]:
     """Name of this machine in the request, the same with its port, and the website's origin."""
     headers = {name.lower(): value for name, value in visitor.headers.items()}
     host = headers.get("host", "")
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        name = ""
-    return name, host, headers.get("origin", "")
+    return host_name(host), host, headers.get("origin", "")
 
 
 def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
@@ -88,7 +78,7 @@ def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
     name, host, origin = _named(visitor)
     if _has_token(visitor, token):
         return None
-    if name != "localhost" and _number(name) is None:
+    if not is_ours(name):
         return TurnedAway.HOST
     return None if origin in ("", f"http://{host}") else TurnedAway.ORIGIN
 

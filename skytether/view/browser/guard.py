@@ -3,6 +3,7 @@
 viser itself accepts any connection and any message: uploads of any size, requests to put the page
 on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
+- no answer may be shown in a website's frame;
 - a websocket is opened only for browsers that may look (`access.refusal`), up to a number;
 - only messages that our page sends (`MESSAGES`) are taken, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
@@ -30,6 +31,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 
 from skytether.shared.core.events import BrowserRefused
+from skytether.shell.web import HEADERS
 from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16
@@ -135,6 +137,7 @@ class Guard:
             rules = {
                 "max_size": MESSAGE_BYTES_MAX,
                 "process_request": partial(self._opened, process_request),
+                "process_response": _unframed,
                 "create_connection": partial(_Connection, self),
                 "logger": _QUIET,
             }
@@ -263,6 +266,11 @@ class _Connection(sockets.ServerConnection):
         self._guard.count(why)
         self._is_cut = True
         self.transport.abort()
+
+
+def _unframed(_: sockets.ServerConnection, __: Request, response: Response) -> None:
+    """Forbid that an answer is shown in a frame."""
+    response.headers.update(HEADERS)
 
 
 def visitor(connection: sockets.ServerConnection) -> Visitor:
