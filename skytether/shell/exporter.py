@@ -240,7 +240,11 @@ class Metrics:
             return _response(405, b"GET alone\n", "Allow: GET\r\n")
         if not all(map(self._is_ours, _hosts(request))):
             return _response(403, BY_NAME)
-        match words[1].split(b"?")[0]:
+        return self._page(words[1].split(b"?")[0])
+
+    def _page(self, path: bytes) -> bytes:
+        """Answer to a request for a path."""
+        match path:
             case b"/metrics":
                 return _response(200, generate_latest(self._registry), kind=CONTENT_TYPE_LATEST)
             case b"/healthz":
@@ -249,7 +253,7 @@ class Metrics:
         return _response(404, b"/metrics or /healthz\n")
 
     def _is_ours(self, host: str) -> bool:
-        """Whether a Host header is no website's that a stranger may have pointed at this machine."""
+        """Whether a Host header is no name that a stranger can point at this machine."""
         name = host_name(host)
         return is_ours(name) or name == self._name or (name != "" and "." not in name)
 
@@ -260,9 +264,7 @@ def _hosts(request: bytes) -> list[str]:
     return [value.decode("latin-1").strip() for name, _, value in lines if name.lower() == b"host"]
 
 
-BY_NAME = (
-    b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
-)
+BY_NAME = b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
 """Answer to who comes by the name of a website."""
 _REASONS = {
     200: "OK",

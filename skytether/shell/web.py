@@ -1,4 +1,4 @@
-"""Rules of whatever is served over HTTP, the page and the metrics: for browsers are led by strangers.
+"""Rules of what is served over HTTP, the page and the metrics.
 
 Any website that a browser has open may make it connect to this machine, in an invisible frame or
 under a name of the website's own that it points here (DNS rebinding). So no answer may be shown in

@@ -11,8 +11,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from matplotlib.image import imread
 from skytether.lab.benchmarks.browser import (
     CHROMIUM,
     chromium,
+    cut,
     flown_s,
     opened,
     picture,
@@ -109,6 +112,12 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
     with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")
         page.get_by_role("button", name="Cut the link").click()
+        page.get_by_role("button", name="Yes, cut it").wait_for()
+        picture(page, PICTURES / "asked-dark-wide.png")
+        page.get_by_role("button", name="Leave it").click()
+        page.wait_for_timeout(2500)
+        assert "link cut" not in status(page)
+        cut(page)
         until(lambda: "vehicle 1 hovers: the server is silent" in status(page), "it hovers")
         words = status(page)
         assert "HOVER" in words
@@ -118,6 +127,66 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
         page.get_by_role("button", name="Heal it").click()
         until(lambda: "TRACK" in status(page), "it flies a plan once the link is healed")
         until(lambda: "link good" in status(page), "the link is good again")
+
+
+def test_what_may_end_a_flight_is_asked_once_more(browser: "sync_api.Browser", flight: str) -> None:
+    """Disarming, and losing all packets by the slider; leaving it changes nothing."""
+    with opened(browser, flight) as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        armed = page.get_by_label("Armed")
+        armed.click()
+        page.get_by_role("button", name="Leave it").click()
+        until(armed.is_checked, "it is shown as armed again")
+        armed.click()
+        page.get_by_role("button", name="Yes, disarm").click()
+        until(lambda: "TRACK" not in status(page), "it is disarmed")
+        armed.click()
+        until(lambda: "TRACK" in status(page), "it flies again, and nobody asks")
+        put(page, "Loss [%]", 100)
+        page.get_by_role("button", name="Leave it").click()
+        page.wait_for_timeout(2500)
+        assert "link cut" not in status(page)
+
+
+def test_a_website_cannot_show_the_page_in_a_frame_and_catch_a_click(
+    browser: "sync_api.Browser", flight: str
+) -> None:
+    """A page of another origin, with an invisible frame over all of it."""
+    frame = (
+        f'<iframe src="{flight}" style="position:fixed;inset:0;width:100%;height:100%;opacity:0">'
+    )
+
+    class Website(BaseHTTPRequestHandler):
+        """A website of a stranger."""
+
+        def do_GET(self) -> None:
+            """Send the page with the frame."""
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(frame.encode())
+
+    with (
+        ThreadingHTTPServer(("127.0.0.1", 0), Website) as website,
+        opened(browser, flight) as page,
+    ):
+        Thread(target=website.serve_forever, daemon=True).start()
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        button = page.get_by_role("button", name="Cut the link").bounding_box()
+        assert button
+        attacked = browser.new_page(viewport=page.viewport_size)
+        attacked.goto(f"http://localhost:{website.server_port}/")
+        attacked.wait_for_timeout(5000)  # longer than the page takes to be drawn
+        x, y = button["x"] + button["width"] / 2, button["y"] + button["height"] / 2
+        attacked.mouse.click(x, y)
+        picture(attacked, PICTURES / "framed.png")
+        (shown,) = attacked.frames[1:]
+        assert shown.locator("button").count() == 0
+        attacked.close()
+        page.wait_for_timeout(2500)
+        assert "TRACK" in status(page)
+        assert "link cut" not in status(page)
+        website.shutdown()
 
 
 def test_a_network_is_written_and_measured_on_a_page_of_its_own(

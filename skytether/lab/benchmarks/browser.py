@@ -127,6 +127,12 @@ def put(page: "Page", label: str, value: float | str) -> None:
     page.keyboard.press("Enter")
 
 
+def cut(page: "Page") -> None:
+    """Cut the link, and say that it is meant."""
+    page.get_by_role("button", name="Cut the link").click()
+    page.get_by_role("button", name="Yes, cut it").click()
+
+
 def picture(page: "Page", file: Path) -> None:
     """Save a picture, without the browser's notice about software rendering."""
     remark = page.locator(".mantine-Notification-closeButton")
@@ -175,7 +181,7 @@ def main(argv: list[str]) -> int:
             pictures(browser, address, folder)
             with opened(browser, address) as page:
                 until(lambda: "TRACK" in status(page), "it flies a plan")
-                page.get_by_role("button", name="Cut the link").click()
+                cut(page)
                 until(lambda: "HOVER" in status(page), "it hovers")
                 picture(page, folder / "cut-dark-wide.png")
         duel = ("duel", "demo", "demo-no-compensation", "--virtual", "--page", "127.0.0.1:0")

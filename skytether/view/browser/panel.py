@@ -21,6 +21,7 @@ from skytether.view.controls import (
     Knob,
     Values,
     compared,
+    is_cut,
     is_written,
     knobs,
     texts,
@@ -37,6 +38,8 @@ ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see
 GUIDES, DRAWS = "sends the vehicle", "draws a zone"
 CLICKS = ("looks", GUIDES, DRAWS)
 CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
+MAY_END = "The vehicle then brakes and hovers. Without a link it lands after a while for good."
+ALL_IS_LOST = "Every packet is lost then, both ways."
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
 LEAD_S = 5.0
@@ -236,6 +239,52 @@ class _Slider:
             assign(self._slider, number)
 
 
+class _Question:
+    """Question whether a change is meant that may end the flight; one at a time.
+
+    Args:
+        gui: elements of the browser that is asked.
+        warning: what happens then.
+    """
+
+    def __init__(self, gui: viser.GuiApi, warning: str) -> None:
+        self._gui, self._warning = gui, warning
+        self._shown: Any = None
+        """Window with the question that is shown, or None."""
+
+    def ask(
+        self,
+        title: str,
+        yes: str,
+        change: Callable[[], None],
+        leave: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Ask once more, unless a question is shown already.
+
+        Args:
+            title: the question.
+            yes: text of the button that confirms.
+            change: called when it is meant.
+            leave: called when it is not.
+        """
+        if self._shown is not None:
+            leave()
+            return
+        self._shown = self._gui.add_modal(title)
+        with self._shown:
+            self._gui.add_html(words.note(self._warning))
+            meant = self._gui.add_button(yes, color="red")
+            not_meant = self._gui.add_button("Leave it")
+        meant.on_click(partial(self._answer, change))
+        not_meant.on_click(partial(self._answer, leave))
+
+    async def _answer(self, act: Callable[[], None], _: Any) -> None:
+        if self._shown is not None:
+            self._shown.close()
+            self._shown = None
+            act()
+
+
 class _Network:
     """Text fields of both network directions, which the browser changes together."""
 
@@ -286,6 +335,7 @@ class Controls:
         gui = client.gui
         scenario = self._flights[0].state.scenario
         flies = any(each.state.flies for each in self._flights)
+        self._question = _Question(gui, MAY_END if flies else ALL_IS_LOST)
         self._cut = gui.add_button("Cut the link", color="red", icon=viser.Icon.PLUG_CONNECTED_X)
         self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
         self._answer = gui.add_html("")
@@ -298,9 +348,8 @@ class Controls:
             self._let_fly()
 
         @self._cut.on_click
-        def _(_: Any) -> None:
-            for flight in self._flights:
-                flight.cut()
+        async def _(_: Any) -> None:
+            self._question.ask("Cut the link?", "Yes, cut it", self._cut_all)
 
         @self._heal.on_click
         def _(_: Any) -> None:
@@ -332,8 +381,18 @@ class Controls:
 
         @self._armed.on_update
         async def _(event: Any) -> None:
-            if event.client is not None:
-                self._all("client", {"armed": self._armed.value})
+            if event.client is None:
+                return
+            arm = partial(self._all, "client", {"armed": self._armed.value})
+            if self._armed.value:
+                arm()
+            else:
+                rearm = partial(assign, self._armed, True)
+                self._question.ask("Fly no more plans?", "Yes, disarm", arm, rearm)
+
+    def _cut_all(self) -> None:
+        for flight in self._flights:
+            flight.cut()
 
     def _all(self, process: str, values: dict[str, Any]) -> None:
         for flight in self._flights:
@@ -342,8 +401,13 @@ class Controls:
     def _ask(self, knob: Knob, number: float) -> None:
         for flight in self._flights:
             values = flight.values.get(knob.process, {})
-            if knob.key in values:
-                flight.ask(knob.process, knob.write(values, number))
+            if knob.key not in values:
+                continue
+            changed = knob.write(values, number)
+            if knob.process == "netem" and is_cut({**values, **changed}):
+                self._question.ask("Cut the link?", "Yes, cut it", self._cut_all)
+                return
+            flight.ask(knob.process, changed)
 
     def show(self) -> None:
         """Update the controls and the newest answer."""
