@@ -6,6 +6,9 @@ all have come, so that the answers are a train as well.
 
 A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
 kept from the first PROBE on, which only a sender that receives packets at that address can send.
+Without keys a session is answered at that address alone: whoever knows it may send in any sender's
+name, and nobody is to get packets that he has not asked for. With keys a sender may change its
+address.
 """
 
 import hashlib
@@ -119,13 +122,15 @@ class Listener(Endpoint):
         """Measurement of a session, begun if it is new.
 
         Raises:
-            ProtocolError: the session id is not this listener's, or there is no room.
+            ProtocolError: the session id is not this listener's for the sender, or there is no
+                room.
         """
         session = self._sessions.get(name)
-        if session is None:
+        if session is None or not self._gate.secure:
             nonce, cookie = name[:NONCE_BYTES], name[NONCE_BYTES:]
             if not hmac.compare_digest(cookie, self._cookie(nonce, peer)):
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
+        if session is None:
             if len(self._sessions) >= SESSIONS_MAX:
                 idle = self._oldest_idle(now_ns)
                 if idle is None:

@@ -159,6 +159,23 @@ def test_only_who_can_be_answered_at_an_address_is_kept() -> None:
     assert far.figures()["sessions"] == 1
 
 
+@pytest.mark.parametrize("train", [0, 64])
+def test_an_open_session_is_answered_at_its_own_address_alone(train: int) -> None:
+    """Whoever knows it could have packets sent to others, as many as a train has at once."""
+    far, prober, victim = listener(), ("prober", 1), ("victim", 53)
+    session = session_of(far, prober, 0)
+    far.receive(Datagram(encode(Probe(session, 0, 0, 0), 96), prober), now_ns=0)
+    assert [sent.peer for sent in far.outbox()] == [prober]
+    for number in range(1, 65):
+        far.receive(Datagram(encode(Probe(session, number, train, 0), 96), victim), now_ns=0)
+    far.wake(now_ns=HOLD_NS)
+    assert far.outbox() == []
+    assert far.figures()["dropped"] == {str(Drop.UNKNOWN_SESSION): 64}
+    for number in range(train or 1):
+        far.receive(Datagram(encode(Probe(session, number, train, 0), 96), prober), now_ns=HOLD_NS)
+    assert {sent.peer for sent in far.outbox()} == {prober}
+
+
 def test_a_listener_has_room_for_so_many_measurements() -> None:
     """The next one is refused, until one has been silent for a minute."""
     far = listener()
