@@ -1,14 +1,168 @@
-"""Files that a user names: read up to a largest size, written only where nothing else is lost.
+"""Files that a user names: read up to a largest size, and written without destroying another.
 
 Whatever a command writes is a plain file: a device, a pipe or a link at its place is refused. With
 `--out /dev/sda`, or a link that somebody has left there, it would otherwise write elsewhere.
+
+- New content is written beside the old and takes its name once it is whole (`replacing`): a full
+  disk or a killed process leaves the old file as it was.
+- A file that grows during a flight (`Growing`) has its own name from the start, unless an older
+  file has it.
+- No command writes a file that it reads, and no two commands write one file (`apart`, `claim`).
+
+Nothing else in this package opens a file for writing, which tests/whole/test_writes.py proves.
 """
 
+import fcntl
 import os
 import stat
-from errno import EACCES, EFBIG, EINVAL, EISDIR, ELOOP
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from errno import EACCES, EBUSY, EEXIST, EFBIG, EINVAL, EISDIR, ELOOP, EOPNOTSUPP
+from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
+
+FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+"""Flags of every file that is written: somebody may put a link or a pipe there just now."""
+MODE = 0o666
+"""Permissions of a new file, less the user's mask."""
+
+T = TypeVar("T")
+Inode = tuple[int, int]
+"""Device and number of a file, the same by whichever name it is reached."""
+
+
+# -- one command's files ----------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Command:
+    """Files of one command."""
+
+    inputs: set[Inode] = field(default_factory=set)
+    """Files that it has read."""
+    outputs: set[Inode] = field(default_factory=set)
+    """Files and folders that it is going to write, each locked."""
+    ending: ExitStack = field(default_factory=ExitStack)
+    """Locks, and new files to remove where nothing was written."""
+
+
+_commands: list[_Command] = []
+"""The command that runs, behind those that run it; none outside of `apart`, where files are only
+read and written."""
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Keep the files that a command reads from being written, for as long as the block takes.
+
+    Locks of `claim` last until the end of the block.
+    """
+    _commands.append(_Command())
+    try:
+        with _commands[-1].ending:
+            yield
+    finally:
+        _commands.pop()
+
+
+def note(path: Path, file: BinaryIO) -> None:
+    """Note that the command reads an open file, which it may then not write.
+
+    Raises:
+        OSError: the command is going to write it.
+    """
+    inode = _inode(os.fstat(file.fileno()))
+    for each in _commands:
+        if inode in each.outputs:
+            raise OSError(EBUSY, "it is an output as well, expected another file", str(path))
+        each.inputs.add(inode)
+
+
+def claim(path: Path, *, is_input: bool = False) -> None:
+    """Lock a file to be written until the command ends; one that is missing is made, empty.
+
+    A new file that is still empty at the end is removed.
+
+    Args:
+        is_input: whether the command reads the file as well; none is made then.
+
+    Raises:
+        OSError: it cannot be written, the command reads it, another option names it, or another
+            command has locked it.
+    """
+    made = check(path, is_input=is_input) is None
+    if made and is_input:
+        return
+    if not os.access(path.absolute().parent, os.W_OK | os.X_OK):
+        raise OSError(EACCES, os.strerror(EACCES), str(path))
+    with ExitStack() as stack:
+        flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if made else 0)
+        descriptor = os.open(path, flags, MODE)
+        stack.callback(os.close, descriptor)
+        if made:
+            stack.callback(_remove_empty, path, descriptor)
+        _hold(path, descriptor, stack, is_input=is_input)
+
+
+def claim_folder(path: Path) -> None:
+    """Lock a folder to write files in until the command ends; one that is missing is made.
+
+    Raises:
+        OSError: it cannot be made, or another command has locked it.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        stack.callback(os.close, descriptor)
+        # Two options may name one folder.
+        if not _is_claimed(_inode(os.fstat(descriptor))):
+            _hold(path, descriptor, stack)
+
+
+def _hold(path: Path, descriptor: int, stack: ExitStack, *, is_input: bool = False) -> None:
+    """Lock an open file or folder against other commands until this one ends, see `claim`."""
+    inode = _inode(os.fstat(descriptor))
+    if _is_claimed(inode):
+        raise OSError(EEXIST, "another option names it as well", str(path))
+    if not _locked(path, descriptor):
+        raise OSError(EBUSY, "another command is writing it", str(path))
+    if _commands:
+        if not is_input:
+            _commands[-1].outputs.add(inode)
+        _commands[-1].ending.push(stack.pop_all())
+
+
+def _is_claimed(inode: Inode) -> bool:
+    return any(inode in each.outputs for each in _commands)
+
+
+def _locked(path: Path, descriptor: int) -> bool:
+    """Lock an open file; False where another command has locked it, or has just replaced it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return path.exists() and _inode(path.stat()) == _inode(os.fstat(descriptor))
+
+
+def _remove_empty(path: Path, descriptor: int) -> None:
+    """Remove a file that was made to be locked, unless something was written to it."""
+    with suppress(OSError):
+        status = path.lstat()
+        if not status.st_size and _inode(status) == _inode(os.fstat(descriptor)):
+            path.unlink()
+
+
+def _inode(status: os.stat_result) -> Inode:
+    return status.st_dev, status.st_ino
+
+
+# -- reading ----------------------------------------------------------------------------------
 
 
 def read(path: Path, most: int, *, private: bool = False) -> bytes:
@@ -20,7 +174,7 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
 
     Raises:
         OSError: it cannot be read, it is larger, or a pipe or device, which might never end; it is
-            to be private, and is not.
+            to be private, and is not; or the command is going to write it.
         ValueError: no file can have this name.
     """
     # Without O_NONBLOCK, opening a pipe waits for somebody who writes.
@@ -35,6 +189,7 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
         if private and stat.S_IMODE(mode) & 0o177:
             found = f"its mode is {stat.S_IMODE(mode):04o}"
             raise OSError(EACCES, f"{found}, expected 0600: nobody else may read or write it")
+        note(path, file)
         content = file.read(most + 1)
     if len(content) > most:
         raise OSError(EFBIG, f"it is larger than {most} bytes")
@@ -62,52 +217,172 @@ def check_private(path: Path) -> None:
                 raise OSError(EACCES, f"{found}: expected one where nobody else may")
 
 
-def check(path: Path) -> None:
+# -- writing ----------------------------------------------------------------------------------
+
+
+def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
     """Refuse a place where a file cannot be written: anything but a plain file, or nothing yet.
+
+    Args:
+        is_input: whether the file may be one that the command reads.
+
+    Returns:
+        what is known of the file that is there; None for none.
 
     Raises:
         OSError: with what is there.
     """
     try:
-        mode = path.lstat().st_mode
+        status = path.lstat()
     except FileNotFoundError:
-        return
-    if stat.S_ISDIR(mode):
+        return None
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(path))
-    if not stat.S_ISREG(mode):
-        found = "a link" if stat.S_ISLNK(mode) else "no plain file"
+    if not stat.S_ISREG(status.st_mode):
+        found = "a link" if stat.S_ISLNK(status.st_mode) else "no plain file"
         raise OSError(EINVAL, f"it is {found}, expected a plain file or a new name", str(path))
+    if not is_input and any(_inode(status) in each.inputs for each in _commands):
+        raise OSError(EBUSY, "it is an input as well, expected another file", str(path))
+    return status
 
 
-def create(path: Path, buffering: int = -1) -> BinaryIO:
-    """Open a file for writing and reading, empty: a plain file that is there, or a new one.
+def write(path: Path, content: bytes) -> None:
+    """Write a file as a whole, or not at all; see `replacing`."""
+    with replacing(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def replacing(path: Path, *, is_input: bool = False, new: int | None = None) -> Iterator[BinaryIO]:
+    """File for new content, which gets its name at the end of the block; on an error, nothing is
+    changed.
+
+    It has no name until then where the file system can do this, so that a killed process leaves
+    nothing. Its permissions are those of the file that it replaces.
 
     Args:
+        is_input: whether the file may be one that the command reads.
+        new: permissions of a file that must not exist yet.
+
+    Raises:
+        OSError: it cannot be written, is no plain file, or exists although it must be new.
+    """
+    status = check(path, is_input=is_input)
+    mode = stat.S_IMODE(status.st_mode) if status else new
+    part: Path | None = None
+    try:
+        flags = os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC
+        descriptor = os.open(path.absolute().parent, flags, MODE)
+    except OSError as error:
+        if error.errno not in (EISDIR, EOPNOTSUPP):  # the latter on NFS, for example
+            raise
+        part, descriptor = _unused(path, _new)
+    try:
+        with os.fdopen(descriptor, "r+b") as file:
+            yield file
+            file.flush()
+            if mode is not None:
+                os.fchmod(descriptor, mode)
+            os.fsync(descriptor)
+            if new is not None:
+                _link(descriptor, path)
+                return
+            if part is None:
+                part, _ = _unused(path, partial(_link, descriptor))
+        part.replace(path)
+    finally:
+        if part:
+            part.unlink(missing_ok=True)
+
+
+def appending(path: Path) -> BinaryIO:
+    """Open a file for reading and for more lines at its end, locked until it is closed.
+
+    Raises:
+        OSError: it cannot be written, is no plain file, or another command has locked it.
+    """
+    check(path)
+    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE), "r+b")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode) or not _locked(path, file.fileno()):
+        file.close()
+        raise OSError(EBUSY, "another command is writing it", str(path))
+    return file
+
+
+class Growing:
+    """File that grows as long as a flight takes, and may be read meanwhile.
+
+    It has its own name from the start. Where an older file has that name, it is written beside that
+    file, as NAME.part1.SUFFIX, until it is whole: see `end`.
+
+    Args:
+        path: file to write.
         buffering: as in `open`; 0 for none.
 
     Raises:
         OSError: it cannot be written, or is no plain file.
     """
-    check(path)
-    # Another program may exchange the file just now: then it is not followed, waited for or cut.
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    file = os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=buffering)
-    try:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            said = "it is no plain file, expected a plain file or a new name"
-            raise OSError(EINVAL, said, str(path))
-        file.truncate()
-    except OSError:
-        file.close()
-        raise
-    return file
+
+    def __init__(self, path: Path, buffering: int = -1) -> None:
+        self._path = path
+        status = check(path)
+        self.at = path
+        """Its path, for now."""
+        if status and status.st_size:
+            self.at, descriptor = _unused(path, _new)
+        else:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE)
+        self.file: BinaryIO = os.fdopen(descriptor, "r+b", buffering=buffering)
+        """The file, open for writing and reading."""
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_size:
+            self.file.close()
+            raise OSError(EINVAL, "it is no plain file, or has just been written", str(path))
+
+    def end(self, *, empty: bool, whole: bool) -> None:
+        """Close the file; beside an older one, it takes its name or is removed, or stays there.
+
+        Args:
+            empty: whether it holds nothing of use: then the older one stays.
+            whole: whether it holds everything: then the older one is gone.
+
+        Raises:
+            OSError: it cannot be renamed.
+        """
+        with suppress(OSError):  # raised where its buffer cannot be written
+            self.file.close()
+        if self.at == self._path:
+            return
+        if empty or not self.at.stat().st_size:
+            self.at.unlink(missing_ok=True)
+        elif whole:
+            self.at = self.at.replace(self._path)
 
 
-def write(path: Path, content: bytes) -> None:
-    """Write a file anew; a plain file of that name is replaced.
+def _new(path: Path) -> int:
+    """Descriptor of a new file.
 
     Raises:
-        OSError: it cannot be written, or is no plain file.
+        OSError: it exists, or cannot be made.
     """
-    with create(path) as file:
-        file.write(content)
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, MODE)
+
+
+def _link(descriptor: int, path: Path) -> None:
+    """Give an open file a name that is not taken.
+
+    Raises:
+        OSError: the name is taken.
+    """
+    # link(2) would not follow the link in /proc; with `src_dir_fd` Python calls linkat(2).
+    own = f"/proc/self/fd/{descriptor}"
+    os.link(own, path, src_dir_fd=descriptor, follow_symlinks=True)
+
+
+def _unused(path: Path, make: Callable[[Path], T]) -> tuple[Path, T]:
+    """Make a file beside another, under the first name that is not taken."""
+    for number in count(1):
+        with suppress(FileExistsError):
+            at = path.with_stem(f"{path.stem}.part{number}")
+            return at, make(at)
+    raise AssertionError  # numbers do not end

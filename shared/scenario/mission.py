@@ -4,9 +4,10 @@ A mission is the reference of each of its vehicles: the goal from each time on, 
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count, product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,10 @@ SWAP_AT_S = 2.0
 """Time at which vehicles that swap places leave [s]."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Angle by which points that are spread evenly over a sphere turn from one to the next [rad]."""
-TIMES_MAX = 500
-"""Largest number of times at which goals are checked for being too near to each other."""
+VEHICLES_MAX = 65_535
+"""Largest number of a vehicle."""
+CROWDED = 32
+"""Number of stays at one time and place above which two of them are too near in any case."""
 
 
 class Mission:
@@ -91,19 +94,12 @@ class Mission:
         Returns:
             their numbers, when that is [s], and the distance [m].
         """
-        times_s = np.unique(np.concatenate([times_s for times_s, _ in self._goals.values()]))
-        times_s = times_s[:: -(-len(times_s) // TIMES_MAX)]
-        places = np.stack([self.of(each)(times_s)[..., 0] for each in self._goals])
-        places[..., 2:] *= height
-        for i, at_s in enumerate(times_s):
-            here = places[:, i]
-            away = np.linalg.norm(here[:, None] - here[None], axis=2)
-            np.fill_diagonal(away, np.inf)
-            one, other = np.unravel_index(int(away.argmin()), away.shape)
-            if away[one, other] < apart_m:
-                numbers = self.vehicles
-                return numbers[one], numbers[other], float(at_s), float(away[one, other])
-        return None
+        stays = _Stays.of(self._goals, height)
+        found = stays.nearest(apart_m)
+        if found is None:
+            return None
+        one, other = sorted(stays.vehicles[list(found)].tolist())
+        return one, other, float(stays.begin_s[list(found)].max()), stays.distance_m(*found)
 
     def allocated(self) -> "Mission":
         """A mission whose goals of one time are given to the vehicles that are nearest to them.
@@ -121,6 +117,116 @@ class Mission:
             given = np.append(given, goals[None, linear_sum_assignment(cost)[1]], axis=0)
         shared = {vehicle: (times_s, given[:, i]) for i, vehicle in enumerate(self._goals)}
         return Mission(shared, self._axes, 1)
+
+
+class _Stays(NamedTuple):
+    """Stays of vehicles at their goals, each from a goal's time until that of the next."""
+
+    vehicles: NDArray[np.int64]
+    """Number of each stay's vehicle; shape (n,)."""
+    begin_s: Array
+    """Time at which each stay begins [s]; shape (n,)."""
+    end_s: Array
+    """Time at which each stay ends [s]; shape (n,)."""
+    places_m: Array
+    """Place of each stay, its height scaled [m]; shape (n, axes)."""
+
+    @classmethod
+    def of(cls, goals: Mapping[int, tuple[Array, Array]], height: float) -> "_Stays":
+        """Stays at the goals of vehicles, ordered by the time at which they begin."""
+        counts = [len(times_s) for times_s, _ in goals.values()]
+        begin_s = np.concatenate([times_s for times_s, _ in goals.values()])
+        ends_s = [np.append(times_s[1:], np.inf) for times_s, _ in goals.values()]
+        places_m = np.concatenate([points_m for _, points_m in goals.values()])
+        places_m[:, 2:] *= height
+        order = np.argsort(begin_s, kind="stable")
+        vehicles = np.repeat(np.array(list(goals)), counts)
+        return cls(vehicles[order], begin_s[order], np.concatenate(ends_s)[order], places_m[order])
+
+    def distance_m(self, one: int, other: int) -> float:
+        """Distance of two stays [m]."""
+        return float(np.linalg.norm(self.places_m[one] - self.places_m[other]))
+
+    def nearest(self, apart_m: float) -> tuple[int, int] | None:
+        """First two stays at one time that are nearer than apart_m; None where there are none.
+
+        Stays are sorted into cells of apart_m, and within a cell by time: each is compared with
+        those only that begin in its own cell and in those around it before it ends. That takes a
+        time in proportion to the stays, unless they are too near.
+        """
+        cells = np.floor(self.places_m / apart_m)
+        index, levels = np.empty(cells.shape, np.int64), []
+        for axis, column in enumerate(cells.T):
+            level, index[:, axis] = np.unique(column, return_inverse=True)
+            levels.append(level)
+        shape = [len(level) for level in levels]
+        # Stays come in the order of time, so that a stay's number is also its rank in time.
+        until = np.searchsorted(self.begin_s, self.end_s)
+        own = np.ravel_multi_index(tuple(index.T), shape)
+        known, cell = np.unique(own, return_inverse=True)
+        key = np.sort(cell * len(cell) + np.arange(len(cell)))
+        found: list[tuple[float, float, int, int]] = []
+        for offset in product((-1, 0, 1), repeat=len(shape)):
+            around, is_there = _neighbours(cells + offset, levels, shape, known)
+            stays = np.flatnonzero(is_there)
+            first = np.searchsorted(key, around * len(cell) + stays + 1)
+            behind = np.searchsorted(key, around * len(cell) + until[stays])
+            found += self._pairs(stays, first, behind, key % len(cell), apart_m)
+        return min(found)[2:] if found else None
+
+    def _pairs(
+        self,
+        stays: NDArray[np.int64],
+        first: NDArray[np.int64],
+        behind: NDArray[np.int64],
+        others: NDArray[np.int64],
+        apart_m: float,
+    ) -> list[tuple[float, float, int, int]]:
+        """Time, distance and numbers of stays that are too near, the first at each turn.
+
+        Args:
+            stays: stays to compare with later ones; shape (m,).
+            first: index in `others` of the first one to compare with; shape (m,).
+            behind: index behind the last one to compare with; shape (m,).
+            others: stays by cell and time; shape (n,).
+            apart_m: distance [m].
+        """
+        found: list[tuple[float, float, int, int]] = []
+        for turn in count():
+            left = first + turn < behind
+            if not left.any() or (found and turn > CROWDED):
+                return found
+            stays, first, behind = stays[left], first[left], behind[left]
+            with_ = others[first + turn]
+            away_m = np.linalg.norm(self.places_m[stays] - self.places_m[with_], axis=1)
+            near = (away_m < apart_m) & (self.vehicles[stays] != self.vehicles[with_])
+            if near.any():
+                at = np.flatnonzero(near)
+                one = at[np.lexsort((away_m[at], self.begin_s[with_[at]]))[0]]
+                number = int(with_[one])
+                told = float(self.begin_s[number]), float(away_m[one])
+                found.append((*told, int(stays[one]), number))
+        raise AssertionError  # numbers do not end
+
+
+def _neighbours(
+    cells: Array, levels: Sequence[Array], shape: Sequence[int], known: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Index of each cell among those in which anybody stays, and whether it is one of them.
+
+    Returns:
+        the indices of those that are, shape (m,); and which are, shape (n,).
+    """
+    is_there = np.ones(len(cells), dtype=bool)
+    index = np.empty(cells.shape, np.int64)
+    for axis, level in enumerate(levels):
+        index[:, axis] = np.minimum(np.searchsorted(level, cells[:, axis]), len(level) - 1)
+        is_there &= level[index[:, axis]] == cells[:, axis]
+    code = np.ravel_multi_index(tuple(index[is_there].T), tuple(shape))
+    at = np.minimum(np.searchsorted(known, code), len(known) - 1)
+    hit = known[at] == code
+    is_there[is_there] = hit
+    return at[hit], is_there
 
 
 class Guided:
@@ -217,11 +323,14 @@ def mission(path: Path, axes: int) -> Mission:
     """
     rows = read_table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
     numbers = rows[:, 0].astype(np.int64)
-    if not len(rows) or (numbers != rows[:, 0]).any() or numbers.min() < 1:
-        raise ValueError("column vehicle: expected numbers from 1")
+    if not len(rows) or (numbers != rows[:, 0]).any():
+        raise ValueError("column vehicle: expected numbers")
+    if numbers.min() < 1 or numbers.max() > VEHICLES_MAX:
+        raise ValueError(f"column vehicle: expected numbers from 1 to {VEHICLES_MAX}")
     goals = {}
-    for number in np.unique(numbers).tolist():
-        own = rows[numbers == number]
+    order = np.argsort(numbers, kind="stable")
+    names, begins = np.unique(numbers[order], return_index=True)
+    for number, own in zip(names.tolist(), np.split(rows[order], begins[1:]), strict=True):
         if own[0, 1] != 0.0 or (np.diff(own[:, 1]) <= 0.0).any():
             raise ValueError(f"vehicle {number}: column t must start at 0 and rise")
         goals[number] = own[:, 1], own[:, 2:]

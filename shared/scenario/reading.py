@@ -6,7 +6,6 @@ what differs. `skytether scenarios` lists those that come with Skytether.
 
 import math
 import re
-import tomllib
 import typing
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from skytether import scenarios
-from skytether.shared.base import files
+from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import zones
@@ -28,8 +27,6 @@ from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Sce
 
 SCENARIOS = Path(scenarios.__file__).parent
 """Folder of the scenarios that come with Skytether."""
-FILE_BYTES_MAX = 1_000_000
-"""Largest size of a scenario's file [B]."""
 EXTENDS_MAX = 20
 """Largest number of scenarios that a scenario is laid over, each over the next."""
 GIVEN_MAX = 200
@@ -82,10 +79,7 @@ def load_base(name: str) -> Scenario:
     Raises:
         ConfigError: it does not exist, or a value in it is wrong.
     """
-    try:
-        return convert(_read(name), name)
-    except RecursionError:
-        raise ConfigError(f"{name}: nested too deeply") from None
+    return convert(_read(name), name)
 
 
 def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
@@ -225,11 +219,9 @@ def _path(file: str) -> Path:
 def _toml(path: Path, file: str) -> dict[str, Any]:
     """The raw table of a whole file, which the user calls `file`."""
     try:
-        return tomllib.loads(files.read(path, FILE_BYTES_MAX).decode())
+        return toml.loads(files.read(path, toml.BYTES_MAX).decode())
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
-    except RecursionError:
-        raise ConfigError(f"{file}: no valid TOML: nested too deeply") from None
     except ValueError as error:
         raise ConfigError(f"{file}: no valid TOML: {error}") from None
 

@@ -27,6 +27,8 @@ TURN_S = 3600.0
 bounded, whatever time it is asked for."""
 GRID_BLOCK = 1024
 """Number of points that are drawn at a time."""
+COLUMNS_MAX = 64
+"""Most columns of a table: each line takes time and memory for each of them."""
 FILE_BYTES_MAX = 16_000_000
 """Largest size of a table [B]."""
 
@@ -280,6 +282,8 @@ def read_table(path: Path, names: list[str]) -> Array:
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
     try:
+        if len(table.fieldnames or ()) > COLUMNS_MAX:
+            raise ValueError(f"line 1: expected at most {COLUMNS_MAX} columns")
         if any(name not in (table.fieldnames or ()) for name in names):
             raise ValueError(f"line 1: expected the columns {', '.join(names)}")
         rows += (_numbers([row[name] for name in names], table.line_num) for row in table)

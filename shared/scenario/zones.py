@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from skytether.shared.base import files
 from skytether.shared.base.hint import hint
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.outlines import Outlines, is_near
@@ -325,10 +326,7 @@ def _corridor(written: str, text: str) -> list[Zone]:
 
 def _geojson(written: str, text: str) -> list[Zone]:
     file = _file(text)
-    with Path(file).open("rb") as source:
-        content = source.read(FILE_BYTES_MAX + 1)
-    if len(content) > FILE_BYTES_MAX:
-        raise ValueError(f"a file of at most {FILE_BYTES_MAX} B")
+    content = files.read(Path(file), FILE_BYTES_MAX)
     try:
         told = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -52,8 +52,8 @@ def export(argv: Sequence[str]) -> None:
         if not (options.csv or options.parquet):
             return
         tables = view.tables(recorded)
-    for folder in filter(None, (options.csv, options.parquet)):
-        folder.mkdir(parents=True, exist_ok=True)
+    command.claim_folder("--csv", options.csv, *(f"{name}.csv" for name in tables))
+    command.claim_folder("--parquet", options.parquet, *(f"{name}.parquet" for name in tables))
     for name, columns in tables.items():
         if options.csv:
             path = options.csv / f"{name}.csv"
@@ -73,9 +73,11 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
     if packets is None or not len(packets):
         said = f"{options.file}: got no packets of netem, expected some"
         raise CommandError(said, CONFIGURATION)
+    command.claim_output("--pcap", options.pcap)
     if options.traces:
-        options.traces.mkdir(parents=True, exist_ok=True)
-        for name, trace in traffic.traces(packets).items():
+        traces = traffic.traces(packets)
+        command.claim_folder("--traces", options.traces, *(f"{name}.csv" for name in traces))
+        for name, trace in traces.items():
             _write(options.traces / f"{name}.csv", trace.encode())
     if options.pcap:
         _write(options.pcap, traffic.pcap(packets))

@@ -10,7 +10,6 @@ import tyro
 
 from skytether.cli import recorder, recordings
 from skytether.shared.base import files
-from skytether.shared.base.errors import RecordingError
 from skytether.shell import command
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
@@ -39,16 +38,8 @@ def join(argv: Sequence[str]) -> None:
         said = f"got {len(options.files)} recordings, expected two or more"
         raise CommandError(said, CONFIGURATION)
     recorder.check(options.out, "--out")
-    command.check_output("--out", options.out)
-    if any(options.out.exists() and options.out.samefile(each) for each in options.files):
-        said = f"--out: {options.out} is one of the recordings, expected another file"
-        raise CommandError(said, CONFIGURATION)
+    command.claim_output("--out", options.out)
     with ExitStack() as stack:
         opened = [stack.enter_context(recordings.opened(path)) for path in options.files]
-        try:
-            with files.create(options.out) as file:
-                joined(opened, file)
-        except RecordingError:
-            options.out.unlink(missing_ok=True)
-            raise
+        joined(opened, stack.enter_context(files.replacing(options.out)))
     print(options.out)

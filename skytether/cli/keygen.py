@@ -1,6 +1,5 @@
 """`skytether keygen`: make keys for vehicles, in a file that only its owner can read."""
 
-import os
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,6 +77,8 @@ def make(
         CommandError: a vehicle cannot have another key, or the file cannot be written.
         ConfigError: the existing file holds no keys.
     """
+    if add:
+        command.claim_output("--add", file, is_input=True)
     present = keys.load(file) if add else keys.Keyring(str(file), {})
     lines = []
     for vehicle in vehicles:
@@ -119,18 +120,14 @@ def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
     Raises:
         CommandError: the file exists and must not, or cannot be written.
     """
-    flags = os.O_RDWR | os.O_APPEND if add else os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    flags |= os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         files.check_private(path)
-        with os.fdopen(os.open(path, flags, 0o600), "r+b" if add else "wb") as file:
-            head = HEAD
-            if add:
-                file.seek(-1, os.SEEK_END)
-                head = "" if file.read(1) == b"\n" else "\n"
-            file.write((head + "".join(lines)).encode())
-            file.flush()
-            os.fsync(file.fileno())
+        before = HEAD.encode()
+        if add:
+            before = files.read(path, keys.FILE_BYTES_MAX, private=True)
+            before += b"" if before.endswith(b"\n") else b"\n"
+        with files.replacing(path, is_input=add, new=None if add else 0o600) as file:
+            file.write(before + "".join(lines).encode())
     except FileExistsError:
         raise CommandError(
             f"{path}: exists already, expected a new file (or --add)", CONFIGURATION

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from skytether.shared.base.printable import printable
 from skytether.shell import plugins
 from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
@@ -68,7 +69,7 @@ def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iter
 
 
 def say(line: object) -> None:
-    """Print a line on stderr, whether or not anybody can read it."""
+    """Print lines on stderr, whether or not anybody can read them."""
     # The terminal may be gone: this is no reason to end the flight.
     with contextlib.suppress(OSError):
-        print(line, file=sys.stderr)
+        print("\n".join(map(printable, str(line).splitlines())), file=sys.stderr)

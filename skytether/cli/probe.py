@@ -147,13 +147,13 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
 
 def _probe(options: ProbeOptions, listener: Address) -> None:
     """Measure the path, and print and write the results."""
-    _check(options)
     link: ClientLink = PlainLink()
     if options.keys:
         from skytether.client.secure import SecureLink
 
         key = keys.load(options.keys).of(options.number)
         link = SecureLink(key, entropy=secrets.token_bytes)
+    _check(options)
     command.check_sealed(listener, secure=link.secure or options.insecure)
     prober = Prober(
         link,
@@ -215,13 +215,12 @@ def _check(options: ProbeOptions) -> None:
         said = f"got {options.record}, expected another suffix: a row a packet is no flight"
         raise CommandError(f"--record: {said}", CONFIGURATION)
     for flag in command.OUTPUTS:
-        command.check_output(f"--{flag}", getattr(options, flag))
+        command.claim_output(f"--{flag}", getattr(options, flag))
     if options.figure:
         from skytether.figures import flights
 
         flights.check(options.figure)
-    with _writing(options.out):
-        options.out.mkdir(parents=True, exist_ok=True)
+    command.claim_folder("--out", options.out, "uplink.csv", "downlink.csv")
 
 
 def _write(options: ProbeOptions, found: ProbeOutcome) -> None:

@@ -9,6 +9,7 @@ The loop is asyncio's own: uvloop would reset signals that the children must go 
 
 import asyncio
 import contextlib
+import signal
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import (
     Counted,
@@ -90,10 +92,12 @@ class Child:
         return code
 
     def last_words(self) -> str:
-        """Why the process ended, from its own output."""
+        """Why the process ended: the signal that ended it, or the last line of its output."""
+        code = self.process.returncode
+        if code is not None and code < 0:  # its last line was about something else
+            return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"
         if self.said:
             return self.said[-1]
-        code = self.process.returncode
         said = f"does not listen after {START_S:.0f} s" if code is None else f"ended with {code}"
         return f"{self.name}: {said}"
 
@@ -225,7 +229,7 @@ def run(
     """
     file = parts / "scenario.toml"
     try:
-        file.write_bytes(to_toml(scenario))
+        files.write(file, to_toml(scenario))
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
     if secure:

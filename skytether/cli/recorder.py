@@ -3,18 +3,15 @@
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import BinaryIO
 
 import msgspec
 
-from skytether.shared.base import files
+from skytether.shared.base import files, toml
 from skytether.shared.core.events import RecordIncomplete
 from skytether.shared.scenario.reading import check as checked
 from skytether.shared.scenario.schema import Scenario
@@ -49,7 +46,7 @@ def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Sum
     """Record a flight in virtual time after its end; returns the recording's fault, or None."""
     about = _about(scenario, name, began=None, offset_ns=0, secure=summary.secure)
     try:
-        with files.create(path) as file:
+        with files.replacing(path) as file:
             recording = Recording(file, scenario, about)
             for _, process, frame in of_flight(scenario, name, flown):
                 recording.add(process, frame)
@@ -76,7 +73,7 @@ def beside() -> int:
     """Record the feed of a process as ordered on stdin (`RecorderOrder`), until stdin ends."""
     told = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
     plugins.load(told.plugins)
-    scenario = checked(tomllib.loads(told.scenario))
+    scenario = checked(toml.loads(told.scenario))
     path, feeds = Path(told.path), {told.process: Path(told.feed)}
     live = Live(path, feeds, scenario, told.name, secure=told.secure, tell=lambda _: None)
     print("it reads", flush=True)
@@ -142,7 +139,7 @@ class Live:
         self._tell = tell
         self._fault: str | None = None
         """First fault: what is missing in the recording."""
-        self._file: BinaryIO | None = None
+        self._growing: files.Growing | None = None
         self._recording: Recording | None = None
         """Recording; None once its file has failed."""
         self._rows: dict[str, int] = {}
@@ -154,8 +151,9 @@ class Live:
         began, offset_ns = datetime.now(UTC), time.time_ns() - time.monotonic_ns()
         about = _about(scenario, name, began=began, offset_ns=offset_ns, secure=secure)
         try:
-            self._file = files.create(path)
-            self._recording = Recording(self._file, scenario, about)
+            self._growing = files.Growing(path)
+            self._path = self._growing.at
+            self._recording = Recording(self._growing.file, scenario, about)
         except OSError as error:
             self._miss(error.strerror or str(error))
         self._flusher.start()
@@ -179,9 +177,11 @@ class Live:
             if flown is not None:
                 self._compare(flown)
             self._write(lambda recording: recording.finish(summary))
-            if self._file:
-                with suppress(OSError):  # Closing raises where the file's buffer cannot be written.
-                    self._file.close()
+            if self._growing:
+                try:
+                    self._growing.end(empty=not self._rows, whole=self._fault is None)
+                except OSError as error:
+                    self._miss(error.strerror or str(error))
         return f"{self._path}: {self._fault}" if self._fault else None
 
     def _all_ended(self) -> bool:

@@ -34,8 +34,10 @@ def recover(argv: Sequence[str]) -> None:
     read and found to hold at least as many rows.
     """
     options = read(RecoverOptions(tyro.MISSING), argv, "skytether recover", recover.__doc__)
-    command.check_output("--out", options.out)
     out = options.out or options.file
+    if options.out or options.file.is_file():
+        flag = "--out" if options.out else "FILE"
+        command.claim_output(flag, out, is_input=options.out is None)
     try:
         with refused(options.file):
             kept = recovered(options.file, out)

@@ -32,7 +32,7 @@ def report(argv: Sequence[str]) -> None:
     The page shows the path, plots over time, the summary, the events and the scenario.
     """
     options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
-    command.check_output("--out", options.out)
+    command.claim_output("--out", options.out)
     with recordings.opened(options.file) as recorded:
         summary = terminal.summary_rows(recorded.summary) if recorded.summary else []
         written = page(recorded, summary)

@@ -1,7 +1,6 @@
 """`skytether set`: change keys of a scenario in flight."""
 
 import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
+from skytether.shared.base import toml
 from skytether.shared.core.change import REQUEST_BYTES_MAX
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.control import Caller, ControlError
@@ -75,7 +75,7 @@ def parsed(changes: Sequence[str]) -> dict[str, Any]:
 def value(text: str) -> Any:
     """Value of a text as TOML if JSON can express it too; any other text is a string itself."""
     try:
-        table = tomllib.loads(f"value = {text}")
+        table = toml.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
     except (ValueError, RecursionError, TypeError):
         return text

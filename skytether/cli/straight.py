@@ -9,7 +9,7 @@ from pathlib import Path
 from skytether.autopilot.flavours import FlavourName
 from skytether.cli import page_process, processes
 from skytether.figures import flights as figures
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.core.aboard import AutopilotRefused, AutopilotText
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.scenario.reading import to_toml
@@ -108,7 +108,7 @@ def _really(
     scenario = options.config
     with temporary.folder() as parts:
         file = parts / "scenario.toml"
-        file.write_bytes(to_toml(scenario))
+        files.write(file, to_toml(scenario))
 
         def process(name: str, *argv: str) -> list[str]:
             return [name, str(file), "--record", str(parts / name), *argv]

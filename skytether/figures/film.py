@@ -58,7 +58,7 @@ def write(
     for frame in _frames(title, scenario, client, separations):
         frames.append(frame)
         on_frame(len(frames))
-    with files.create(path) as file:
+    with files.replacing(path) as file:
         frames[0].save(
             file,
             format="GIF",

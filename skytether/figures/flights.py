@@ -50,7 +50,7 @@ def save(figure: "Figure", path: Path, *, dpi: int) -> None:
     Raises:
         OSError: the file cannot be written, or is no regular file.
     """
-    with files.create(path) as file:
+    with files.replacing(path) as file:
         figure.savefig(file, format=path.suffix[1:], dpi=dpi)
 
 

@@ -5,7 +5,9 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-FORMULA = ("=", "+", "-", "@", "\t")
+from skytether.shared.base.printable import printable
+
+FORMULA = ("=", "+", "-", "@")
 """First characters of a cell that make spreadsheets compute it."""
 
 
@@ -13,14 +15,13 @@ def _plain(value: Any) -> Any:
     """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
 
     A text that a spreadsheet would take for a formula gets an apostrophe in front; a number does
-    not.
+    not. A terminal that shows the table obeys nothing in it.
     """
     if isinstance(value, bool):
         return str(value).lower()
     if not isinstance(value, str):
         return value
-    # `csv` does not quote it, and many programs take it for the end of a row
-    line = value.replace("\r", " ")
+    line = printable(value)
     return f"'{line}" if line.startswith(FORMULA) and not _is_number(line) else line
 
 
@@ -29,7 +30,7 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return not text.startswith("\t")
+    return True
 
 
 def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -41,6 +42,6 @@ def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Table as CSV text."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(header)
+    writer.writerow(list(map(_plain, header)))
     writer.writerows(list(map(_plain, row)) for row in rows)
     return file.getvalue()

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from skytether.lab.house.rooms import modules
+from skytether.shared.base import files
 
 FORM = re.compile(
     r"Source: (?:eq\. \(\d+\)|eqs\. \(\d+\)(?:, \(\d+\))+|algorithms? \d(?:, \d)*)\.",
@@ -143,7 +144,7 @@ def refreshed(page: str) -> str:
 def main(page: str) -> None:
     """Rewrite the table of a page."""
     file = Path(page)
-    file.write_text(refreshed(file.read_text()))
+    files.write(file, refreshed(file.read_text()).encode())
 
 
 if __name__ == "__main__":

@@ -6,10 +6,8 @@ before the next one is written. An incomplete last line, left by a killed writer
 altered line is an error. Files that the results depend on are in the settings by their digests.
 """
 
-import fcntl
 import hashlib
 import os
-import tomllib
 import zlib
 from collections.abc import Mapping, Sequence
 from importlib import metadata
@@ -18,7 +16,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from skytether.shared.base import files
+from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.dotted import flat
 from skytether.shared.scenario.schema import TABLES, Scenario
@@ -49,12 +47,8 @@ class Journal(Generic[E]):
         """Digest of every file that the entries depend on, by its path."""
         self.entries: list[E] = []
         """Finished entries, in order."""
-        self._file = os.fdopen(os.open(folder / ENTRIES, os.O_RDWR | os.O_CREAT, 0o666), "r+b")
+        self._file = files.appending(folder / ENTRIES)
         try:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ConfigError(f"{folder}: another command is writing there") from None
             self._agree({"version": metadata.version("skytether"), **settings})
             self._read(msgspec.json.Decoder(kind))
         except BaseException:
@@ -68,12 +62,12 @@ class Journal(Generic[E]):
         if not path.exists():
             if os.fstat(self._file.fileno()).st_size:
                 raise ConfigError(f"{self.folder}: got {ENTRIES} without {SETTINGS}, expected both")
-            write(path, text)
+            files.write(path, text)
         try:
-            before = dict(flat(tomllib.loads(path.read_text())))
+            before = dict(flat(toml.loads(path.read_text())))
         except ValueError as error:
             raise ConfigError(f"{path}: no valid TOML: {error}") from None
-        now = dict(flat(tomllib.loads(text.decode())))
+        now = dict(flat(toml.loads(text.decode())))
         for key in [*now, *before]:
             if now.get(key) != before.get(key):
                 raise ConfigError(
@@ -114,21 +108,6 @@ class Journal(Generic[E]):
 def sealed(content: bytes) -> bytes:
     """Line of a journal: a JSON list of the checksum and the entry."""
     return b'["%08x",%b]\n' % (zlib.crc32(content), content)
-
-
-def write(path: Path, content: bytes) -> None:
-    """Write a file as a whole, or not at all.
-
-    Raises:
-        OSError: the file cannot be written, or the path is no regular file.
-    """
-    files.check(path)
-    part = path.with_name(f"{path.name}.part")
-    with files.create(part) as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:

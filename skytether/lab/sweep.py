@@ -7,7 +7,6 @@ no result depends on the number of workers, or on interruptions.
 
 import itertools
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +19,7 @@ from scipy import stats
 
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab.journal import digests
+from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
@@ -97,14 +97,14 @@ def _linear(start: str, stop: str, count: str) -> list[float]:
 def _listed(given: str) -> list[Any]:
     """Values between commas, as in TOML; a bare word is a string."""
     try:
-        return tomllib.loads(f"values = [{given}]")["values"]
+        return toml.loads(f"values = [{given}]")["values"]
     except ValueError:
         return [_value(part.strip()) for part in given.split(",")]
 
 
 def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return toml.loads(f"value = {text}")["value"]
     except ValueError:
         # A string without quotes: a name, or a path.
         if not text or {*text} & {*"\"'[]{}=:"}:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from errno import EMFILE
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Protocol, TypeVar
 
@@ -21,6 +22,7 @@ import msgspec
 from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.extras import ExtraMissing
+from skytether.shared.base.printable import printable
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, NoFailsafe, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
@@ -102,7 +104,7 @@ def parse(
             changes more keys, and checks it after that.
 
     Raises:
-        CommandError: an output file cannot be written.
+        CommandError: an output file cannot be written, is an input, or is locked.
         ConfigError: the scenario cannot be flown, or a plug-in cannot be imported.
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
@@ -121,7 +123,7 @@ def parse(
     source = name if options.config == base else f"{name} and the command line"
     checked = read_scenario(reading.to_table(options.config), source)
     for option in OUTPUTS:
-        check_output(f"--{option}", getattr(options, option, None))
+        claim_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]
 
 
@@ -202,22 +204,37 @@ def check_sockets(flag: str, given: int) -> None:
     allow_sockets(given)
 
 
-def check_output(flag: str, path: Path | None) -> None:
-    """Refuse a file that cannot be written, before anything is flown for it.
+def claim_output(flag: str, path: Path | None, *, is_input: bool = False) -> None:
+    """Lock a file to be written until the command ends, before anything is flown for it.
+
+    Args:
+        is_input: whether the command may read the file as well.
 
     Raises:
-        CommandError: with the system's reason.
+        CommandError: it cannot be written, is an input, or is locked by another command.
     """
-    if path is None:
-        return
+    _claim(partial(files.claim, is_input=is_input), flag, path)
+
+
+def claim_folder(flag: str, path: Path | None, *names: str) -> None:
+    """Lock a folder to write files in until the command ends; one that is missing is made.
+
+    Args:
+        names: files that will be written in it.
+
+    Raises:
+        CommandError: it cannot be made, is locked by another command, or one of the files cannot be
+            written or is an input.
+    """
+    _claim(files.claim_folder, flag, path)
+    for name in names:
+        _claim(files.check, flag, path and path / name)
+
+
+def _claim(claim: Callable[[Path], object], flag: str, path: Path | None) -> None:
     try:
-        files.check(path)
-        try:
-            path.open("xb").close()
-        except FileExistsError:
-            path.open("ab").close()
-        else:
-            path.unlink()
+        if path is not None:
+            claim(path)
     except OSError as error:
         said = f"{flag}: {path}: cannot be written: {error.strerror}"
         raise CommandError(said, CONFIGURATION) from None
@@ -242,7 +259,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     """Run a command, with one line on stderr if it fails; returns its exit code."""
     try:
         try:
-            with extras.named():
+            with extras.named(), files.apart():
                 command(sys.argv[1:] if argv is None else argv)
         finally:
             sys.stdout.flush()
@@ -266,11 +283,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
 
 def _refuse(prog: str, message: str, code: int) -> int:
     """Print an error as a single line, whatever characters are in it; returns the exit code."""
-    shown = (
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
-        for letter in f"{prog}: {message}"
-    )
-    print("".join(shown), file=sys.stderr)
+    print(printable(f"{prog}: {message}"), file=sys.stderr)
     return code
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from skytether.shared.base.printable import printable
 from skytether.shared.core.events import Counted, Event, Omitted
 from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
@@ -110,7 +111,8 @@ class Log:
             lines += rendered(_for_people(event.figures), indent=2)
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
         # Not `encode()` alone: a file's name need not be valid Unicode.
-        return [f"{now} {self._process}: {line}\n".encode(errors="replace") for line in lines]
+        shown = (f"{now} {self._process}: {printable(line)}\n" for line in lines)
+        return [line.encode(errors="replace") for line in shown]
 
 
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:

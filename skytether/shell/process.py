@@ -52,10 +52,14 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
         CommandError: the file cannot be opened; at the end, it does not hold all rows.
     """
     try:
-        file = files.create(path, buffering=0)
+        growing = files.Growing(path, buffering=0)
     except OSError as error:
         raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
-    yield from _until_the_end(RecordFile(str(path), columns, file))
+    recording = RecordFile(str(growing.at), columns, growing.file)
+    try:
+        yield from _until_the_end(recording)
+    finally:
+        growing.end(empty=recording.is_empty, whole=recording.fault() is None)
 
 
 @contextmanager

@@ -68,6 +68,11 @@ class RecordFile:
         )
         return f"{self._name}: {reason}: {kept} of {rows} rows are recorded"
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row has been written."""
+        return self._writer.written <= self._header_bytes
+
     def rows(self) -> Rows:
         """Whole rows in the file; valid after `end`.
 

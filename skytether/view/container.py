@@ -35,6 +35,7 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader
 
+from skytether.shared.base import files
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.telemetry.record import RECORDING
 
@@ -101,6 +102,11 @@ def opened(path: Path) -> tuple[BinaryIO, int]:
         os.close(descriptor)
         raise RecordingError(f"{path}: it is no plain file, expected a recording ({RECORDING})")
     file = os.fdopen(descriptor, "rb")
+    try:
+        files.note(path, file)
+    except OSError:
+        file.close()
+        raise
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
         what = "it is no MCAP file" if status.st_size else "it is empty"

@@ -17,7 +17,6 @@ for each of the first VEHICLES_MAX vehicles /vehicle/N/pose, /vehicle/N/transfor
 the end, the summary are attachments.
 """
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from itertools import groupby
@@ -29,6 +28,7 @@ import numpy as np
 from mcap.records import Channel, Message
 from mcap.writer import Writer
 
+from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import (
@@ -40,7 +40,7 @@ from skytether.shared.core.events import (
     RecordIncomplete,
 )
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.reading import FILE_BYTES_MAX, check, to_toml
+from skytether.shared.scenario.reading import check, to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table
@@ -438,10 +438,8 @@ def known_of(
     if OURS not in metadata or SCENARIO not in attached:
         raise RecordingError(f"{path}: it is no recording of Skytether, or nothing is whole of it")
     with reading(path):
-        if len(attached[SCENARIO]) > FILE_BYTES_MAX:
-            raise ValueError(f"{SCENARIO} is larger than {FILE_BYTES_MAX} B")
         about = msgspec.convert(metadata[OURS], About, strict=False)
-        table = tomllib.loads(attached[SCENARIO].decode())
+        table = toml.loads(attached[SCENARIO].decode())
         try:
             return about, check(table, f"{path}: {SCENARIO}")
         # written by another version, or its trajectory's file is on another machine
@@ -497,7 +495,7 @@ def _check_begun(scenario: str) -> None:
         ConfigError: the scenario is invalid.
         ValueError: the text is no TOML.
     """
-    check(tomllib.loads(scenario), "the scenario of a process")
+    check(toml.loads(scenario), "the scenario of a process")
 
 
 def columns_in(channel: Channel, scenario: Scenario) -> np.dtype[np.void]:

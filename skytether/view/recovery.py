@@ -9,7 +9,6 @@ chunk, the scenario or the metadata. A chunk contains its size and a checksum, s
 does not lose the records behind it.
 """
 
-import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -92,28 +91,16 @@ def recover(path: Path, out: Path) -> Kept:
     """
     before = _readable(path)
     source, size = opened(path)
-    part = out.with_name(f"{out.name}.part")
-    with source:
-        try:
-            files.check(out)
-            file = files.create(part)
-        except OSError as error:
-            raise RecordingError(f"{out}: cannot be written: {error.strerror}") from None
-        try:
-            recovery = _Recovery(path, Bounded(source, size), file)
-            with reading(path):
-                recovery.run()
-            file.flush()
-            os.fsync(file.fileno())
-            with Recorded(part) as recorded:
-                rows = sum(map(len, recorded.parts().values()))
-            if rows < before:
-                said = f"{rows} of its {before} rows would be left"
-                raise RecordingError(f"{path}: it stays as it is, for {said}")
-            part.replace(out)
-        finally:
-            file.close()
-            part.unlink(missing_ok=True)
+    with source, files.replacing(out, is_input=out == path) as file:
+        recovery = _Recovery(path, Bounded(source, size), file)
+        with reading(path):
+            recovery.run()
+        file.flush()
+        with Recorded(Path(f"/proc/self/fd/{file.fileno()}")) as recorded:
+            rows = sum(map(len, recorded.parts().values()))
+        if rows < before:
+            said = f"{rows} of its {before} rows would be left"
+            raise RecordingError(f"{path}: it stays as it is, for {said}")
     first_ns, last_ns = recovery.times_ns or (0, 0)
     seconds = (last_ns - first_ns) / SECOND_NS
     return Kept(recovery.messages, seconds, recovery.lost_bytes, before, rows)

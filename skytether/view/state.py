@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
+from skytether.shared.base import toml
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.law.model import Array
@@ -420,8 +421,8 @@ class State:
             known.seen_ns = known.newest_ns
             return
         try:
-            scenario = msgspec.toml.decode(opened.scenario, type=Scenario)
-        except (msgspec.DecodeError, RecursionError) as error:
+            scenario = msgspec.convert(toml.loads(opened.scenario), Scenario)
+        except ValueError as error:
             raise FeedError(f"got no scenario: {error}") from None
         if known and process == "client":
             self._begin()  # another flight

@@ -5,6 +5,7 @@ import os
 import resource
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import msgspec
@@ -80,12 +81,12 @@ async def test_a_child_that_cannot_start_says_why() -> None:
             pass
 
 
-async def test_a_child_that_is_killed_leaves_its_last_event() -> None:
-    """Nothing else is known of it."""
+async def test_a_child_that_is_killed_is_said_to_be() -> None:
+    """Its last line, that it listens, is no reason to end."""
     async with started("netem", "demo", "--bind", "127.0.0.1:0") as netem:
         os.kill(netem.process.pid, signal.SIGKILL)
         assert await netem.process.wait() == -signal.SIGKILL
-    assert netem.last_words().startswith("netem: listening on 127.0.0.1:")
+    assert netem.last_words() == "netem: ended by a signal: Killed"
 
 
 async def test_a_child_whose_record_is_incomplete_has_told_so(tmp_path: Path) -> None:
@@ -143,7 +144,7 @@ async def test_a_line_that_is_nested_deeply_hides_nothing_that_follows() -> None
     known = msgspec.json.encode(line)
     stream.feed_data(known.replace(b"[[]]", b"[" * 50_000) + b"\n" + known + b"\n")
     stream.feed_eof()
-    child = Child("client", cast(asyncio.subprocess.Process, None))
+    child = Child("client", cast(asyncio.subprocess.Process, SimpleNamespace(returncode=1)))
     await _read(child, stream, heard.append)
     assert heard == [line]
     assert child.last_words().startswith('{"process":"client"')

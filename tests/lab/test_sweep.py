@@ -254,7 +254,7 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
     """The second is told; once the first is over, it may."""
-    told = pytest.raises(ConfigError, match="another command is writing there")
+    told = pytest.raises(OSError, match="another command is writing it")
     with closing(journal_of(ONE, tmp_path)), told:
         journal_of(ONE, tmp_path)
     journal_of(ONE, tmp_path).close()

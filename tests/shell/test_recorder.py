@@ -44,11 +44,18 @@ def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
         assert read(path)["number"].tolist() == list(range(10))
 
 
+class OnAFullDisk(files.Growing):
+    """A file for which there is no room."""
+
+    def __init__(self, path: Path, buffering: int = -1) -> None:
+        self._path = self.at = path
+        self.file = Path("/dev/full").open("r+b", buffering)  # noqa: SIM115 - closed by `end`
+
+
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file on a disk that is full."""
-    disk = Path("/dev/full")
-    monkeypatch.setattr(files, "create", lambda _, buffering: disk.open("r+b", buffering))
+    monkeypatch.setattr(files, "Growing", OnAFullDisk)
     return Path("record")
 
 

@@ -10,6 +10,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from itertools import islice
@@ -30,7 +31,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 import hostile_recordings
-from skytether.cli import recorder
+from skytether.cli import page_process, recorder
 from skytether.cli.export import export
 from skytether.cli.fly import fly
 from skytether.cli.recorder import Live
@@ -39,6 +40,7 @@ from skytether.cli.report import report
 from skytether.figures.tables import to_csv
 from skytether.lab.fuzz.recordings import records, written
 from skytether.shared.base.errors import RecordingError
+from skytether.shared.core.aboard import AutopilotText
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared
@@ -53,6 +55,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell import command
+from skytether.shell.log import Log
 from skytether.sim import flight
 from skytether.view import recording as view
 from skytether.view import recovery
@@ -893,10 +896,27 @@ def test_no_text_of_a_table_is_a_formula() -> None:
     """A spreadsheet would compute it; a number stays a number, in words and as one."""
     texts = ["=1+1", "+1 m", "-x", "@SUM(1)", "\t=1", "a\r=1", "a=b", "-1.5", "+2", "-inf", ""]
     written = to_csv(["text", "number"], [(text, -1.5) for text in texts])
+    assert to_csv(["=1+1"], []) == "'=1+1\n"
     assert [row["text"] for row in csv.DictReader(io.StringIO(written, newline=""))] == [
-        *("'=1+1", "'+1 m", "'-x", "'@SUM(1)", "'\t=1", "a =1", "a=b", "-1.5", "+2", "-inf", "")
+        *("'=1+1", "'+1 m", "'-x", "'@SUM(1)", "\\t=1", "a\\r=1", "a=b", "-1.5", "+2", "-inf", "")
     ]
     assert {row["number"] for row in csv.DictReader(io.StringIO(written, newline=""))} == {"-1.5"}
+
+
+def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
+    capfdbinary: pytest.CaptureFixture[bytes],
+) -> None:
+    """It would clear the screen, or turn what follows: texts come from files and peers."""
+    text = "\x1b[2J\x07\u202e\x9bm"
+    safe = r"\x1b[2J\x07\u202e\x9bm"
+    assert to_csv(["text"], [[text]]) == f"text\n{safe}\n"
+    page_process.say(f"{text}\nnext")
+    with closing(Log("server", "text")) as log:
+        log.say(AutopilotText(vehicle=1, severity=2, text=text))
+    written = capfdbinary.readouterr()
+    assert written.err.decode() == f"{safe}\nnext\n"
+    assert safe in written.out.decode()
+    assert b"\x1b" not in written.out
 
 
 def test_parquet_without_pyarrow_is_one_line(

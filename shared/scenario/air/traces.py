@@ -12,14 +12,15 @@ Of a round trip half is taken for each direction. Times at which packets may go 
 mahimahi has them: a line for each packet of 1504 bytes, with the millisecond at which it may go.
 """
 
-import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from skytether.shared.base import files
@@ -140,7 +141,7 @@ def _recorded(file: str, way: Way, *_: int) -> RecordedPath:
 
 @lru_cache(maxsize=16)
 def _deliveries(file: str, *_: int) -> Array:
-    times = _table(file, "\n".join(["ms", *_text(file).split()]), ["ms"])[:, 0]
+    times = _table(file, "\n".join(["ms", *_text(file).split()]), [0])[:, 0]
     wrong = ~np.isfinite(times) | (times < 0.0) | (np.diff(times, prepend=0.0) < 0.0)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -166,14 +167,14 @@ def _reason(error: Exception) -> str:
     return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
 
 
-def _table(file: str, text: str, names: list[str]) -> Array:
-    """Numbers below a line of names; shape (rows, columns). What is left out is NaN."""
+def _table(file: str, text: str, columns: Sequence[int]) -> Array:
+    """Numbers of columns below a line of names; shape (rows, columns). What is left out is NaN."""
     rows = text.rstrip().count("\n")
     if rows > ROWS_MAX:
         raise ValueError(f"{file}: got {rows} rows, expected at most {ROWS_MAX}")
     body = text.split("\n", 1)[1] if "\n" in text else ""
     if not body.strip():
-        raise ValueError(f"{file}: got no rows, expected at least one below {','.join(names)}")
+        raise ValueError(f"{file}: got no rows, expected at least one below its first line")
     try:
         return np.loadtxt(
             StringIO(body),
@@ -181,7 +182,7 @@ def _table(file: str, text: str, names: list[str]) -> Array:
             ndmin=2,
             comments=None,
             converters=lambda word: float(word) if word.strip() else np.nan,
-            usecols=range(len(names)),
+            usecols=columns,
             dtype=np.float64,
         )
     except ValueError as error:
@@ -196,11 +197,10 @@ def _of_csv(file: str, text: str) -> tuple[Array, Array, Flags]:
         expected = f"the columns {' or '.join(_TIMES)}, and {' or '.join(_DELAYS)}"
         given = ",".join(names)[:60]
         raise ValueError(f"{file}: got the first line {given!r}, expected {expected}")
-    table = _table(file, text, names)
-    lost = np.zeros(len(table), dtype=bool)
-    if "lost" in names:
-        lost = table[:, names.index("lost")] != 0.0
-    return table[:, names.index(time)], table[:, names.index(delay)] * _DELAYS[delay], lost
+    columns = [time, delay, *(["lost"] if "lost" in names else [])]
+    table = _table(file, text, list(map(names.index, columns)))
+    lost = (table[:, 2:] != 0.0).any(axis=1)
+    return table[:, 0], table[:, 1] * _DELAYS[delay], lost
 
 
 def _of_ping(file: str, text: str) -> tuple[Array, Array, Flags]:
@@ -226,14 +226,46 @@ def _of_ping(file: str, text: str) -> tuple[Array, Array, Flags]:
     return np.interp(np.arange(low, high + 1), numbers, sent_s), delay_s, lost
 
 
+class _Stamp(msgspec.Struct):
+    """Time of day of a packet, on a clock that only rises [ns]."""
+
+    monotonic: float
+
+
+class _OfClient(msgspec.Struct):
+    """Times of the end that measured."""
+
+    send: _Stamp
+
+
+class _Stamps(msgspec.Struct):
+    """Times of one packet."""
+
+    client: _OfClient
+
+
+class _Trip(msgspec.Struct):
+    """Packet there and back."""
+
+    lost: str | bool
+    timestamps: _Stamps
+    delay: dict[str, float] = {}
+
+
+class _Irtt(msgspec.Struct):
+    """File of irtt: everything else in it takes no memory."""
+
+    round_trips: list[_Trip]
+
+
 def _of_irtt(file: str, text: str, way: Way) -> tuple[Array, Array, Flags]:
     key = "rtt" if way == "auto" else way
     rows = []
     try:
-        for trip in json.loads(text)["round_trips"][: ROWS_MAX + 1]:
-            lost = trip["lost"] not in ("false", False)
-            delay_ns = trip["delay"][key] if not lost else np.nan
-            rows.append((trip["timestamps"]["client"]["send"]["monotonic"], delay_ns, lost))
+        for trip in msgspec.json.decode(text, type=_Irtt).round_trips[: ROWS_MAX + 1]:
+            lost = trip.lost not in ("false", False)
+            delay_ns = trip.delay[key] if not lost else np.nan
+            rows.append((trip.timestamps.client.send.monotonic, delay_ns, lost))
         table = np.array(rows, dtype=np.float64).reshape(-1, 3)
     except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON as irtt writes it: {error!r}") from None

@@ -113,7 +113,7 @@ def write(
     tables = {"machine": machines(merged), "packages": packages(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)
-    document.write_text(refresh(document.read_text(), tables))
+    files.write(document, refresh(document.read_text(), tables).encode())
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:

@@ -23,6 +23,7 @@ import tyro
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.lab.benchmarks.harness import TextTable, progress, refresh
+from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying
 from skytether.shared.scenario import reading
@@ -332,7 +333,7 @@ def main() -> int:
     for title, table in made.items():
         table.show(title)
     if options.write:
-        DOCUMENT.write_text(refresh(DOCUMENT.read_text(), made))
+        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
     return 0
 
 

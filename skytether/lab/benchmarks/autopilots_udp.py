@@ -39,6 +39,7 @@ from skytether.lab.benchmarks.autopilots import (
     row,
 )
 from skytether.lab.benchmarks.harness import TextTable, refresh
+from skytether.shared.base import files
 from skytether.shared.core.events import Flying, address_text
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -85,7 +86,7 @@ async def fly(scenario: Scenario, cell: Cell, parts: Path, *, cut: bool) -> Reco
     """
     law = contenders(cell.flavour)[cell.contender]
     file, keys = parts / "scenario.toml", ("--keys", str(parts / "keys"))
-    file.write_bytes(reading.to_toml(scenario))
+    files.write(file, reading.to_toml(scenario))
     keygen.make(parts / "keys", [1])
     said: list[LogLine] = []
     flies = asyncio.Event()
@@ -218,7 +219,7 @@ def main() -> int:
     made = table(asyncio.run(fly_all(options)))
     made.show("over UDP")
     if options.write:
-        DOCUMENT.write_text(refresh(DOCUMENT.read_text(), {"udp": made}))
+        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), {"udp": made}).encode())
     return 0
 
 

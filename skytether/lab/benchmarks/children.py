@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Counted, Event, Listening, address_text
 from skytether.shared.scenario.reading import to_toml
@@ -159,11 +160,11 @@ class Lab:
         self._stack = stack
         self.folder = folder
         self._file = folder / "scenario.toml"
-        self._file.write_bytes(to_toml(scenario))
+        files.write(self._file, to_toml(scenario))
         self.key_file = folder / "keys"
-        self.key_file.touch(mode=0o600)
         secrets = [(vehicle, os.urandom(keys.SECRET_BYTES)) for vehicle in vehicles]
-        self.key_file.write_text("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets))
+        with files.replacing(self.key_file, new=0o600) as file:
+            file.write("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets).encode())
 
     def server(self, bind: Address = (HOST, 0), *more: str) -> ChildProcess:
         """Start a server."""

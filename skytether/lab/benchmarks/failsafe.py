@@ -29,6 +29,7 @@ from skytether.lab.benchmarks import autopilots
 from skytether.lab.benchmarks.harness import TextTable, progress, refresh
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
+from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import Event, Flying, ModeChanged
@@ -364,7 +365,7 @@ def main() -> int:
     for title, table in made.items():
         table.show(title)
     if options.write:
-        DOCUMENT.write_text(refresh(DOCUMENT.read_text(), made))
+        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
     return 0
 
 

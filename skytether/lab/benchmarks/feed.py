@@ -30,6 +30,7 @@ from skytether.lab.benchmarks.children import ChildProcess
 from skytether.lab.benchmarks.harness import CONSOLE, Durations, TextTable, us
 from skytether.lab.benchmarks.problems import derive
 from skytether.server.endpoint import Server
+from skytether.shared.base import files
 from skytether.shared.core.change import Running
 from skytether.shared.core.events import address_text
 from skytether.shared.core.stopwatch import Stopwatch
@@ -224,7 +225,7 @@ def measure(
         server = _server(scenario, options.vehicles, feed)
         shell = Timed(server, ("127.0.0.1", 0), feed=feed)
         lookers = lookers_at(stack, folder)
-        (folder / "scenario.toml").write_bytes(to_toml(scenario))
+        files.write(folder / "scenario.toml", to_toml(scenario))
         more: tuple[str, ...] = (
             "--vehicles",
             str(options.vehicles),

@@ -28,6 +28,7 @@ from skytether.lab.benchmarks.harness import TextTable, progress, refresh
 from skytether.lab.benchmarks.heartbeats import computed
 from skytether.netem.fate import Fates
 from skytether.server.sessions import Session
+from skytether.shared.base import files
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import ModeChanged
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
@@ -265,7 +266,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     table = table_of(given.hours, given.flown_hours)
     print(table.markdown())
     if given.write:
-        DOCUMENT.write_text(refresh(DOCUMENT.read_text(), {"liveness": table}))
+        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), {"liveness": table}).encode())
 
 
 if __name__ == "__main__":

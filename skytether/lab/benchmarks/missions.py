@@ -26,6 +26,7 @@ from skytether.lab.benchmarks.harness import TextTable
 from skytether.lab.benchmarks.kept import flights
 from skytether.lab.benchmarks.together import ARRIVED_M, MortalServer, deaths
 from skytether.server.control.routes import Routes
+from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, zones
@@ -111,7 +112,7 @@ def mission(options: MissionsOptions, seed: int, folder: Path) -> Scenario:
         for number, both in enumerate(places.swapaxes(0, 1), start=1)
         for at_s, place in zip((0.0, GOAL_AT_S), both, strict=True)
     ]
-    file.write_text("\n".join([columns, *rows, ""]))
+    files.write(file, "\n".join([columns, *rows, ""]).encode())
     table = reading.to_table(reading.load("sphere" if options.space else "swap"))
     table |= {"seed": seed, "duration": options.duration, "settle": 1.0}
     table["reference"] |= {"shape": "mission", "file": str(file)}
@@ -297,7 +298,7 @@ def main(argv: Sequence[str]) -> None:
             f"zones {each.clear_m:.3f} m, {each.late} not arrived"
         )
     if options.markdown:
-        options.markdown.write_text(found.markdown())
+        files.write(options.markdown, found.markdown().encode())
 
 
 if __name__ == "__main__":

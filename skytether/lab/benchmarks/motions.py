@@ -42,6 +42,7 @@ from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.together import Together
+from skytether.shared.base import files
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -325,7 +326,7 @@ def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> 
             x = side * LEG_M / 2 * (-1.0) ** leg
             lines.append(f"{vehicle},{leg * LEG_S:g},{x:g},{APART_M * place:g}")
     file = folder / f"fleet-{vehicles}-{near}.csv"
-    file.write_text("\n".join(lines))
+    files.write(file, "\n".join(lines).encode())
     made = reading.load("swap")
     reference = msgspec.structs.replace(made.reference, shape="mission", file=str(file))
     return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
@@ -456,7 +457,7 @@ def main() -> int:
     for each, title in zip(found, titles, strict=True):
         each.show(title)
     if options.markdown:
-        options.markdown.write_text("\n".join(each.markdown() for each in found))
+        files.write(options.markdown, "\n".join(each.markdown() for each in found).encode())
     return 0
 
 

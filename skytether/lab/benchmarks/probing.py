@@ -24,6 +24,7 @@ from skytether.probe.outcome import PathTold, WayTold, outcome
 from skytether.probe.prober import MeasuredPath, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import PlainGate
+from skytether.shared.base import files
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
@@ -174,7 +175,7 @@ def main() -> int:
     found = table(options)
     found.show(f"probed for {options.seconds:g} s, {options.rate:g} packets a second")
     if options.markdown:
-        options.markdown.write_text(found.markdown())
+        files.write(options.markdown, found.markdown().encode())
     return 0
 
 

@@ -28,6 +28,7 @@ import tyro
 from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.server.control.scheme import Foresight
 from skytether.server.control.together import Together
+from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
@@ -133,7 +134,7 @@ def scenario(task: Task, network: str, duration: float, seed: int, folder: Path)
         for number, both in enumerate(zip(begins, ends, strict=True), start=1)
         for at_s, (x, y, z) in zip((0.0, GOAL_AT_S), both, strict=True)
     ]
-    file.write_text("vehicle,t,x,y,z\n" + "".join(rows))
+    files.write(file, ("vehicle,t,x,y,z\n" + "".join(rows)).encode())
     table = reading.to_table(reading.load("sphere"))
     table |= {"seed": seed, "duration": duration, "settle": 1.0}
     table["reference"] |= {"shape": "mission", "file": str(file)}
@@ -225,7 +226,7 @@ def main() -> int:
     found = table(options)
     found.show(f"published tasks, {options.flights} flights each")
     if options.markdown:
-        options.markdown.write_text(found.markdown())
+        files.write(options.markdown, found.markdown().encode())
     return 0
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from skytether.figures.flights import save
 from skytether.lab.benchmarks.harness import TextTable
 from skytether.quadrotor.frames import CRAZYFLIE, KG15, SIH, Frame
 from skytether.quadrotor.loops import ARDUPILOT, PX4, Gains
@@ -96,7 +97,7 @@ def draw(path: Path) -> None:
     axes.axhline(1.0, color="0.7", linewidth=0.8)
     axes.set(xlabel="time [s]", ylabel="velocity [m/s]", xlim=(0.0, SECONDS))
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    save(figure, path, dpi=110)
 
 
 def main() -> int:

@@ -29,6 +29,7 @@ from skytether.server.control.direct import Direct
 from skytether.server.control.known import Known
 from skytether.server.control.together import Together
 from skytether.server.endpoint import Server
+from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.core.endpoint import Datagram, Endpoint
@@ -330,7 +331,7 @@ def main(argv: Sequence[str]) -> None:
     found = table(options)
     found.show(f"{options.vehicles} vehicles swap places, {options.flights} flights a cell")
     if options.markdown:
-        options.markdown.write_text(found.markdown())
+        files.write(options.markdown, found.markdown().encode())
 
 
 if __name__ == "__main__":

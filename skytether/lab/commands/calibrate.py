@@ -19,8 +19,9 @@ from skytether.figures.page import as_text
 from skytether.lab import calibration
 from skytether.lab.calibration import HERE, Rmse, SearchLimits, Table1
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
+from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
@@ -98,6 +99,7 @@ def calibrate(argv: Sequence[str]) -> None:
         population=options.population,
         sigma=options.sigma,
     )
+    command.claim_folder("--out", options.out, BEST)
     title = f"searching from {options.scenario}"
     with (
         writing(options.out),
@@ -111,7 +113,7 @@ def calibrate(argv: Sequence[str]) -> None:
         points = list(chain.from_iterable(journal.entries[: options.generations]))
         if not points:
             raise CommandError("ended before the first generation was flown")
-        write(options.out / BEST, to_toml(search.scenario(best(points))))
+        files.write(options.out / BEST, to_toml(search.scenario(best(points))))
     if is_rmse:
         _print_rmse(points)
     else:

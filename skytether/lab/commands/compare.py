@@ -17,8 +17,9 @@ from skytether.lab.commands import report_folder
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
 from skytether.lab.search import Search, SearchPoint, best
+from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shell import command
 from skytether.shell.options import read
@@ -75,6 +76,7 @@ def compare(argv: Sequence[str]) -> None:
 def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
     """Fly all contenders in all cases, and write the report."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
+    command.claim_folder("--out", options.out, report_folder.PAGE)
     runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
     chosen = [plan.chosen() for plan in plans]
     sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
@@ -125,6 +127,7 @@ def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
 
 def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
     """Search for the weights of every contender in every case, and write them to a file."""
+    command.claim_folder("--out", options.out, WEIGHTS)
     found = []
     total = len(scale.searched) * scale.generations
     with crew(options.pool, "searching", total, "generations") as flyers:
@@ -151,5 +154,5 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
             )
             found.append(Found(contender, case, search.scenario(point), says))
             print(f"{name}: {says}")
-    write(options.out / WEIGHTS, contenders.to_file(found, scale).encode())
+    files.write(options.out / WEIGHTS, contenders.to_file(found, scale).encode())
     print(f"{options.out / WEIGHTS}: weights of {len(found)} contenders in their cases")

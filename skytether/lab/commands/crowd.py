@@ -15,8 +15,8 @@ from skytether.cli import processes
 from skytether.lab import figures
 from skytether.lab.commands.pool import Interrupted, writing
 from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
-from skytether.lab.journal import Journal, write
-from skytether.shared.base import kernel
+from skytether.lab.journal import Journal
+from skytether.shared.base import files, kernel
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shell import command, temporary, terminal
@@ -71,6 +71,7 @@ def crowd(argv: Sequence[str]) -> None:
     plan = Crowd(options.scenario, options.config, options.udp)
     for scheme in options.schemes:
         plan.of(scheme)
+    command.claim_folder("--out", options.out, "crowd.csv", "crowd.png")
     terminal.prepare(kernel.missing())
     with (
         writing(options.out),
@@ -161,7 +162,7 @@ def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     where = "over UDP" if options.udp else "in virtual time"
     title = f"{options.scenario}, {where}, seed {options.config.seed}"
     rows = [point for each in flown.values() for point in each.points]
-    write(options.out / "crowd.csv", points_csv(rows).encode())
+    files.write(options.out / "crowd.csv", points_csv(rows).encode())
     figures.crowd(options.out / "crowd.png", title, flown, options.limit)
     table = Table(title=title, title_justify="left")
     headings = ("scheme", "vehicles", "fly", "RMSE [m]", "worst [m]", "brake or end")

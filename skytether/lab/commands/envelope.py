@@ -15,7 +15,8 @@ from rich.table import Table
 from skytether.lab import figures
 from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
+from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
@@ -57,6 +58,7 @@ def envelope(argv: Sequence[str]) -> None:
     command.check_count("--points", options.points, 10**6)
     options.pool.check()
     plan = Envelope(options.scenario, options.config)
+    command.claim_folder("--out", options.out, "points.csv", "envelope.png")
     title = f"flying points of {options.scenario}"
     with (
         writing(options.out),
@@ -83,7 +85,7 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
         CommandError: some points are bad.
     """
     title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
-    write(options.out / "points.csv", plan.csv(points).encode())
+    files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)
     counts = Counter(point.outcome for point in points)
     table = Table(title=title, title_justify="left", min_width=len(title))

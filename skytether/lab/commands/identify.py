@@ -28,8 +28,7 @@ from skytether.lab.identify.steps import (
     default_speeds,
     fenced,
 )
-from skytether.lab.journal import write
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event
@@ -131,8 +130,7 @@ def identify(argv: Sequence[str]) -> None:
         kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
         raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
     figures.check(options.out / PICTURE)
-    with writing(options.out):
-        options.out.mkdir(parents=True, exist_ok=True)
+    command.claim_folder("--out", options.out, SCENARIO, PICTURE, MEASURED, OUTCOME)
     flown = [_fly(scenario, plan, sets=options.set_parameters) for plan in plans]
     if failure := flown[0].flight.failure:
         raise CommandError(str(failure))
@@ -276,8 +274,8 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         costs=costs,
     )
     with writing(out):
-        write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
-        write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
+        files.write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
+        files.write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
         figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
     terminal.show(_table(first))
     for name, axis in zip(AXES, first.axes, strict=False):
@@ -364,7 +362,7 @@ def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlo
         raise CommandError(f"no scenario is written: too few steps of {', '.join(missing)}")
     file = options.out / SCENARIO
     with writing(options.out):
-        write(file, text)
+        files.write(file, text)
     try:
         reading.load(str(file))
     except ConfigError as error:

@@ -15,10 +15,10 @@ from rich.table import Table
 from skytether.lab import maps
 from skytether.lab import margins as lab
 from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
 from skytether.lab.maps import Box, MapPoint
 from skytether.lab.margins import Margin
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, terminal
@@ -80,6 +80,7 @@ def margins(argv: Sequence[str]) -> None:
     scenario = options.config
     if options.maps is not None:
         _box(options, scenario.control.trigger)
+        command.claim_folder("--maps", options.maps, "points.csv", "maps.png")
     rates = lab.looks_at_state(scenario)
     rows = {lab.AS_IT_IS: scenario}
     rows |= {name: each.of(scenario) for name, each in lab.VEHICLES.items() if each.is_of(scenario)}
@@ -153,7 +154,7 @@ def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
 
             flyers.share(box.fly, [number for number in range(count) if number not in done], keep)
         points = sorted(journal.entries, key=lambda point: point.number)
-        write(folder / "points.csv", box.csv(points).encode())
+        files.write(folder / "points.csv", box.csv(points).encode())
         title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
         maps.draw(folder / "maps.png", title, box, points)
     _show_points(title, box, points)

@@ -29,7 +29,7 @@ import skytether.lab.sweep
 from skytether.lab.journal import Journal, digest
 from skytether.lab.search import Generation, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Done, FlightTask, Results, Sweep
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.schema import TABLES, Scenario
 from skytether.shell import command, plugins, temporary, terminal
@@ -143,7 +143,7 @@ class Crew:
             self.spent.runs += len(done.runs)
             self.advance(len(done.runs), text)
 
-        self.share(partial(work, files=journal.files), todo, keep)
+        self.share(partial(work, pins=journal.files), todo, keep)
 
     def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
         """All results of a sweep, after flying the missing tasks; see `fly`.
@@ -269,42 +269,42 @@ def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) 
     return function(item)
 
 
-def work(task: FlightTask, files: Mapping[str, str]) -> tuple[Done, float]:
+def work(task: FlightTask, pins: Mapping[str, str]) -> tuple[Done, float]:
     """Result of a task, and its CPU time [s]; called in a worker.
 
     Args:
-        files: see `pinned`.
+        pins: see `pinned`.
     """
     kernel.load()
     began_s = time.thread_time()
-    with pinned(task.scenario, files) as scenario:
+    with pinned(task.scenario, pins) as scenario:
         done = skytether.lab.sweep.fly(replace(task, scenario=scenario))
     return done, time.thread_time() - began_s
 
 
 def _fly_point(
-    fly: Callable[[Scenario], Values], files: Mapping[str, str], scenario: Scenario
+    fly: Callable[[Scenario], Values], pins: Mapping[str, str], scenario: Scenario
 ) -> Values:
     """Figures of a point of a search; called in a worker."""
-    with pinned(scenario, files) as flown:
+    with pinned(scenario, pins) as flown:
         return fly(flown)
 
 
 @contextmanager
-def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
+def pinned(scenario: Scenario, pins: Mapping[str, str]) -> Iterator[Scenario]:
     """Scenario that refers to a copy of its trajectory's file, so that later edits have no effect.
 
     Args:
-        files: expected digest of each file, by its path; other files are not copied.
+        pins: expected digest of each file, by its path; other files are not copied.
 
     Raises:
         ConfigError: the file has changed since the work began, or differs on this machine.
     """
     reference = scenario.reference
-    if reference.shape not in TABLES or reference.file not in files:
+    if reference.shape not in TABLES or reference.file not in pins:
         yield scenario
         return
-    content, expected = Path(reference.file).read_bytes(), files[reference.file]
+    content, expected = Path(reference.file).read_bytes(), pins[reference.file]
     if digest(content) != expected:
         raise ConfigError(
             f"{reference.file}: got the content {digest(content)}, expected {expected}, "
@@ -312,7 +312,7 @@ def pinned(scenario: Scenario, files: Mapping[str, str]) -> Iterator[Scenario]:
         )
     with temporary.folder() as folder:
         copy = folder / "trajectory.csv"
-        copy.write_bytes(content)
+        files.write(copy, content)
         yield replace(scenario, reference=replace(reference, file=str(copy)))
 
 

@@ -82,10 +82,11 @@ def write(out: Path, drawn: Drawn, scenario: Scenario, call: CommandCall, runs: 
             files.write(out / f"{picture.name}{suffix}", content)
     for table in drawn.tables:
         files.write(out / f"{table.name}.csv", table.csv.encode())
-    files.check(out / CALLS)
-    with (out / CALLS).open("a") as file:
-        file.write(json.dumps(call.facts(runs)) + "\n")
-    calls = [json.loads(line) for line in (out / CALLS).read_text().splitlines()]
+    file = out / CALLS
+    lines = file.read_text().splitlines() if file.exists() else []
+    lines.append(json.dumps(call.facts(runs)))
+    files.write(file, "".join(f"{line}\n" for line in lines).encode())
+    calls = [json.loads(line) for line in lines]
     files.write(out / PAGE, report.html(drawn, scenario, calls).encode())
 
 

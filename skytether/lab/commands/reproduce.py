@@ -16,11 +16,11 @@ from skytether.lab import report, studies
 from skytether.lab.commands import delays, report_folder
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
 from skytether.lab.report import Reproduction
 from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
 from skytether.lab.sweep import Done
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -61,6 +61,7 @@ def reproduce(argv: Sequence[str]) -> None:
         scale = replace(studies.QUICK, runs=min(options.runs, studies.QUICK.runs))
     scenario = msgspec.structs.replace(reading.load(studies.SCENARIO), duration=scale.duration)
     call = CommandCall.now("reproduce", argv)
+    command.claim_folder("--out", options.out, report_folder.PAGE)
     with writing(options.out):
         measured, runs = _measure(options, scenario, scale)
         drawn = report.draw(measured)
@@ -123,7 +124,7 @@ def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
         content = io.BytesIO()
         with terminal.progress("packets through netem, over UDP", seconds) as on_second:
             np.save(content, delays.measure(scenario, folder, scale.delay_packets, on_second))
-        write(file, content.getvalue())
+        files.write(file, content.getvalue())
     kept: Array = np.load(file)
     return kept
 
@@ -178,7 +179,7 @@ def _samples(
             }
             content = io.BytesIO()
             np.savez_compressed(content, **rows)
-            write(file, content.getvalue())
+            files.write(file, content.getvalue())
         with np.load(file) as kept:
             samples[method] = (
                 scenario,

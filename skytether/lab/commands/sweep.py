@@ -13,8 +13,9 @@ from rich.text import Text
 
 from skytether.lab import figures
 from skytether.lab.commands.pool import Flags, PoolFlags, Spent, crew, writing
-from skytether.lab.journal import Journal, write
+from skytether.lab.journal import Journal
 from skytether.lab.sweep import Done, Sweep, estimate, parse_axis, results
+from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, terminal
 from skytether.shell.command import ScenarioFlags, ScenarioName
@@ -63,6 +64,7 @@ def sweep(argv: Sequence[str]) -> None:
     options.pool.check()
     axes = [parse_axis(text) for text in options.grid]
     plan = Sweep(options.scenario, options.config, axes, options.runs)
+    command.claim_folder("--out", options.out, "runs.csv", "cells.csv")
     title = f"sweeping {options.scenario}, {len(plan.cells)} cells"
     with (
         writing(options.out),
@@ -75,10 +77,10 @@ def sweep(argv: Sequence[str]) -> None:
 
 def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: Spent) -> None:
     """Write and print the tables and pictures of a complete sweep."""
-    files = ["runs.csv", "cells.csv"]
+    written = ["runs.csv", "cells.csv"]
     done = results(journal.entries)
-    write(options.out / "runs.csv", plan.runs_csv(done).encode())
-    write(options.out / "cells.csv", plan.cells_csv(done).encode())
+    files.write(options.out / "runs.csv", plan.runs_csv(done).encode())
+    files.write(options.out / "cells.csv", plan.cells_csv(done).encode())
     cells = [plan.of_cell(done, cell) for cell in range(len(plan.cells))]
     title = f"{options.scenario}, {plan.runs} runs each, in virtual time"
     for figure, name in DRAWN.items():
@@ -95,7 +97,7 @@ def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: S
                 figures.heat_map(path, title, (one, other), name, means=means)
             case _:
                 continue
-        files.append(path.name)
+        written.append(path.name)
     table = Table(title=title, title_justify="left")
     for heading in [axis.key for axis in plan.axes] + [name for name, _ in SHOWN.values()]:
         table.add_column(Text(heading), justify="right", no_wrap=True)
@@ -112,7 +114,7 @@ def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: S
     if spent.cpu_s:
         rate = spent.steps / spent.cpu_s
         print(f"{spent.steps} vehicle-steps, {rate:.0f} per core-second")
-    print(f"{options.out}: {', '.join(files)}")
+    print(f"{options.out}: {', '.join(written)}")
 
 
 def _interval(mean: float | None, half: float | None, spec: str) -> str:

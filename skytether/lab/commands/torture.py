@@ -16,6 +16,7 @@ from rich.table import Table
 from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
+from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shell import command, terminal
 from skytether.shell.command import CommandError
@@ -25,6 +26,8 @@ SEEDS = 2**32
 """Number of seeds."""
 HOURS_MAX = 10_000
 """Largest number of hours."""
+SCHEDULES_BYTES_MAX = 64_000_000
+"""Largest size of a file of schedules [B]."""
 TOLD_MAX = 10
 """Most failures that are shrunk and printed."""
 
@@ -61,7 +64,7 @@ def torture(argv: Sequence[str]) -> None:
     """
     options = read(TortureOptions(), argv, "skytether torture", torture.__doc__)
     command.check_count("--count", options.count, 10**6)
-    command.check_output("--json", options.json)
+    command.claim_output("--json", options.json)
     pool = Flags(workers=options.jobs)
     pool.check()
     trials, title = _trials(options)
@@ -129,7 +132,7 @@ def _read(path: Path) -> list[Trial]:
         ConfigError: a line is no schedule, or the file has none.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
     trials = [loads(line) for line in lines if line.strip() and not line.startswith("#")]

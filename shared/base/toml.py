@@ -1,0 +1,51 @@
+"""TOML text, refused before it is parsed where parsing it would take too much.
+
+The standard library's parser keeps every prefix of a dotted key: its memory grows with the square
+of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So
+the text is first read for these two alone, in one pass. Nothing else parses TOML in this package,
+which tests/shared/test_toml.py proves.
+"""
+
+import re
+import tomllib
+from typing import Any
+
+BYTES_MAX = 1_000_000
+"""Largest size of a text [characters]."""
+PARTS_MAX = 8
+"""Most parts of a key."""
+DEPTH_MAX = 32
+"""Most brackets open at once."""
+
+_OPAQUE = re.compile(
+    r'"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}'
+    r"|'''(?:[^']|'{1,2}(?!'))*+'{3,5}"
+    r'|"(?:[^"\\\n]|\\.)*+"'
+    r"|'[^'\n]*+'"
+    r"|\#[^\n]*+",
+    re.DOTALL,
+)
+"""Strings and comments, in which points and brackets are only letters."""
+_DIVIDERS = re.compile(r"[=,\[\]{}\n]")
+"""Letters that end a key."""
+
+
+def loads(text: str) -> dict[str, Any]:
+    """Values of a TOML text.
+
+    Raises:
+        ValueError: it is no valid TOML, too long, nested too deeply, or has a key of too many
+            parts.
+    """
+    if len(text) > BYTES_MAX:
+        raise ValueError(f"got {len(text)} characters, expected at most {BYTES_MAX}")
+    bare = _OPAQUE.sub("", text)
+    parts = 1 + max(each.count(".") for each in _DIVIDERS.split(bare))
+    if parts > PARTS_MAX:
+        raise ValueError(f"got a key of {parts} parts, expected at most {PARTS_MAX}")
+    depth = 0
+    for each in re.findall(r"[\[\]{}]", bare):
+        depth += 1 if each in "[{" else -1
+        if depth > DEPTH_MAX:
+            raise ValueError(f"nested too deeply, expected at most {DEPTH_MAX} brackets")
+    return tomllib.loads(text)

@@ -1,0 +1,394 @@
+"""What commands write: never an input, never what another command writes, never half of it."""
+
+import dataclasses
+import fcntl
+import importlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import get_type_hints
+
+import numpy as np
+import pytest
+
+from skytether.__main__ import COMMANDS, main
+from skytether.shared.base import files
+from skytether.shared.scenario.registry import REFERENCES
+from skytether.shared.telemetry.record import PACKET_COLUMNS, read
+from skytether.shell import plugins
+from skytether.shell.command import CommandError
+from skytether.shell.process import recorded
+
+SHORT = ("--virtual", "--duration", "6", "--settle", "0")
+SCENARIO = "extends = 'demo'\nduration = 6.0\n"
+LINES = {
+    "fly --json": "fly SCENARIO OUT",
+    "fly --record": "fly SCENARIO OUT.mcap",
+    "fly --figure": "fly SCENARIO OUT.png",
+    "straight --json": "straight SCENARIO OUT",
+    "straight --figure": "straight SCENARIO OUT.png",
+    "fleet --json": "fleet --mission MISSION --virtual OUT",
+    "fleet --figure": "fleet SCENARIO --virtual --vehicles 1 OUT.png",
+    "crowd --out": "crowd SCENARIO OUT/crowd.csv",
+    "sweep --out": "sweep SCENARIO --runs 1 OUT/runs.csv",
+    "envelope --out": "envelope SCENARIO --points 1 OUT/points.csv",
+    "margins --json": "margins SCENARIO --runs 1 OUT",
+    "margins --maps": "margins SCENARIO --runs 1 OUT/points.csv",
+    "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
+    "torture --json": "torture --replay SCHEDULES OUT",
+    "reproduce --out": "reproduce --quick --plugin PLUGIN OUT/report.html",
+    "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
+    "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",
+    "report --out": "report RECORDING OUT",
+    "export --csv": "export RECORDING OUT/client.csv",
+    "export --parquet": "export RECORDING OUT/client.parquet",
+    "export --traces": "export RECORDING OUT/uplink-0.csv",
+    "export --pcap": "export RECORDING OUT",
+    "recover --out": "recover RECORDING OUT.mcap",
+    "join --out": "join RECORDING OTHER OUT.mcap",
+    "probe --out": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT/uplink.csv",
+    "probe --json": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT",
+    "probe --figure": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT.png",
+    "probe --record": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT",
+    "server --json": "server demo --keys KEYS OUT",
+    "server --record": "server SCENARIO OUT",
+    "netem --json": "netem SCENARIO OUT",
+    "netem --record": "netem SCENARIO OUT.mcap",
+    "client --json": "client demo --keys KEYS OUT",
+    "client --record": "client SCENARIO OUT.mcap",
+    "autopilot --json": "autopilot SCENARIO OUT",
+    "autopilot --record": "autopilot SCENARIO OUT",
+    "station --json": "station SCENARIO OUT",
+    "station --record": "station SCENARIO OUT",
+}
+"""A line for each option that names what is written; OUT stands for the option and another name of
+the input."""
+READ = {"plugin", "keys", "replay", "file", "files", "folders", "path"}
+"""Options that name files to read, or sockets and folders of sockets."""
+SOCKETS = {"control", "feed"}
+"""Options that name sockets to make, for which no file is replaced."""
+IN_PLACE = {("keygen", "file"), ("recover", "file")}
+"""Options whose file is read and written on purpose."""
+
+
+def options_of(command: str) -> type:
+    """The record of a command's options."""
+    module = importlib.import_module(COMMANDS[command].partition(":")[0])
+    found = [
+        each
+        for name, each in vars(module).items()
+        if name.endswith("Options") and each.__module__ == module.__name__
+    ]
+    return found[-1] if found else type("Nothing", (), {"__dataclass_fields__": {}})
+
+
+def test_every_option_that_names_a_file_is_looked_at() -> None:
+    """A new one belongs in the table above, or is read alone."""
+    for command in COMMANDS:
+        kind = options_of(command)
+        for field in dataclasses.fields(kind):
+            if "Path" in str(get_type_hints(kind, include_extras=True)[field.name]):
+                flag = field.name.replace("_", "-")
+                known = f"{command} --{flag}" in LINES or (command, field.name) in IN_PLACE
+                assert known or field.name in READ | SOCKETS, (command, field.name)
+
+
+@pytest.fixture(autouse=True)
+def _tables() -> Iterator[None]:
+    """Leave the tables of plug-ins as they were."""
+    before = dict(REFERENCES)
+    yield
+    plugins._loaded.clear()
+    REFERENCES.clear()
+    REFERENCES.update(before)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a flight."""
+    path = tmp_path_factory.mktemp("flight") / "flight.mcap"
+    assert main(["fly", "demo", *SHORT, "--record", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
+    """A file of each kind that commands read."""
+    folder = tmp_path / "in"
+    folder.mkdir(mode=0o700)
+    made = {
+        "SCENARIO": folder / "scenario.toml",
+        "MISSION": folder / "mission.csv",
+        "SCHEDULES": folder / "schedules.txt",
+        "PLUGIN": folder / "plugin.py",
+        "WEIGHTS": folder / "weights.toml",
+        "RECORDING": folder / "flight.mcap",
+        "OTHER": folder / "other.mcap",
+        "KEYS": folder / "keys",
+    }
+    made["SCENARIO"].write_text(SCENARIO)
+    made["MISSION"].write_text("vehicle,t,x,y\n1,0,0,0\n2,0,5,0\n")
+    made["SCHEDULES"].write_text(
+        Path(__file__).parents[1].joinpath("torture_seeds.txt").read_text()
+    )
+    made["PLUGIN"].write_text(
+        "from skytether.plugin import reference\nimport numpy as np\n"
+        "@reference\ndef still(scenario):\n"
+        "    '''At rest.'''\n    return lambda t: np.zeros((*np.shape(t), 2, 2))\n"
+    )
+    scenarios = Path(importlib.import_module("skytether.scenarios").__file__ or "").parent
+    made["WEIGHTS"].write_bytes((scenarios / "compare.toml").read_bytes())
+    for name in ("RECORDING", "OTHER"):
+        made[name].write_bytes(recording.read_bytes())
+    assert main(["keygen", str(made["KEYS"])]) == 0
+    return made
+
+
+def line_of(option: str, inputs: dict[str, Path], out: Path) -> tuple[list[str], Path, Path]:
+    """Arguments of a line of the table, its input, and where that is linked to as the output."""
+    *words, last = LINES[option].split()
+    flag = option.partition(" ")[2]
+    (source,) = (inputs[word] for word in words if word in inputs and word != "OTHER")
+    name, _, inside = last.partition("/")
+    target = out / inside if inside else out / name.replace("OUT", "it")
+    given = [str(inputs.get(word, word)) for word in words]
+    return [*given, flag, str(out if inside else target)], source, target
+
+
+@pytest.mark.parametrize("option", LINES)
+def test_no_output_is_an_input(
+    option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By whichever name: here the output is another link to the same file."""
+    out = tmp_path / "out"
+    out.mkdir()
+    argv, source, target = line_of(option, inputs, out)
+    os.link(source, target)
+    before = source.read_bytes()
+    capsys.readouterr()
+    assert main(argv) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "put as well, expected another file" in said
+    assert str(target) in said or str(source) in said
+    assert source.read_bytes() == target.read_bytes() == before
+    assert {each.name for each in out.iterdir()} == {target.name}
+
+
+@pytest.mark.parametrize("option", ["fly --json", "report --out", "join --out", "torture --json"])
+def test_nor_by_its_own_name(
+    option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The simplest way to lose a recording."""
+    argv, source, _ = line_of(option, inputs, tmp_path)
+    argv[-1] = str(source)
+    before = source.read_bytes()
+    assert main(argv) == 2
+    assert f"{source}: " in capsys.readouterr().err.splitlines()[-1]
+    assert source.read_bytes() == before
+
+
+def test_a_file_that_a_scenario_names_is_an_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it extends, and its trajectory."""
+    (tmp_path / "below.toml").write_text(SCENARIO)
+    (tmp_path / "way.csv").write_text("t,x,y\n0,0,0\n10,1,1\n")
+    above = tmp_path / "above.toml"
+    above.write_text("extends = 'below.toml'\n[reference]\nshape = 'csv'\nfile = 'way.csv'\n")
+    for name in ("below.toml", "way.csv"):
+        before = (tmp_path / name).read_bytes()
+        assert main(["fly", str(above), "--virtual", "--json", str(tmp_path / name)]) == 2
+        assert "it is an input as well" in capsys.readouterr().err
+        assert (tmp_path / name).read_bytes() == before
+
+
+def test_two_options_do_not_name_one_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second would replace the first."""
+    at = str(tmp_path / "it.png")
+    assert main(["fly", "demo", *SHORT, "--json", at, "--figure", at]) == 2
+    assert "another option names it as well" in capsys.readouterr().err
+    assert not Path(at).exists()
+
+
+# -- two commands at once ------------------------------------------------------------------------
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """A file or folder that another command is writing."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@pytest.mark.parametrize(
+    ("argv", "name"),
+    [
+        (("fly", "demo", *SHORT, "--record"), "it.mcap"),
+        (("fly", "demo", *SHORT, "--json"), "it"),
+        (("fly", "demo", *SHORT, "--figure"), "it.png"),
+        (("server", "demo", "--record"), "it"),
+        (("sweep", "demo", "--runs", "1", "--out"), "folder"),
+        (("margins", "demo", "--maps"), "folder"),
+        (("export", "FLIGHT", "--csv"), "folder"),
+        (("recover",), "it.mcap"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),
+)
+def test_two_commands_do_not_write_one_file(
+    argv: tuple[str, ...],
+    name: str,
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The second is refused before it flies."""
+    at = tmp_path / name
+    if name == "folder":
+        at.mkdir()
+    else:
+        at.write_bytes(b"older")
+    words = [str(recording) if word == "FLIGHT" else word for word in argv]
+    with locked(at):
+        assert main([*words, str(at)]) == 2
+    assert f"{at}: cannot be written: another command is writing it" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [at]
+    assert at.is_dir() or at.read_bytes() == b"older"
+
+
+def test_a_new_file_is_locked_at_once_and_gone_where_nothing_was_written(tmp_path: Path) -> None:
+    """It is empty until then."""
+    at = tmp_path / "it"
+    with files.apart():
+        files.claim(at)
+        assert at.read_bytes() == b""
+        with at.open() as other, pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    assert not at.exists()
+    with files.apart():
+        files.claim(at)
+        files.write(at, b"content")
+    assert at.read_bytes() == b"content"
+
+
+@pytest.mark.long
+def test_a_flight_that_is_killed_leaves_the_older_recording(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Meanwhile no other command may write there; what was recorded can be recovered."""
+    at, part = tmp_path / "it.mcap", tmp_path / "it.part1.mcap"
+    at.write_bytes(recording.read_bytes())
+    argv = ["fly", "demo", "--no-page", "--duration", "60", "--record", str(at)]
+    child = subprocess.Popen([sys.executable, "-P", "-m", "skytether", *argv])
+    try:
+        until_s = time.monotonic() + 120.0
+        while not part.exists() or part.stat().st_size < 100_000:
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+        assert main(["fly", "demo", *SHORT, "--record", str(at)]) == 2
+        assert "another command is writing it" in capsys.readouterr().err
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    assert at.read_bytes() == recording.read_bytes()
+    assert main(["recover", str(part), "--out", str(tmp_path / "mended.mcap")]) == 0
+
+
+# -- a full disk ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file may be longer."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("argv", "name"),
+    [
+        (("fly", "demo", *SHORT, "--record"), "it.mcap"),
+        (("fly", "demo", *SHORT, "--figure"), "it.png"),
+        (("report", "FLIGHT", "--out"), "it.html"),
+        (("recover", "FLIGHT", "--out"), "it.mcap"),
+        (("join", "FLIGHT", "FLIGHT", "--out"), "it.mcap"),
+        (("export", "FLIGHT", "--pcap"), "it.pcap"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),
+)
+def test_a_full_disk_leaves_the_older_file(
+    argv: tuple[str, ...],
+    name: str,
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Whole, and nothing beside it; without an older one there is none."""
+    at = tmp_path / name
+    words = [str(recording) if word == "FLIGHT" else word for word in argv]
+    for older in (b"older", None):
+        if older is None:
+            at.unlink()
+        else:
+            at.write_bytes(older)
+        with room_for(2000):
+            assert main([*words, str(at)]) != 0
+        assert "File too large" in capsys.readouterr().err
+        assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == (
+            {name: older} if older else {}
+        )
+
+
+def test_without_unnamed_files_a_file_is_replaced_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on NFS: it has a name of its own while it is written."""
+    monkeypatch.setattr(files.os, "O_TMPFILE", os.O_DIRECTORY | os.O_RDWR)
+    at = tmp_path / "it"
+    with files.replacing(at) as file:
+        file.write(b"content")
+        (part,) = tmp_path.iterdir()
+        assert part.name == "it.part1"
+    assert at.read_bytes() == b"content"
+    with pytest.raises(OSError, match="exists"), files.replacing(at, new=0o600) as file:
+        file.write(b"other")
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"content"]
+
+
+def test_an_older_record_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+    """What a full disk has left of the new one is beside it."""
+    at, part = tmp_path / "it", tmp_path / "it.part1"
+
+    def fly(rows: int) -> None:
+        with recorded(at, PACKET_COLUMNS) as record:
+            for number in range(rows):
+                record.recorder.append(1, number=number)
+
+    fly(10)
+    older = at.read_bytes()
+    with room_for(4096), pytest.raises(CommandError, match=r"it\.part1: File too large"):
+        fly(1000)
+    assert at.read_bytes() == older
+    kept = read(part)["number"]
+    np.testing.assert_array_equal(kept, np.arange(len(kept)))
+    part.unlink()
+    fly(20)
+    assert read(at)["number"].tolist() == list(range(20))
+    fly(0)
+    assert read(at)["number"].tolist() == list(range(20))
+    assert list(tmp_path.iterdir()) == [at]

@@ -1,0 +1,87 @@
+"""Checks of missions: which goals are too near to each other, whatever the number of vehicles."""
+
+import resource
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.mission import Mission, mission
+
+Goals = dict[int, tuple[Array, Array]]
+MANY = 20_000
+CPU_S = 30.0
+"""Longest time for MANY vehicles [s], which take half a second; each with each takes minutes."""
+
+
+def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, float] | None:
+    """First time and distance of goals that are too near, by comparing all at all times."""
+    times = np.unique(np.concatenate([times_s for times_s, _ in goals.values()]))
+    all_ = Mission(goals, 3, 1)
+    for at_s in times.tolist():
+        places = [all_.of(number)(np.array(at_s))[:, 0] * [1.0, 1.0, height] for number in goals]
+        away = min((np.linalg.norm(a - b) for a, b in combinations(places, 2)), default=np.inf)
+        if away < apart_m:
+            return at_s, float(away)
+    return None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_first_two_that_are_too_near_are_found(seed: int) -> None:
+    """As if each were compared with each at each time."""
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        goals: Goals = {}
+        for number in range(1, int(rng.integers(2, 9))):
+            times_s = np.append(0.0, np.sort(rng.choice(10, rng.integers(0, 4), replace=False) + 1))
+            goals[number] = times_s, rng.uniform(-3.0, 3.0, (len(times_s), 3))
+        apart_m, height = rng.uniform(0.1, 1.5), rng.choice([1.0, 0.5, 0.0])
+        found = Mission(goals, 3, 1).nearest(apart_m, height)
+        assert (found and found[2:]) == pytest.approx(each_with_each(goals, apart_m, height))
+
+
+def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
+    """One leaves when the next one comes."""
+    turns: Goals = {
+        1: (np.array([0.0, 5.0]), np.array([[0.0, 0.0], [9.0, 9.0]])),
+        2: (np.array([0.0, 5.0]), np.array([[5.0, 5.0], [0.0, 0.0]])),
+    }
+    assert Mission(turns, 2, 1).nearest(1.0, 1.0) is None
+    turns[2] = np.array([0.0, 4.0]), turns[2][1]
+    assert Mission(turns, 2, 1).nearest(1.0, 1.0) == (1, 2, 4.0, 0.0)
+
+
+def grid(vehicles: int) -> Array:
+    """Places on a square grid of 1 m."""
+    return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
+
+
+def test_many_vehicles_are_checked_in_proportion(tmp_path: Path) -> None:
+    """In a table, with places apart, all at one place, and one place visited by all in turn."""
+    lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
+    (tmp_path / "goals.csv").write_text("\n".join(["vehicle,t,x,y", *lines]))
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    read = mission(tmp_path / "goals.csv", 2)
+    assert read.nearest(0.99, 1.0) is None
+    assert read.nearest(1.01, 1.0) == (1, 2, 0.0, 1.0)
+    heap = Mission({i + 1: (np.zeros(1), np.zeros((1, 2))) for i in range(MANY)}, 2, 1)
+    assert heap.nearest(0.5, 1.0) == (1, 2, 0.0, 0.0)
+    times_s, home = np.array([0.0, 1.0, 2.0]), 5.0 + grid(MANY)
+    in_turn: Goals = {
+        i + 1: (times_s + np.array([0.0, i, i]), np.array([at, [0.0, 0.0], at]))
+        for i, at in enumerate(home)
+    }
+    assert Mission(in_turn, 2, 1).nearest(0.99, 1.0) is None
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    assert after.ru_utime - before.ru_utime < CPU_S
+
+
+def test_numbers_of_vehicles_are_those_that_fly(tmp_path: Path) -> None:
+    """The link has two bytes for them."""
+    path = tmp_path / "goals.csv"
+    for number in (0, 65_536, 1.5):
+        path.write_text(f"vehicle,t,x,y\n{number},0,0,0\n")
+        with pytest.raises(ValueError, match="column vehicle: expected numbers"):
+            mission(path, 2)

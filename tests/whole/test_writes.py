@@ -1,0 +1,133 @@
+"""One place for each: `shared.base.files` writes files, `shared.base.toml` reads TOML."""
+
+import ast
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+HOUSE = Path(__file__).parents[2]
+ROOMS = ("skytether", "server", "client", "netem", "shared")
+ALLOWED = {
+    "shared/base/files.py": "the one place",
+    "skytether/shell/start.py": "/dev/null in place of a closed stream",
+    "skytether/shell/command.py": "/dev/null in place of a closed pipe",
+    "skytether/shell/stream.py": "the line to an autopilot",
+    "skytether/shell/temporary.py": "marks in folders that it has made",
+}
+"""Files of code that open something for writing, and what."""
+SCRATCH = "skytether/lab/fuzz/"
+"""The fuzzer rewrites a file thousands of times a minute, in a folder that it throws away."""
+WRITING = set("wax+")
+METHODS = {"write_text", "write_bytes", "touch", "symlink_to", "hardlink_to"}
+FLAGS = {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"}
+IN_MEMORY = {"png", "pdf", "content", "file", "figure"}
+"""Names of what pictures and arrays are saved to: buffers, and files of `files.replacing`."""
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Every module of the package, by its path in the house."""
+    paths = [path for room in ROOMS for path in sorted((HOUSE / room).rglob("*.py"))]
+    own = [path for path in paths if path.resolve() == path]  # not through a room's link
+    return {str(path.relative_to(HOUSE)): ast.parse(path.read_text()) for path in own}
+
+
+def mode_of(call: ast.Call, place: int) -> str:
+    """The mode with which `open` is called; all of them where it is no literal."""
+    given = [each.value for each in call.keywords if each.arg == "mode"]
+    given += call.args[place : place + 1]
+    if not given:
+        return "r"
+    (mode,) = given[:1]
+    return mode.value if isinstance(mode, ast.Constant) and isinstance(mode.value, str) else "w+"
+
+
+def writes(call: ast.Call) -> bool:  # noqa: PLR0911 - one for each way to write
+    """Whether a call opens a file for writing, or gives one another name."""
+    match call.func:
+        case ast.Name(id="open"):
+            return bool(WRITING & set(mode_of(call, 1)))
+        case ast.Attribute(value=ast.Name(id="os"), attr="open"):
+            named = {each.attr for each in ast.walk(call) if isinstance(each, ast.Attribute)}
+            return bool(FLAGS & named) or any(isinstance(each, ast.Name) for each in call.args[1:])
+        case ast.Attribute(value=ast.Name(id="os"), attr="replace" | "rename" | "link" | "mkfifo"):
+            return True
+        case ast.Attribute(attr="open"):
+            literal = [each for each in call.args[:1] if isinstance(each, ast.Constant)]
+            return bool(literal) and bool(WRITING & set(str(literal[0].value)))
+        case ast.Attribute(value=ast.Name(id="figures" | "flights"), attr="save"):
+            return False  # our own, by `files.replacing`
+        case ast.Attribute(attr="savefig" | "save" | "savez" | "savez_compressed" | "to_csv"):
+            first = call.args[:1]
+            return not all(isinstance(each, ast.Name) and each.id in IN_MEMORY for each in first)
+        case ast.Attribute(attr=name):
+            return name in METHODS
+    return False
+
+
+def found(of: Callable[[ast.Call], bool]) -> set[str]:
+    """Places of calls, as file and line."""
+    return {
+        f"{path}:{node.lineno}"
+        for path, tree in modules().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and of(node)
+    }
+
+
+def test_nothing_else_writes_a_file() -> None:
+    """So that nothing is cut before it is replaced, and no input becomes an output."""
+    elsewhere = {
+        place
+        for place in found(writes)
+        if place.partition(":")[0] not in ALLOWED and not place.startswith(SCRATCH)
+    }
+    assert elsewhere == set()
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "open(path, 'w')",
+        "open(path, mode='ab')",
+        "open(path, mode)",
+        "path.open('x')",
+        "path.write_text(text)",
+        "path.write_bytes(content)",
+        "os.open(path, os.O_RDWR)",
+        "os.open(path, flags)",
+        "os.rename(path, other)",
+        "figure.savefig(path)",
+        "np.save(path, rows)",
+    ],
+)
+def test_each_way_to_write_is_seen(code: str) -> None:
+    """The test above would otherwise be passed by what it does not know."""
+    (call,) = (each for each in ast.walk(ast.parse(code)) if isinstance(each, ast.Call))
+    assert writes(call)
+
+
+@pytest.mark.parametrize("code", ["open(path)", "path.open()", "figure.savefig(png)"])
+def test_what_only_reads_is_no_way_to_write(code: str) -> None:
+    """Nor is a picture in memory."""
+    (call,) = (each for each in ast.walk(ast.parse(code)) if isinstance(each, ast.Call))
+    assert not writes(call)
+
+
+def test_nothing_else_parses_toml() -> None:
+    """`tomllib` takes memory in the square of a key's parts."""
+
+    def parses(node: ast.AST) -> bool:
+        match node:
+            case ast.Import(names=names):
+                return any(each.name == "tomllib" for each in names)
+            case ast.ImportFrom(module="tomllib"):
+                return True
+            case ast.Attribute(value=ast.Attribute(attr="toml"), attr="decode"):
+                return True
+        return False
+
+    places = {path for path, tree in modules().items() for node in ast.walk(tree) if parses(node)}
+    assert places - {"skytether/lab/fuzz/texts.py"} == {"shared/base/toml.py"}
