@@ -253,7 +253,14 @@ def write(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def replacing(path: Path, *, is_input: bool = False, new: int | None = None) -> Iterator[BinaryIO]:
+def replacing(
+    path: Path,
+    *,
+    is_input: bool = False,
+    mode: int | None = None,
+    is_new: bool = False,
+    is_synced: bool = True,
+) -> Iterator[BinaryIO]:
     """File for new content, which gets its name at the end of the block; on an error, nothing is
     changed.
 
@@ -262,29 +269,33 @@ def replacing(path: Path, *, is_input: bool = False, new: int | None = None) -> 
 
     Args:
         is_input: whether the file may be one that the command reads.
-        new: permissions of a file that must not exist yet.
+        mode: its permissions, unless they are to be those of the file that it replaces.
+        is_new: whether a file that is there is an error.
+        is_synced: whether it is on the disk at the end, and outlives the computer.
 
     Raises:
         OSError: it cannot be written, is no plain file, or exists although it must be new.
     """
     status = check(path, is_input=is_input)
-    mode = stat.S_IMODE(status.st_mode) if status else new
+    if mode is None and status:
+        mode = stat.S_IMODE(status.st_mode)
     part: Path | None = None
     try:
         flags = os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC
-        descriptor = os.open(path.absolute().parent, flags, MODE)
+        descriptor = os.open(path.absolute().parent, flags, MODE if mode is None else mode)
     except OSError as error:
         if error.errno not in (EISDIR, EOPNOTSUPP):  # the latter on NFS, for example
             raise
-        part, descriptor = _unused(path, _new)
+        part, descriptor = _unused(path, partial(_new, mode=MODE if mode is None else mode))
     try:
         with os.fdopen(descriptor, "r+b") as file:
             yield file
             file.flush()
             if mode is not None:
                 os.fchmod(descriptor, mode)
-            os.fsync(descriptor)
-            if new is not None:
+            if is_synced:
+                os.fsync(descriptor)
+            if is_new:
                 _link(descriptor, path)
                 return
             if part is None:
@@ -327,7 +338,7 @@ class Growing:
         self._path = path
         status = check(path)
         self.at = path
-        """Its path, for now."""
+        """Path of the file, for now."""
         if status and status.st_size:
             self.at, descriptor = _unused(path, _new)
         else:
@@ -359,13 +370,13 @@ class Growing:
             self.at = self.at.replace(self._path)
 
 
-def _new(path: Path) -> int:
+def _new(path: Path, mode: int = MODE) -> int:
     """Descriptor of a new file.
 
     Raises:
         OSError: it exists, or cannot be made.
     """
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, MODE)
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, mode)
 
 
 def _link(descriptor: int, path: Path) -> None:

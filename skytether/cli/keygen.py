@@ -126,7 +126,7 @@ def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
         if add:
             before = files.read(path, keys.FILE_BYTES_MAX, private=True)
             before += b"" if before.endswith(b"\n") else b"\n"
-        with files.replacing(path, is_input=add, new=None if add else 0o600) as file:
+        with files.replacing(path, is_input=add, mode=0o600, is_new=not add) as file:
             file.write(before + "".join(lines).encode())
     except FileExistsError:
         raise CommandError(

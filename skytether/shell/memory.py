@@ -9,11 +9,11 @@ One that is damaged, or of another vehicle, key or flight, is refused in words, 
 
 import asyncio
 import contextlib
-import fcntl
 import os
 import threading
 import time
 from collections.abc import Mapping
+from errno import EBUSY
 from hashlib import blake2b
 from pathlib import Path
 
@@ -81,12 +81,11 @@ class MemoryFile:
         self._path, self._identity, self._secret = path, dict(identity), secret
         self._host = _host()
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        lock = path.with_name(path.name + ".lock")
-        self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(self._lock)
+            self._lock = files.appending(path.with_name(path.name + ".lock"))
+        except OSError as error:
+            if error.errno != EBUSY:
+                raise
             raise OSError(f"{path}: another process keeps its memory there") from None
         self._wanted: bytes | None = None
         """Content to be written next."""
@@ -182,7 +181,7 @@ class MemoryFile:
         if self._thread is not None:
             self._thread.join(AGAIN_S)
         with contextlib.suppress(OSError):
-            os.close(self._lock)
+            self._lock.close()
 
     def _work(self) -> None:
         while True:
@@ -193,7 +192,10 @@ class MemoryFile:
                     return
                 held = self._wanted
             try:
-                _replace(self._path, held)
+                with files.replacing(
+                    self._path, is_input=True, mode=0o600, is_synced=False
+                ) as file:
+                    file.write(held)
                 self._failure = ""
             except OSError as error:
                 self._failure = f"{self._path}: {error.strerror or error}"
@@ -220,16 +222,3 @@ def _host() -> str:
         return BOOT_ID.read_text().strip()
     except OSError:
         return ""
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write a file beside its place and move it there."""
-    beside = path.with_name(path.name + ".new")
-    with contextlib.suppress(FileNotFoundError):
-        beside.unlink()
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    with os.fdopen(os.open(beside, flags, 0o600), "wb", buffering=0) as file:
-        left = memoryview(content)
-        while left:
-            left = left[file.write(left) :]
-    beside.rename(path)

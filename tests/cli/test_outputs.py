@@ -42,6 +42,7 @@ LINES = {
     "margins --maps": "margins SCENARIO --runs 1 OUT/points.csv",
     "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
     "torture --json": "torture --replay SCHEDULES OUT",
+    "adversary --json": "adversary swap --attack ATTACK OUT",
     "reproduce --out": "reproduce --quick --plugin PLUGIN OUT/report.html",
     "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
     "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",
@@ -126,6 +127,7 @@ def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
         "SCENARIO": folder / "scenario.toml",
         "MISSION": folder / "mission.csv",
         "SCHEDULES": folder / "schedules.txt",
+        "ATTACK": folder / "attack.json",
         "PLUGIN": folder / "plugin.py",
         "WEIGHTS": folder / "weights.toml",
         "RECORDING": folder / "flight.mcap",
@@ -137,6 +139,7 @@ def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
     made["SCHEDULES"].write_text(
         Path(__file__).parents[1].joinpath("torture_seeds.txt").read_text()
     )
+    made["ATTACK"].write_text("{}")
     made["PLUGIN"].write_text(
         "from skytether.plugin import reference\nimport numpy as np\n"
         "@reference\ndef still(scenario):\n"
@@ -365,7 +368,7 @@ def test_without_unnamed_files_a_file_is_replaced_as_well(
         (part,) = tmp_path.iterdir()
         assert part.name == "it.part1"
     assert at.read_bytes() == b"content"
-    with pytest.raises(OSError, match="exists"), files.replacing(at, new=0o600) as file:
+    with pytest.raises(OSError, match="exists"), files.replacing(at, is_new=True) as file:
         file.write(b"other")
     assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"content"]
 

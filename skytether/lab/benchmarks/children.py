@@ -163,7 +163,7 @@ class Lab:
         files.write(self._file, to_toml(scenario))
         self.key_file = folder / "keys"
         secrets = [(vehicle, os.urandom(keys.SECRET_BYTES)) for vehicle in vehicles]
-        with files.replacing(self.key_file, new=0o600) as file:
+        with files.replacing(self.key_file, mode=0o600, is_new=True) as file:
             file.write("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets).encode())
 
     def server(self, bind: Address = (HOST, 0), *more: str) -> ChildProcess:

@@ -28,6 +28,7 @@ from skytether.lab.adversary import (
     spare_m,
 )
 from skytether.lab.commands.pool import Flags, crew
+from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
@@ -47,6 +48,8 @@ class Kept(msgspec.Struct, frozen=True):
     """What was left of the distances asked for, of each flight [m]."""
 
 
+ATTACK_BYTES_MAX = 16_000_000
+"""Largest size of a file of moves [B]."""
 OWN = ("with", "tries", "moves", "first", "workers", "json")
 """Options with a value that are about the search, and not about a flight."""
 
@@ -141,7 +144,8 @@ def _moves(text: str) -> Moves:
     if text.startswith("["):
         return loads(text)
     try:
-        return msgspec.json.decode(Path(text).read_bytes(), type=Kept).nearest.moves
+        content = files.read(Path(text), ATTACK_BYTES_MAX)
+        return msgspec.json.decode(content, type=Kept).nearest.moves
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
     except msgspec.DecodeError as error:
