@@ -17,6 +17,7 @@ from skytether.client.memory import FlownMotion, Kept, Memory
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
 from skytether.shared.core.events import (
@@ -26,6 +27,8 @@ from skytether.shared.core.events import (
     Flying,
     ModeChanged,
     NotFlown,
+    StateLeapt,
+    metres,
 )
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
@@ -41,6 +44,9 @@ ARMED = keys_of(InFlight.ARMED)
 """Key with which a person says that plans may be flown."""
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which it is said again that the fence holds the vehicle back [ns]."""
+AFTER_LEAP = "vehicle.after_leap"
+LEAP = keys_of(InFlight.LEAP)
+"""Key with which an operator says which frame counts after a leap."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
 """Reasons that do not say why there is no newer horizon."""
 
@@ -85,7 +91,10 @@ class Client(Endpoint):
         self._flies, self._port = flies, flies.port
         if before is not None:
             flies.recall(before.frame)
-        self.changeable = flies.changeable | ARMED
+        self.changeable = flies.changeable | ARMED | LEAP
+        if scenario.vehicle.after_leap != "ask":
+            given = scenario.vehicle.after_leap
+            raise ConfigError(f"{AFTER_LEAP}: got {given!r}, expected 'ask': it is chosen in flight")
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
@@ -109,6 +118,9 @@ class Client(Endpoint):
         self._pilot = pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
         """Event with which a flight ends that has had no plan."""
+        self._land_after_s = scenario.vehicle.land_after_s
+        self._leap_told: tuple[float, ...] | None = None
+        """Leap that was told."""
         self._held_ns = 0
         """Time before which it is not said again that the fence holds the vehicle."""
         self.horizons = 0
@@ -274,6 +286,8 @@ class Client(Endpoint):
         if pilot.is_held and now_ns >= self._held_ns:
             self._held_ns = now_ns + HELD_AGAIN_NS
             self._events.append(FenceHolds(vehicle=self.vehicle))
+        if pilot.leap_m != self._leap_told:
+            self._tell_leap(pilot.leap_m)
         if pilot.step >= pilot.steps:
             self._end(now_ns)
         # Nothing is told before it is kept: the server would forget a motion that the next life
@@ -283,6 +297,12 @@ class Client(Endpoint):
         observation = pilot.observation(session)
         if observation is not None:
             session.send(observation)
+
+    def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
+        self._leap_told = leap_m
+        if leap_m is not None and self._failsafe.has_leapt:
+            after_s = self._land_after_s
+            self._events.append(StateLeapt(vehicle=self.vehicle, by_m=leap_m, land_after_s=after_s))
 
     def _end(self, now_ns: int) -> None:
         """Report how the flight ended, and let the vehicle land."""
@@ -297,7 +317,16 @@ class Client(Endpoint):
             self._events.append(self._not_flown)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`."""
+        """See `Endpoint`; after a leap nobody arms it without saying where it is."""
+        leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
+        if leap_m is None and keys & LEAP and choice != "ask":
+            return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
+        if choice == "old" and keys & LEAP and self._flies.leap_m is None:
+            expected = "expected 'new' or 'stay': the vehicle has not subtracted the leap"
+            return f"{AFTER_LEAP}: got 'old', {expected}"
+        if leap_m is not None and "armed" in keys and scenario.armed and not keys & LEAP:
+            expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
+            return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
         return self._flies.objection(scenario, keys)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
@@ -305,6 +334,12 @@ class Client(Endpoint):
         self._failsafe.armed = scenario.armed
         if keys & ARMED and scenario.armed:
             self._flies.arm()
+        if keys & LEAP:
+            match scenario.vehicle.after_leap:
+                case "old" | "new" as frame:
+                    self._pilot.decide(keeps_frame=frame == "old")
+                case choice:
+                    self._failsafe.stays = choice == "stay"
         if keys & self._flies.changeable:
             self._flies.change(scenario)
 

@@ -190,8 +190,10 @@ class Failsafe:
         """Time since which it has hovered without what it needs to fly on, as far as it has."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         """Times of the newest malformed messages."""
-        self._has_leapt = False
-        """Whether its state has leapt since it was armed: it does not know where it is."""
+        self.has_leapt = False
+        """Whether its state has leapt, and nobody has said which frame counts."""
+        self.stays = False
+        """Whether it hovers on after a leap, and does not land: an operator's choice."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
         """Times of the newest horizons for impossible times."""
 
@@ -204,7 +206,7 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a horizon that comes now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        return may and self.armed and not self._has_leapt and self.reason not in LOCKING
+        return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
     @property
     def brakes(self) -> bool:
@@ -231,7 +233,7 @@ class Failsafe:
                 change something.
         """
         waits = self.mode not in CALM or self.reason in LOCKING or self.reason is Reason.UNARMED
-        if waits or not self.armed or self._has_leapt or self.is_lost(now_ns):
+        if waits or not self.armed or self.has_leapt or self.is_lost(now_ns):
             return now_ns
         assert self._heard_ns is not None
         lost_ns = self._heard_ns + self._timeout_ns
@@ -313,10 +315,8 @@ class Failsafe:
         if good and (locked or armed_now or self.mode is Mode.SYNC):
             self.meet(Reason.GOOD, now_ns=now_ns)
         if not self.armed:
-            # Disarming is how an operator says that the leap was seen to.
-            self._has_leapt = False
             self.meet(Reason.UNARMED, now_ns=now_ns)
-        elif self._has_leapt and self.reason not in LOCKING:
+        elif self.has_leapt and self.reason not in LOCKING:
             self.meet(Reason.LEAPT, now_ns=now_ns)
         if now_ns - self._horizon_ns > self._timeout_ns:
             self.meet(Reason.OLD, now_ns=now_ns)
@@ -328,7 +328,7 @@ class Failsafe:
         """Land where what the vehicle needs to fly on does not come."""
         # A link that is never good, or an autopilot that is silent, locks it as a lost link does.
         locked = self.reason in LOCKING or self.mode is Mode.SYNC
-        waits = lost or (locked and not good) or self._has_leapt
+        waits = lost or (locked and not good) or (self.has_leapt and not self.stays)
         # A link that has just come back has its second to be good.
         patience_ns = self._land_after_ns + (0 if lost else GOOD_NS)
         if self.mode not in HANGING or not waits:
@@ -337,11 +337,15 @@ class Failsafe:
             self.meet(Reason.ALONE if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
-        """Note that its state has leapt: no horizon is taken until it is disarmed and armed."""
+        """Note that its state has leapt: no horizon is taken until an operator has chosen."""
         # With HOLD there is no failsafe, and a leap stops nothing.
-        self._has_leapt = self.brakes
+        self.has_leapt = self.brakes
         if self.reason not in LOCKING:
             self.meet(Reason.LEAPT, now_ns=now_ns)
+
+    def decide(self) -> None:
+        """Note that an operator has said which frame counts."""
+        self.has_leapt = self.stays = False
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
         """Change mode and reason for a cause, where the table says so."""

@@ -15,7 +15,13 @@ from skytether.client.filter import Kalman
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.dead_time import OnTheirWay
-from skytether.shared.law.leap import NOISE_M, NOISE_MPS, position_leaps, velocity_leaps
+from skytether.shared.law.leap import (
+    NOISE_M,
+    NOISE_MPS,
+    displacement,
+    position_leaps,
+    velocity_leaps,
+)
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
@@ -66,7 +72,7 @@ class Navigation:
 
     def __init__(self, scenario: Scenario) -> None:
         known, axes = sensing(scenario), scenario.model.axes
-        terms = scenario.terms()
+        self._scenario, terms = scenario, scenario.terms()
         self.filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
         """Filter that makes an estimate of the measurements."""
         late = any(terms.dead_time_s)
@@ -127,6 +133,10 @@ class Navigation:
             # Told as float32, a larger number would reach the server as infinity.
             self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
 
+    def begin_anew(self) -> None:
+        """Begin with the next measurement: the frame has changed, and with it the position."""
+        self._begun, self.leaps = False, Leaps(self._scenario)
+
     def note(self, estimate: list[tuple[float, float]]) -> None:
         """Note the finite estimate of a step that was computed elsewhere, without a leap.
 
@@ -183,6 +193,9 @@ class Leaps:
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
+        self.off_m: list[float] = []
+        """Displacement of the newest position from where the vehicle can have come to, on each axis
+        [m]; empty unless it has leapt."""
         self.noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self.noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position: tuple[int, list[float]] | None = None
@@ -201,13 +214,17 @@ class Leaps:
                     found |= velocity_leaps(v, after_v, time, noise)
             # Also after a leap: else whatever is measured after it would be one, too.
             self._velocity = stamp_ns, velocity
+        self.off_m = []
         if position is not None:
             if self._position is not None and before is not None:
                 since_ns, elsewhere = self._position
                 time, noise = (stamp_ns - since_ns) / SECOND_NS, self.noise_m
-                states = zip(elsewhere, before[1], position, velocity or before[1], strict=True)
-                for p, v, after_p, after_v in states:
-                    found |= position_leaps(p, v, after_p, after_v, time, noise)
+                moves = list(
+                    zip(elsewhere, before[1], position, velocity or before[1], strict=True)
+                )
+                if any(position_leaps(*each, time, noise) for each in moves):
+                    found = True
+                    self.off_m = [displacement(*each, time) for each in moves]
             self._position = stamp_ns, position
         return found
 

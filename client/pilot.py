@@ -108,6 +108,9 @@ class Pilot:
         """Step after the last of these."""
         self.missed = 0
         """Steps slept through."""
+        self.leap_m: tuple[float, ...] | None = None
+        """Leap that nobody has decided about: displacement on each axis [m], or empty where the
+        velocity alone has leapt. None without one."""
 
     @property
     def without_ns(self) -> int:
@@ -228,7 +231,11 @@ class Pilot:
         known = self._navigation
         if not self._navigation.is_known:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
-        if self._navigation.leapt:
+        if self._vehicle.leap_m is not None:
+            self.leap_m = self._vehicle.leap_m
+            failsafe.leapt(now_ns=now_ns)
+        elif self._navigation.leapt:
+            self.leap_m = tuple(self._navigation.leaps.off_m)
             failsafe.leapt(now_ns=now_ns)
         # Asked first: `choose` goes on to this step.
         had_plan = compensator.covered
@@ -299,6 +306,14 @@ class Pilot:
         if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:
             within[ALTITUDE] = flown[ALTITUDE]
         return within
+
+    def decide(self, *, keeps_frame: bool) -> None:
+        """Fly on after a leap, see `Vehicle.decide`."""
+        self._vehicle.decide(keeps_frame=keeps_frame)
+        if not keeps_frame:
+            self._navigation.begin_anew()
+        self._failsafe.decide()
+        self.leap_m = None
 
     @property
     def is_held(self) -> bool:

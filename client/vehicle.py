@@ -42,6 +42,8 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None where it
     is not known."""
+    leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    """Displacement in `origin` that nobody has decided about, see `Vehicle.leap_m` [m]."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which that was so last [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
@@ -56,6 +58,9 @@ class Vehicle(ABC):
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware, beside the link; None where there is
     none."""
+    leap_m: tuple[float, ...] | None = None
+    """Displacement of its measured position, on each axis, that nobody has decided about [m]; it is
+    subtracted meanwhile. None: there is none, or the vehicle does not watch for any."""
     failure: Failure | None = None
     """Event after which the vehicle cannot be flown, and no session is asked for."""
 
@@ -99,6 +104,13 @@ class Vehicle(ABC):
     def hindrance(self, *, now_ns: int) -> Reason | None:  # noqa: ARG002 - most know of none
         """Cause on the vehicle's side for which it must not follow a plan now, if there is any."""
         return None
+
+    def decide(self, *, keeps_frame: bool) -> None:  # noqa: B027 - most watch for no leap
+        """Let `leap_m` be subtracted for good, or count from now on.
+
+        Args:
+            keeps_frame: whether it is subtracted.
+        """
 
     def land(self) -> bool:
         """Land by itself from now on; False of a vehicle that cannot, and has to be flown down."""

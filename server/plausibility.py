@@ -48,6 +48,7 @@ class Statement:
 
 STATEMENT = record(Statement)
 position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.velocity_leaps)
+shared(leap.displacement)
 
 
 class Belief(IntEnum):

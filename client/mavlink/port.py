@@ -15,6 +15,7 @@ from skytether.client.mavlink.launch import Launch, Phase
 from skytether.client.mavlink.positions import Positions, Vector
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
+from skytether.client.navigation import Leaps
 from skytether.client.vehicle import Frame
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -113,6 +114,7 @@ class Port(Endpoint):
             self._clock,
             start=_start(scenario, vehicle),
             origin=given_origin(scenario),
+            leaps=Leaps(scenario),
         )
         """Measurements."""
         self._texts = Texts()

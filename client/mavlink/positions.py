@@ -3,7 +3,10 @@
 import math
 from collections import Counter, deque
 
+import msgspec
+
 from skytether.client.mavlink.clock import BootClock
+from skytether.client.navigation import Leaps
 from skytether.client.vehicle import Frame, Measurement
 from skytether.mavlink.codec import Message
 from skytether.mavlink.frames import turned
@@ -40,6 +43,7 @@ class Positions:
         start: where in our axes it takes off, once `begin` is called [m].
         origin: origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None
             where it is only known once `begin` is called.
+        leaps: check of each measurement against the one before; None: none is checked.
     """
 
     def __init__(
@@ -49,12 +53,19 @@ class Positions:
         old_ns: int = OLD_NS,
         start: Vector = (0.0, 0.0, 0.0),
         origin: Vector | None = (0.0, 0.0, 0.0),
+        leaps: Leaps | None = None,
     ) -> None:
         self._axes, self._clock, self._old_ns, self._start = axes, clock, old_ns, start
         self._waiting: deque[Measurement] = deque(maxlen=WAITING_MAX)
         self._newest_boot_ms = -1
         self._newest_ns: int | None = None
         """Stamp of the newest measurement."""
+        self._leaps = leaps
+        self._is_flown = False
+        """Whether its measurements are flown by: from then on a leap counts."""
+        self.leap_m: Vector | None = None
+        """Displacement of its position that nobody has decided about, in our axes [m]; None without
+        one. The origin has been displaced by as much, so that the vehicle goes by its old frame."""
         self._jumps = 0
         self.origin: Vector = origin or (0.0, 0.0, 0.0)
         """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]."""
@@ -99,10 +110,29 @@ class Positions:
         self.velocity = turned((message.vx, message.vy, message.vz))
         self.came_ns = now_ns
         self.taken += 1
+        if self._leaps is not None:
+            self._watch(self._leaps, Measurement(stamp_ns, [*self.position], [*self.velocity]))
         place = [at - zero for at, zero in zip(self.position, self.origin, strict=True)]
         self._waiting.append(
             Measurement(stamp_ns, place[: self._axes], list(self.velocity[: self._axes]))
         )
+
+    def _watch(self, leaps: Leaps, measured: Measurement) -> None:
+        """Displace the origin with a position that has leapt: the vehicle has not moved so far."""
+        if leaps.leaps(measured) and leaps.off_m and self._is_flown:
+            dx, dy, dz = leaps.off_m
+            (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
+            self.origin = x + dx, y + dy, z + dz
+            self.leap_m = before[0] + dx, before[1] + dy, before[2] + dz
+
+    def decide(self, *, keeps_frame: bool) -> None:
+        """Go by the old frame for good, or by the new one from now on."""
+        if self.leap_m is not None and not keeps_frame:
+            pairs = zip(self.origin, self.leap_m, strict=True)
+            x, y, z = (zero - leapt for zero, leapt in pairs)
+            self.origin = x, y, z
+            self._waiting.clear()
+        self.leap_m = None
 
     def _stamp_ns(self, boot_ms: int) -> int:
         # What was measured in this millisecond was so in the middle of it.
@@ -157,6 +187,7 @@ class Positions:
         is_same = apart_ns <= REBOOT_NS + passed_ns // DRIFT_PARTS
         if is_same and 0 <= passed_ns <= RECALLED_MAX_NS and frame.origin is not None:
             self.place(frame.origin)
+            self.leap_m = frame.leap_m
             self.is_recalled = True
 
     def frame(self, *, armed: bool) -> Frame:
@@ -167,11 +198,18 @@ class Positions:
         """
         if not self.has_origin or self.came_ns is None:
             known = self._recalled or Frame()
-            return Frame(armed=armed, origin=known.origin, boot_ms=known.boot_ms, at_ns=known.at_ns)
-        return Frame(armed=armed, origin=self.origin, boot_ms=self._boot_ms, at_ns=self.came_ns)
+            return msgspec.structs.replace(known, armed=armed)
+        return Frame(
+            armed=armed,
+            origin=self.origin,
+            leap_m=self.leap_m,
+            boot_ms=self._boot_ms,
+            at_ns=self.came_ns,
+        )
 
     def take(self, *, now_ns: int) -> list[Measurement]:
         """Measurements of up to now that were not taken before, the oldest first."""
+        self._is_flown = True
         told = []
         while self._waiting and self._waiting[0].stamp_ns <= now_ns:
             told.append(self._waiting.popleft())

@@ -94,6 +94,15 @@ class MavlinkVehicle(Vehicle):
         """See `Vehicle`."""
         return self._port.hindrance(now_ns=now_ns)
 
+    @property
+    def leap_m(self) -> tuple[float, ...] | None:  # type: ignore[override] # it comes of itself
+        """See `Vehicle`."""
+        return self._port.positions.leap_m
+
+    def decide(self, *, keeps_frame: bool) -> None:
+        """See `Vehicle`."""
+        self._port.positions.decide(keeps_frame=keeps_frame)
+
     def land(self) -> bool:
         """See `Vehicle`; the autopilot's own landing."""
         self._port.land()

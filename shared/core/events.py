@@ -417,6 +417,29 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is {off}: the others keep further away"
 
 
+def metres(leap_m: tuple[float, ...]) -> str:
+    """A displacement as an operator reads it."""
+    return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
+
+
+class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
+    """What a vehicle measures of itself has leapt, and somebody has to say which frame counts."""
+
+    by_m: tuple[float, ...]
+    """Displacement of its position on each axis [m]; empty where its velocity alone has leapt."""
+    land_after_s: float
+    """Time of hovering after which it lands without a choice [s]; 0: never."""
+
+    def __str__(self) -> str:
+        leap = f"position has leapt by {metres(self.by_m)}" if self.by_m else "velocity has leapt"
+        what = (
+            "choose vehicle.after_leap: 'old' (the leap is subtracted, the fence stays), 'new' "
+            "(it counts, the fence moves with it) or 'stay'"
+        )
+        lands = f"; without a choice it lands {self.land_after_s:g} s after it has begun to hover"
+        return f"vehicle {self.vehicle}: its {leap}: {what}{lands if self.land_after_s else ''}"
+
+
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
     """The fence lets less pass than the vehicle was told to fly."""
 
@@ -527,6 +550,7 @@ Event = (
     | PlanningStopped
     | StateDoubted
     | LeftTube
+    | StateLeapt
     | FenceHolds
     | PlanningResumed
     | NotFlown

@@ -21,6 +21,18 @@ def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
     return abs(after_v - v) > noise + ACCELERATION_MPS2 * time
 
 
+def displacement(p: float, v: float, after_p: float, after_v: float, time: float) -> float:
+    """Distance of a position from where the velocities have taken the vehicle [m].
+
+    Args:
+        p, v: position [m] and velocity [m/s] on one axis before.
+        after_p, after_v: position [m] and velocity [m/s] after.
+        time: between the two [s].
+    """
+    # By the mean of both velocities, so that only what an acceleration cannot explain is left.
+    return after_p - p - 0.5 * (v + after_v) * time
+
+
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
@@ -32,6 +44,5 @@ def position_leaps(
         time: between the two [s].
         noise: what noise may add to the change of position [m].
     """
-    # By the mean of both velocities, so that only what an acceleration cannot explain is left.
-    off = after_p - p - 0.5 * (v + after_v) * time
+    off = displacement(p, v, after_p, after_v, time)
     return abs(off) > noise + 0.5 * ACCELERATION_MPS2 * time * time

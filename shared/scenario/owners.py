@@ -38,6 +38,8 @@ class InFlight(Enum):
     """Whether plans may be flown."""
     ORIGIN = auto()
     """Where the scenario's origin is, of a vehicle in the air that does not know."""
+    LEAP = auto()
+    """Choice after a leap of the position."""
     WIND = auto()
     """Wind and gusts."""
     IMPAIRMENT = auto()

@@ -225,6 +225,12 @@ class VehicleConfig(Section, frozen=True):
     `hold`."""
     land_after_s: Term[Duration] = 10.0
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
+    after_leap: Annotated[
+        Literal["ask", "old", "new", "stay"], Key(Owner.VEHICLE, InFlight.LEAP)
+    ] = "ask"
+    """Choice after a leap of the position, given in flight alone: old (the leap is subtracted, the
+    fence stays where it was), new (it counts, and the fence moves with it), or stay (it hovers on).
+    Without one the vehicle lands after `land_after_s`; see docs/failsafe.md."""
     tau_s: OfVehicle[tuple[Factor, ...]] = ()
     """True time constant [s], one for all axes, or one each; left out: the model's."""
     gain: OfVehicle[Factors] = ()

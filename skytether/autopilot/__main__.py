@@ -55,7 +55,8 @@ class AutopilotOptions:
             "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
             "estimate@20-25: it does not know where it is; "
-            "drift@20-25: its accelerometers fail, it moves and does not notice.",
+            "drift@20-25: its accelerometers fail, it moves and does not notice; "
+            "leap@20: the position that it reports leaps by 12 m.",
         ),
     ] = ()
     insecure: bool = False

@@ -10,12 +10,14 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.base.units import seconds_to_ns
 
-FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate", "drift"]
+FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate", "drift", "leap"]
 NAMES: tuple[str, ...] = get_args(FaultName)
-LASTING = ("silence", "estimate", "drift")
+LASTING = ("silence", "estimate", "drift", "leap")
 """Faults that may end."""
 DRIFT: Vector = (3.5, 0.0, 0.0)
 """Velocity at which the vehicle moves unnoticed with the fault `drift` [m/s]."""
+LEAP: Vector = (-12.0, 0.0, 0.0)
+"""Displacement of the reported position with the fault `leap` [m]."""
 LOW_CHARGE = 0.05
 """Charge that is left by the fault `battery`."""
 
@@ -98,5 +100,7 @@ class Script:
                 self.silent = wrong
             case "drift":
                 flight.drift = DRIFT if wrong else REST
+            case "leap":
+                flight.displaced = LEAP if wrong else REST
             case _:
                 flight.estimates = not wrong

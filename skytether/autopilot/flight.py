@@ -117,6 +117,8 @@ class PilotedVehicle(ABC):
         self.drift: Vector = REST
         """Velocity at which it moves beside the one that it estimates, as with accelerometers that
         have failed [m/s]."""
+        self.displaced: Vector = REST
+        """Displacement of the position that it reports [m]."""
         self.said: list[tuple[Severity, str]] = []
         """Texts not sent yet."""
         self.now_ns = 0

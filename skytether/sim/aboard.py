@@ -26,6 +26,7 @@ from skytether.shared.wire.protocol import FLOAT_MAX
 
 limited = shared(clamp.limited)
 velocity_leaps, position_leaps = shared(leap.velocity_leaps), shared(leap.position_leaps)
+shared(leap.displacement)
 widened = shared(kalman.widened)
 by_position, by_velocity = shared(kalman.by_position), shared(kalman.by_velocity)
 

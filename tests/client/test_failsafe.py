@@ -27,6 +27,7 @@ from skytether.lab.states import svg
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.law import rule
@@ -588,7 +589,7 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
         assert hand.changes[-1] == ("fault", "its state or its input is not finite")
 
 
-def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again() -> None:
+def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chosen() -> None:
     """A position that changes by 300 m in a step, or a velocity by 20 m/s, is not flown by."""
     for p, v in ((300.0, 0.0), (0.0, 20.0)):
         hand = tracking()
@@ -599,10 +600,13 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again(
         hand.fly(9.0, plans=True)
         assert (hand.mode, hand.takes) == (Mode.HOVER, False)
         assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
-        for armed in (False, True):
-            flown = msgspec.structs.replace(hand.scenario, armed=armed)
-            hand.client.change(flown, frozenset({"armed"}), now_ns=hand.now_ns)
-            hand.fly(0.1)
+        running = Running(hand.client, hand.scenario)
+        with pytest.raises(ConfigError, match=r"^vehicle.after_leap: .*has not subtracted"):
+            running.change({"vehicle.after_leap": "old"}, now_ns=hand.now_ns)
+        with pytest.raises(ConfigError, match=r"^armed: got true after"):
+            running.change({"armed": True}, now_ns=hand.now_ns)
+        running.change({"vehicle.after_leap": "new"}, now_ns=hand.now_ns)
+        hand.fly(0.1)
         assert hand.takes
         hand.fly(0.1, plans=True)
         assert hand.mode is Mode.TRACK
@@ -954,7 +958,7 @@ ROWS: dict[Reason, Callable[[], None]] = {
     Reason.CLOSED: test_a_server_that_closes_the_session_ends_in_brake_at_once,
     Reason.STALLED: test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon,
     Reason.NOT_FINITE: test_what_is_not_finite_ends_in_fault_for_good,
-    Reason.LEAPT: test_a_state_that_no_vehicle_can_have_ends_in_hover_until_it_is_armed_again,
+    Reason.LEAPT: test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chosen,
     Reason.TAKEN: hindrance_test(
         test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back, Reason.TAKEN
     ),

@@ -44,6 +44,10 @@ GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
 LEAD_S = 5.0
 """Age up to which a target that is led about is shown as known [s]."""
+AFTER_LEAP = (
+    "Once its position has leapt: fly on in the old frame (the leap is subtracted), in the new one "
+    "(figure and fence move with it), or stay, see docs/failsafe.md"
+)
 FIXED = (
     "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
     "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
@@ -367,6 +371,9 @@ class Controls:
         )
         self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
         self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
+        self._after_leap = gui.add_button_group(
+            "After a leap", ("old", "new", "stay"), visible=False, hint=AFTER_LEAP
+        )
         gui.add_text("Scheme", scenario.control.scheme, disabled=True, hint=FIXED)
         if scenario.reference.shape == "live":
             self._lead = _Lead(self._client, self._flights)
@@ -378,6 +385,10 @@ class Controls:
         async def _(event: Any) -> None:
             if event.client is not None:
                 self._all("server", {"control.trigger": self._trigger.value})
+
+        @self._after_leap.on_click
+        async def _(_: Any) -> None:
+            self._all("client", {"vehicle.after_leap": self._after_leap.value})
 
         @self._armed.on_update
         async def _(event: Any) -> None:
@@ -439,6 +450,9 @@ class Controls:
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
+        flies_real = flight.state.scenario.vehicle.kind == "mavlink"
+        said = flight.values.get("client", {})
+        self._after_leap.visible = flies_real and "vehicle.after_leap" in said
         if self._lead:
             self._lead.show()
         if self._mission:

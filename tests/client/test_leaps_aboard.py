@@ -1,0 +1,141 @@
+"""Leaps of an autopilot's position: told in metres, hovered through, and decided by a person."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from airborne import Air
+from skytether.autopilot.faults import LEAP
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.change import Running
+from skytether.shared.core.events import ModeChanged, StateLeapt
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+
+FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0], "wind_mps": 0.5}
+AFTER_LEAP = "vehicle.after_leap"
+
+
+def leapt(**table: Any) -> tuple[Air, Running]:
+    """A vehicle in flight whose reported position has just leapt by 12 m, and its keys."""
+    slow = {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [1.5]}
+    air = Air("ardupilot", duration=90.0, fence=FENCE, model=slow, **table)
+    air.fly()
+    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
+    air.run(2.0)
+    air.flight.displaced = LEAP
+    air.run(2.0, lambda: bool(air.of(StateLeapt)))
+    return air, Running(air.client, air.scenario)
+
+
+def place(air: Air) -> Any:
+    """True position in the plane [m]."""
+    return np.array(air.flight.position()[:2])
+
+
+def change(air: Air, running: Running, **values: Any) -> None:
+    """Change keys of the client now; a name has two underscores for its dot."""
+    keys = {key.replace("__", "."): value for key, value in values.items()}
+    running.change(keys, now_ns=air.world.now_ns)
+
+
+def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
+    """The fence is 8 m wide and the leap 12 m: the vehicle brakes where it is, and hovers."""
+    air, _ = leapt()
+    began = place(air)
+    (told,) = air.of(StateLeapt)
+    assert told.by_m == pytest.approx(LEAP, abs=0.1)
+    air.run(6.0)
+    assert air.client._failsafe.mode is Mode.HOVER
+    # Braking from 1.5 m/s at 2 m/s², and what dead time and inertia add.
+    assert np.linalg.norm(place(air) - began) < 2.0
+    hovered = place(air)
+    air.run(1.0)
+    assert np.linalg.norm(place(air) - hovered) < 0.05
+
+
+def test_without_a_choice_it_lands() -> None:
+    """`vehicle.land_after_s` of hovering and a second later, armed or not."""
+    for armed in (True, False):
+        air, running = leapt()
+        if not armed:
+            change(air, running, armed=False)
+        lands_s = air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
+        assert lands_s == pytest.approx(1.0 + 10.0 + 1.0, abs=1.0)
+        last = air.of(ModeChanged)[-1]
+        assert (last.after, last.reason) == ("land", str(Reason.LEAPT))
+
+
+def test_arming_again_is_no_choice() -> None:
+    """It is refused in words; nothing is flown, and the vehicle lands."""
+    air, running = leapt()
+    change(air, running, armed=False)
+    air.run(3.0)
+    with pytest.raises(ConfigError, match=r"armed: .*leapt by \(-12.*vehicle.after_leap"):
+        change(air, running, armed=True)
+    air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
+    assert air.client._failsafe.mode is Mode.LAND
+
+
+@pytest.mark.parametrize("choice", ["old", "new"])
+def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
+    """In the old one where it was; in the new one figure and fence have moved by the leap."""
+    air, running = leapt()
+    change(air, running, armed=False)
+    air.run(3.0)
+    change(air, running, armed=True, vehicle__after_leap=choice)
+    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
+    assert air.client._failsafe.mode is Mode.TRACK
+    air.run(16.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    estimate = air.rows()["estimate"][-1, :2, 0]
+    moved = (0.0, 0.0) if choice == "old" else LEAP[:2]
+    np.testing.assert_allclose(estimate, place(air) + moved, atol=0.2)
+    times = air.rows()["step"][-1] * air.scenario.control.dt
+    wanted = air.scenario.make_reference()(np.array(times))[:2, 0]
+    assert np.linalg.norm(estimate - wanted) < 1.5
+
+
+def test_one_that_stays_hovers_on() -> None:
+    """Until another choice is made."""
+    air, running = leapt()
+    change(air, running, vehicle__after_leap="stay")
+    air.run(20.0)
+    assert air.client._failsafe.mode is Mode.HOVER
+    change(air, running, vehicle__after_leap="old")
+    air.run(3.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+
+
+def test_the_next_leap_asks_again() -> None:
+    """What was chosen for one is chosen for that one alone."""
+    air, running = leapt()
+    air.run(2.0)
+    change(air, running, vehicle__after_leap="old")
+    air.run(3.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    air.flight.displaced = (0.0, 0.0, 0.0)
+    air.run(2.0)
+    assert [each.by_m[0] for each in air.of(StateLeapt)] == pytest.approx([-12.0, 12.0], abs=0.1)
+    assert air.client._failsafe.mode is Mode.HOVER
+
+
+def test_nothing_is_chosen_before_a_leap() -> None:
+    """Neither in flight nor in a file: it would be chosen without knowing the leap."""
+    air = Air("ardupilot")
+    running = Running(air.client, air.scenario)
+    with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*before its position has leapt"):
+        change(air, running, vehicle__after_leap="old")
+    with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*chosen in flight"):
+        Air("ardupilot", vehicle={"after_leap": "old"})
+
+
+def test_the_chosen_frame_is_that_of_the_origin() -> None:
+    """Whoever keeps the origin over a restart keeps the choice with it."""
+    air, running = leapt()
+    change(air, running, vehicle__after_leap="old")
+    assert air.flies.port.positions.origin == pytest.approx(LEAP, abs=0.1)
+    again, running = leapt()
+    change(again, running, vehicle__after_leap="new")
+    assert again.flies.port.positions.origin == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
