@@ -94,13 +94,15 @@ class Client(Endpoint):
         self.changeable = flies.changeable | ARMED | LEAP
         if scenario.vehicle.after_leap != "ask":
             given = scenario.vehicle.after_leap
-            raise ConfigError(f"{AFTER_LEAP}: got {given!r}, expected 'ask': it is chosen in flight")
+            expected = "expected 'ask': it is chosen in flight"
+            raise ConfigError(f"{AFTER_LEAP}: got {given!r}, {expected}")
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
             timeout_ns=self._timeout_ns,
             brake_ns=brake_ns(terms),
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
+            returns=scenario.vehicle.on_loss == "return",
             changed=self._mode_changed,
         )
         self._session = ServerSession(
@@ -361,6 +363,8 @@ class Client(Endpoint):
         self._pilot.mode_changed(cause)
         if self._failsafe.mode is Mode.LAND:
             self._flies.land()
+        elif self._failsafe.mode is Mode.RETURN:
+            self._flies.return_home()
         if cause in CLOSING:
             self._session.close()
         if cause is Reason.OLD or (was, cause) == (Reason.OLD, Reason.HORIZON):

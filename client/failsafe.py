@@ -71,12 +71,12 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# Not in INIT, where nothing is flown yet, nor in LAND and FAULT, which last until somebody has seen
+# Not in INIT, where nothing is flown yet, nor in LAND, RETURN and FAULT, which last until somebody has seen
 # to the vehicle.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
-    if mode not in (Mode.INIT, Mode.LAND, Mode.FAULT)
+    if mode not in (Mode.INIT, Mode.LAND, Mode.RETURN, Mode.FAULT)
     for cause in YIELDING
 }
 
@@ -105,6 +105,7 @@ TABLE: Table = MappingProxyType(
         for cause in GROUNDING
     }
     | {(mode, cause): Mode.LAND for mode in HANGING for cause in (Reason.ALONE, Reason.WAITED)}
+    | {(mode, Reason.HOMEWARD): Mode.RETURN for mode in HANGING}
     # LOST is left out: in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
@@ -152,6 +153,7 @@ class Failsafe:
         brake_ns: longest time of braking [ns]: then it hovers, whatever still pushes it.
         land_after_ns: time of hovering after which it lands, if nothing that it needs to fly on has
             come: a good link, say [ns]; 0: never.
+        returns: whether it returns home with a silent server, in place of landing.
         changed: called whenever mode or reason have changed, with those before, the cause, and the
             time.
     """
@@ -164,6 +166,7 @@ class Failsafe:
         timeout_ns: int,
         brake_ns: int,
         land_after_ns: int,
+        returns: bool = False,
         changed: Callable[[Mode, Reason, Reason, int], None],
     ) -> None:
         self._table = table
@@ -171,6 +174,8 @@ class Failsafe:
         """Whether horizons may be flown at all; it may change in flight."""
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
+        self._alone = Reason.HOMEWARD if returns else Reason.ALONE
+        """Cause of a server that has been silent for long."""
         self._changed = changed
         self.mode = Mode.INIT
         """Present mode."""
@@ -334,7 +339,7 @@ class Failsafe:
         if self.mode not in HANGING or not waits:
             self._waits_ns = now_ns
         elif self._land_after_ns and now_ns - self._waits_ns >= patience_ns:
-            self.meet(Reason.ALONE if lost else Reason.WAITED, now_ns=now_ns)
+            self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
         """Note that its state has leapt: no horizon is taken until an operator has chosen."""

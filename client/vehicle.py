@@ -58,6 +58,8 @@ class Vehicle(ABC):
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware, beside the link; None where there is
     none."""
+    returns = False
+    """Whether it can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None
     """Displacement of its measured position, on each axis, that nobody has decided about [m]; it is
     subtracted meanwhile. None: there is none, or the vehicle does not watch for any."""
@@ -115,6 +117,9 @@ class Vehicle(ABC):
     def land(self) -> bool:
         """Land by itself from now on; False of a vehicle that cannot, and has to be flown down."""
         return False
+
+    def return_home(self) -> None:  # noqa: B027 - most cannot
+        """Return home by itself from now on, and land there; only asked of one that `returns`."""
 
     @property
     def is_down(self) -> bool:

@@ -47,4 +47,7 @@ def make(scenario: Scenario, number: int) -> Vehicle:
         raise ConfigError(f"vehicle.kind: got {error.given!r}, expected {error.expected}") from None
     entry = VEHICLES[named.name]
     made: Vehicle = entry.make(scenario, number, *entry.numbers(named.values, scenario.vehicle))
+    if scenario.vehicle.on_loss == "return" and not made.returns:
+        expected = f"'land' with vehicle.kind = {named.name!r}, which cannot return by itself"
+        raise ConfigError(f"vehicle.on_loss: got 'return', expected {expected}")
     return made

@@ -46,6 +46,8 @@ class Flavour:
     """Number of the mode that follows setpoints."""
     land: int
     """Number of the mode that lands."""
+    back: int
+    """Number of the mode that returns home, and lands there."""
     hold: int
     """Number of the mode that stays where it is."""
     own: frozenset[int]
@@ -82,6 +84,7 @@ ARDUPILOT = Flavour(
     name="ArduCopter",
     guided=4,
     land=9,
+    back=6,
     hold=17,
     own=frozenset({4}),
     steps=(LaunchStep.GUIDE, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB),
@@ -113,6 +116,7 @@ PX4 = Flavour(
     name="PX4",
     guided=_px4(6),
     land=_px4(4, 6),
+    back=_px4(4, 5),
     hold=_px4(4, 3),
     own=frozenset({_px4(4, 1), _px4(4, 2), _px4(4, 3), _px4(6)}),
     steps=(LaunchStep.HOLD, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB, LaunchStep.GUIDE),

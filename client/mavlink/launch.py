@@ -35,6 +35,10 @@ FRESH_NS = 500 * MILLISECOND_NS
 """Age up to which a position tells where the vehicle is now [ns]."""
 LAND_MAX_NS = 120 * SECOND_NS
 """Longest time that a landing is waited for [ns]."""
+RETURN_MAX_NS = 600 * SECOND_NS
+"""Longest time that a return is waited for [ns]."""
+REFUSED_NS = 4 * SECOND_NS
+"""Time after which a vehicle that was told to return, and does not, is told to land [ns]."""
 QUIET_NS = 3 * SECOND_NS
 """Silence of the autopilot that is the reason why a step is not done [ns]."""
 SILENT_MAX_NS = 10 * SECOND_NS
@@ -123,6 +127,8 @@ class Launch:
         """Whether it was armed in this life of the client."""
         self._closed = False
         """Whether nothing is to begin any more."""
+        self._way_down = flavour.land
+        """Number of the mode in which it comes down."""
         self._words = ""
         """Newest reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
@@ -296,6 +302,12 @@ class Launch:
 
     # -- down again --------------------------------------------------------------------------
 
+    def return_home(self, *, now_ns: int) -> None:
+        """Return home and land there from now on, where the vehicle is ours and in the air."""
+        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self._way_down = self._flavour.back
+        self.land(now_ns=now_ns)
+
     def land(self, *, now_ns: int) -> None:
         """Land from now on, where the vehicle is ours and in the air."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
@@ -323,8 +335,9 @@ class Launch:
             return False
         assert self._since_ns is not None
         lost = condition.heard_ns is None or now_ns - condition.heard_ns > SILENT_MAX_NS
-        obeys = condition.mode in self._flavour.own or condition.mode == self._flavour.land
-        return lost or not obeys or now_ns - self._since_ns > LAND_MAX_NS
+        obeys = condition.mode in (*self._flavour.own, self._flavour.land, self._way_down)
+        most_ns = LAND_MAX_NS if self._way_down == self._flavour.land else RETURN_MAX_NS
+        return lost or not obeys or now_ns - self._since_ns > most_ns
 
     # -- what is asked and heard -------------------------------------------------------------
 
@@ -340,7 +353,7 @@ class Launch:
 
     def _command(self, now_ns: int) -> Message | None:
         if self.phase is Phase.LANDING:
-            return self._mode_command(self._flavour.land) if self._is_ours(now_ns) else None
+            return self._come_down(now_ns) if self._is_ours(now_ns) else None
         if self.phase is not Phase.CLIMBING or self._closed:
             return None
         step = self._flavour.steps[self._step]
@@ -354,6 +367,13 @@ class Launch:
         if step is LaunchStep.ARM:
             return self._long(ARM, 1.0)
         return self._lift() if step is LaunchStep.LIFT else None
+
+    def _come_down(self, now_ns: int) -> Message:
+        """Command to land or to return; one that does not return for long lands."""
+        assert self._since_ns is not None
+        if now_ns - self._since_ns > REFUSED_NS:
+            self._way_down = self._flavour.land
+        return self._mode_command(self._way_down)
 
     def _lift(self) -> Message | None:
         altitude = self._altitude

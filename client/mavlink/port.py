@@ -5,6 +5,7 @@ never a position. Whatever ends that loop ends the setpoints, and the autopilot'
 nothing in here repeats what was said by somebody who is gone.
 """
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -31,6 +32,7 @@ from skytether.shared.core.aboard import (
 )
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.core.line import Line
+from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
@@ -91,6 +93,15 @@ def given_origin(scenario: Scenario) -> Vector | None:
     raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused it
 
 
+def returns_below_m(scenario: Scenario) -> float | None:
+    """Altitude below which a lost vehicle returns home [m], infinite without a fence; None of one
+    that lands where it is."""
+    if scenario.vehicle.on_loss != "return":
+        return None
+    high = scenario.fence.high_m[ALTITUDE:]
+    return high[0] if high else math.inf
+
+
 class Port(Endpoint):
     """Line to one autopilot.
 
@@ -147,6 +158,7 @@ class Port(Endpoint):
         self._repeat_ns = round(LATE * each / parts)
         self._was_armed = False
         """Whether a life of the client has armed it since a person last said that it may be."""
+        self._returns_below_m = returns_below_m(scenario)
         self._was_disarmed = False
         """Whether it was disarmed since it flew: it is not flown again."""
 
@@ -226,6 +238,12 @@ class Port(Endpoint):
         if self._sent_ns is None or self.now_ns - self._sent_ns >= 0.9 * least_ns:
             self._send_velocity(self.now_ns)
 
+    def return_home(self) -> None:
+        """Command the autopilot to return home by itself, and to land there."""
+        if self._launch is not None:
+            self._launch.return_home(now_ns=self.now_ns)
+            self._tick_ns = self.now_ns
+
     def land(self) -> None:
         """Command the autopilot to land by itself."""
         if self._launch is not None:
@@ -272,6 +290,7 @@ class Port(Endpoint):
             sender,
             keys.system,
             sets=self.sets_parameters,
+            returns_below_m=self._returns_below_m,
             events=self._events,
         )
         self._launch = Launch(

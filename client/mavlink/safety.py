@@ -101,13 +101,75 @@ def _options(value: float) -> str:
     return "; ".join(held) or "every failsafe acts at once"
 
 
-def ardupilot(system: int) -> tuple[Rule, ...]:
+CLEAR_M = 1.0
+"""Distance below the fence at which a vehicle returns whose parameter is set [m]."""
+
+
+def _below(value: float, below_m: float) -> bool:
+    return value <= below_m + TOLERANCE
+
+
+def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
+    """Rule for an altitude of the return: below the fence.
+
+    Args:
+        name: name of the parameter.
+        what: what it does at that altitude.
+        below_m: altitude of the fence [m]; infinite without one.
+        scale: number of the parameter's units in a metre.
+    """
+    return Rule(
+        (name,),
+        lambda v: f"it {what} at {v / scale:g} m",
+        lambda v: _below(v / scale, below_m),
+        f"up to {below_m:g} m, fence.high_m: set {scale * max(below_m - CLEAR_M, CLEAR_M):g}",
+        scale * max(below_m - CLEAR_M, CLEAR_M),
+        required=True,
+    )
+
+
+def _ardupilot_returns(below_m: float | None) -> tuple[Rule, ...]:
+    """Rules for the return of ArduCopter; none for one that does not return."""
+    if below_m is None:
+        return ()
+    return (
+        _returning("RTL_ALT", "returns home", below_m, 100.0),
+        Rule(
+            ("RTL_ALT_FINAL",),
+            lambda v: (
+                f"home, it hovers at {v / 100.0:g} m for ever" if v > 0.0 else "home, it lands"
+            ),
+            lambda v: v <= 0.0,
+            "0, with which it lands: set 0",
+        ),
+    )
+
+
+def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
+    """Rules for the return of PX4; none for one that does not return."""
+    if below_m is None:
+        return ()
+    return (
+        _returning("RTL_RETURN_ALT", "returns home", below_m, 1.0),
+        _returning("RTL_DESCEND_ALT", "waits to land", below_m, 1.0),
+        Rule(
+            ("RTL_LAND_DELAY",),
+            lambda v: f"home, it lands after {v:g} s" if v >= 0.0 else "home, it hovers for ever",
+            lambda v: v >= 0.0,
+            "0 or more, with which it lands: set 0",
+        ),
+    )
+
+
+def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, ...]:
     """Rules for ArduCopter.
 
     Args:
         system: number of our own system.
+        returns_below_m: altitude below which it has to return home, where it does [m].
     """
     return (
+        *_ardupilot_returns(returns_below_m),
         Rule(
             ("GUID_TIMEOUT",),
             lambda v: f"without setpoints for {v:g} s it brakes, and stands",
@@ -168,9 +230,14 @@ def ardupilot(system: int) -> tuple[Rule, ...]:
     )
 
 
-def px4() -> tuple[Rule, ...]:
-    """Rules for PX4."""
+def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
+    """Rules for PX4.
+
+    Args:
+        returns_below_m: altitude below which it has to return home, where it does [m].
+    """
     return (
+        *_px4_returns(returns_below_m),
         Rule(
             ("COM_OF_LOSS_T",),
             lambda v: f"it leaves OFFBOARD after {v:g} s without setpoints",

@@ -44,6 +44,7 @@ class Setup:
         target: numbers of its system and component.
         system: number of our own system.
         sets: whether parameters that are not safe are set.
+        returns_below_m: altitude below which it has to return home, where it does [m].
         events: takes what is told.
     """
 
@@ -55,11 +56,16 @@ class Setup:
         system: int,
         *,
         sets: bool,
+        returns_below_m: float | None = None,
         events: Events,
     ) -> None:
         self._vehicle, self._flavour, self._target = vehicle, flavour, target
         self._sets, self._events = sets, events
-        self._rules = safety.ardupilot(system) if flavour is ARDUPILOT else safety.px4()
+        self._rules = (
+            safety.ardupilot(system, returns_below_m)
+            if flavour is ARDUPILOT
+            else safety.px4(returns_below_m)
+        )
         self._bytewise = flavour.bytewise
         self._version: str | None = None
         """Name and version; None until it is known, or not told."""

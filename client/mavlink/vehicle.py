@@ -33,6 +33,7 @@ class MavlinkVehicle(Vehicle):
         ConfigError: the line to the autopilot is none, or the flight begins on the ground.
     """
 
+    returns = True
     changeable = keys_of(InFlight.ARMED, InFlight.ORIGIN)
 
     def __init__(self, scenario: Scenario, number: int) -> None:
@@ -107,6 +108,10 @@ class MavlinkVehicle(Vehicle):
         """See `Vehicle`; the autopilot's own landing."""
         self._port.land()
         return True
+
+    def return_home(self) -> None:
+        """See `Vehicle`; the autopilot's own return."""
+        self._port.return_home()
 
     @property
     def is_down(self) -> bool:

@@ -384,6 +384,7 @@ DOES = {
     "brake": "brakes",
     "hover": "hovers",
     "land": "lands, and must be checked before it flies again",
+    "return": "returns home, and must be checked before it flies again",
     "manual": "is flown by somebody else, or by nobody",
     "fault": "stands still, and must be checked before it flies again",
 }

@@ -11,7 +11,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import policies
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario.fence import inner, margins
+from skytether.shared.scenario.fence import inner, is_home_inside, margins
 from skytether.shared.scenario.mission import Mission, given, written
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import (
@@ -95,6 +95,8 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     yield from _no_way(scenario, known)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
+    if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
+        yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
@@ -131,6 +133,9 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     most_s = JOIN_MAX * SPACING * control.dt
     if not 0.0 < link.join_s <= most_s + TINY:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
+    if vehicle.on_loss != "land":
+        expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
+        yield "vehicle.on_loss", repr(vehicle.on_loss), expected
     # A vehicle that hears nothing flies its motion to the end before it brakes.
     longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
     for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):

@@ -6,7 +6,8 @@ the scenario states: see `client.fence`.
 
 import math
 
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.law.model import ALTITUDE
+from skytether.shared.scenario.schema import FenceConfig, Scenario
 
 SLOW_STEPS = 2
 """Steps by which T of the fence is longer than the vehicle's time constant."""
@@ -16,6 +17,12 @@ WEAK = 1.25
 """Factor by which wind leads a vehicle further if its gain is a fifth less than the model's."""
 LATER_S = 0.1
 """Time by which the vehicle's dead time may be longer than the model's [s]."""
+
+
+def is_home_inside(fence: FenceConfig) -> bool:
+    """Whether a vehicle that returns to where it took off stays inside in the plane."""
+    low = all(each <= 0.0 for each in fence.low_m[:ALTITUDE])
+    return low and all(each >= 0.0 for each in fence.high_m[:ALTITUDE])
 
 
 def margins(scenario: Scenario) -> list[float]:

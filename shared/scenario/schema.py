@@ -225,6 +225,9 @@ class VehicleConfig(Section, frozen=True):
     `hold`."""
     land_after_s: Term[Duration] = 10.0
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
+    on_loss: OfVehicle[Literal["land", "return"]] = "land"
+    """What it does `land_after_s` after it has begun to hover with a silent server: it lands where
+    it is, or its autopilot flies it home and lands it there."""
     after_leap: Annotated[
         Literal["ask", "old", "new", "stay"], Key(Owner.VEHICLE, InFlight.LEAP)
     ] = "ask"

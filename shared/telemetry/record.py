@@ -61,6 +61,7 @@ class Reason(IntEnum):
     MUTE = 23
     WAITED = 24
     RESUMED = 25
+    HOMEWARD = 26
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -91,6 +92,7 @@ REASON_TEXTS = {
     Reason.BATTERY: "its battery is low",
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
+    Reason.HOMEWARD: "the server has been silent for long",
     Reason.WAITED: "what it waits for has not come for long",
     Reason.RESUMED: "its process has restarted, and it goes on along its motion",
 }

@@ -150,6 +150,8 @@ class Mode(IntEnum):
     """Vehicle with a fault aboard: stands still, and flies nothing more."""
     MANUAL = 9
     """Vehicle that a pilot or nobody flies: nothing is sent to its autopilot."""
+    RETURN = 10
+    """Vehicle that its autopilot flies home, and lands there."""
 
     def __str__(self) -> str:
         return self.name.lower()

@@ -26,6 +26,8 @@ MODE_COLOURS: Mapping[Mode, str] = {
     Mode.BRAKE: RED,
     Mode.HOVER: BLUE,
     Mode.LAND: VIOLET,
+    Mode.RETURN: VIOLET,
+    Mode.MANUAL: GREY,
     Mode.FAULT: RED,
 }
 """Name of the colour of each mode."""

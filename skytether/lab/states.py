@@ -25,6 +25,7 @@ AT: Mapping[Mode, tuple[int, int]] = {
     Mode.LAND: (310, 380),
     Mode.FAULT: (80, 380),
     Mode.MANUAL: (770, 540),
+    Mode.RETURN: (425, 540),
 }
 """Centre of each state."""
 BEND: Mapping[tuple[Mode, Mode], int] = {
@@ -37,11 +38,11 @@ BEND: Mapping[tuple[Mode, Mode], int] = {
     (Mode.COAST, Mode.BRAKE): -30,
 }
 """Distance by which an arrow's middle is bent to the left; 0 for those not listed."""
-BELOW = {Mode.BRAKE, Mode.HOVER, Mode.LAND, Mode.FAULT, Mode.MANUAL}
+BELOW = {Mode.BRAKE, Mode.HOVER, Mode.LAND, Mode.FAULT, Mode.MANUAL, Mode.RETURN}
 """States whose self-loop is drawn below them."""
 ANYWHERE: Mapping[Mode, tuple[str, tuple[int, int], tuple[int, int]]] = {
     Mode.FAULT: ("from every state:", (0, -90), (0, -96)),
-    Mode.MANUAL: ("from every state but INIT, LAND, FAULT:", (-110, 0), (-240, -4)),
+    Mode.MANUAL: ("from all but INIT, LAND, RETURN, FAULT:", (-110, 0), (-240, -4)),
 }
 """States that the same causes reach from everywhere: label, start of the single arrow, and position
 of its label, relative to the state's centre."""

@@ -62,6 +62,7 @@ from skytether.shared.core.events import (
     SessionOpened,
     SessionRefused,
     StateDoubted,
+    StateLeapt,
     Unanswered,
     Unauthenticated,
     address_text,
@@ -197,6 +198,17 @@ SENTENCES = [
         "vehicle 1 is sent no plan: the solver has found none",
     ),
     (PlanningResumed(vehicle=1), "vehicle 1 gets plans again"),
+    (
+        StateLeapt(vehicle=1, by_m=(-12.0, 0.03, -0.1), land_after_s=10.0),
+        "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose vehicle.after_leap: "
+        "'old' (the leap is subtracted, the fence stays), 'new' (it counts, the fence moves with "
+        "it) or 'stay'; without a choice it lands 10 s after it has begun to hover",
+    ),
+    (
+        StateLeapt(vehicle=1, by_m=(), land_after_s=0.0),
+        "vehicle 1: its velocity has leapt: choose vehicle.after_leap: 'old' (the leap is "
+        "subtracted, the fence stays), 'new' (it counts, the fence moves with it) or 'stay'",
+    ),
     (
         FenceHolds(vehicle=1),
         "vehicle 1 is held back by its fence",

@@ -1,0 +1,109 @@
+"""Return home by the autopilot itself, when the server has been silent for long."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from airborne import SAFE, Air
+from helpers import packaged
+from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flight import Result
+from skytether.client import vehicles
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.aboard import ParametersUnsafe
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import parse
+from skytether.shared.wire.protocol import Mode
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 6.0], "wind_mps": 0.5}
+RETURNS = {"on_loss": "return", "land_after_s": 3.0}
+MODE_NAMES = {"ardupilot": "RTL", "px4": "AUTO.RTL"}
+LOW: dict[FlavourName, dict[str, float]] = {
+    "ardupilot": {"RTL_ALT": 400},
+    "px4": {"RTL_RETURN_ALT": 4.0, "RTL_DESCEND_ALT": 4.0},
+}
+"""Altitudes of the return that the fence has room for."""
+
+
+def lost(flavour: FlavourName, **keys: Any) -> Air:
+    """A vehicle in flight, 5 m or so from home, whose server has just died."""
+    air = Air(flavour, duration=120.0, fence=FENCE, vehicle=RETURNS, **keys)
+    air.fly()
+    air.run(20.0, lambda: abs(air.flight.position()[1]) > 2.0)
+    assert np.hypot(*air.flight.position()[:2]) > 2.0
+    air.world.stop("server")
+    return air
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: FlavourName) -> None:
+    """By the autopilot's own mode; it lands where it was armed, and no higher than its fence."""
+    air = lost(flavour, parameters=SAFE[flavour] | LOW[flavour])
+    died_ns = air.world.now_ns
+    returns_s = air.run(20.0, lambda: air.flight.mode_name == MODE_NAMES[flavour])
+    assert [each.after for each in air.of(ModeChanged)][-3:] == ["brake", "hover", "return"]
+    assert returns_s == pytest.approx(1.5 + 1.5 + 3.0, abs=1.2)
+    quiet_ns = air.world.now_ns + 200_000_000
+    air.run(90.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+    assert not air.setpoints(quiet_ns)
+    assert np.hypot(*air.flight.position()[:2]) < 0.7
+    rows = parse(air.truth.getvalue())
+    places = rows["state"][rows["time_ns"] > died_ns][:, :, 0]
+    assert np.abs(places[:, :2]).max() < 8.0
+    assert places[:, 2].max() < 6.0
+    assert air.client._failsafe.mode is Mode.RETURN
+
+
+def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
+    """It knows no home, say: four seconds later it is told to land where it is."""
+    air = lost("ardupilot", parameters=SAFE["ardupilot"] | LOW["ardupilot"])
+    switch = air.flight.switch
+    air.flight.switch = lambda number: Result.FAILED if number == 6 else switch(number)
+    air.run(30.0, lambda: air.flight.mode_name == "LAND")
+    assert air.flight.mode_name == "LAND"
+    assert "vehicle 1: its autopilot refuses to change its mode: failed" in air.said()
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None:
+    """Nothing is armed: by default ArduCopter returns at 15 m, and PX4 at 60 m."""
+    air = Air(flavour, fence=FENCE, vehicle=RETURNS)
+    air.run(30.0, lambda: air.client.failure is not None)
+    assert isinstance(air.client.failure, ParametersUnsafe)
+    names = {each.name for each in air.client.failure.parameters}
+    assert names == set(LOW[flavour])
+    assert "fence.high_m" in str(air.client.failure)
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -> None:
+    """A metre below the fence."""
+    air = Air(flavour, fence=FENCE, vehicle=RETURNS, sets=True)
+    air.run(30.0, lambda: bool(air.flight.armed))
+    assert air.flight.armed
+    scale = 100.0 if flavour == "ardupilot" else 1.0
+    for name in LOW[flavour]:
+        assert air.flight.parameters[name] == pytest.approx(5.0 * scale)
+
+
+def test_vehicles_of_a_mission_land_straight_down() -> None:
+    """The proof in docs/together.md has it so: a return is refused in words."""
+    table = reading.to_table(reading.load("swap"))
+    table["vehicle"] |= {"on_loss": "return"}
+    with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*lands straight down"):
+        reading.check(table, "swap")
+
+
+def test_only_a_vehicle_that_can_return_is_told_to() -> None:
+    """A simulated one cannot; and nobody returns to a home outside the fence."""
+    flown = packaged("demo", {}, {"vehicle": {"on_loss": "return"}})
+    with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*cannot return by itself"):
+        vehicles.make(flown, 1)
+    beside = {"low_m": [1.0, -9.0, 0.5], "high_m": [9.0, 9.0, 9.0]}
+    reference = {"shape": "hover", "points_m": [[5.0, 0.0, 3.0]]}
+    with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*home \(0, 0\) is outside"):
+        Air("ardupilot", fence=beside, vehicle=RETURNS, reference=reference)
