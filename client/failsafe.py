@@ -71,8 +71,8 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# Not in INIT, where nothing is flown yet, nor in LAND, RETURN and FAULT, which last until somebody has seen
-# to the vehicle.
+# Not in INIT, where nothing is flown yet, nor in LAND, RETURN and FAULT, which last until somebody
+# has seen to the vehicle.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode

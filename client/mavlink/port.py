@@ -95,7 +95,8 @@ def given_origin(scenario: Scenario) -> Vector | None:
 
 def returns_below_m(scenario: Scenario) -> float | None:
     """Altitude below which a lost vehicle returns home [m], infinite without a fence; None of one
-    that lands where it is."""
+    that lands where it is.
+    """
     if scenario.vehicle.on_loss != "return":
         return None
     high = scenario.fence.high_m[ALTITUDE:]

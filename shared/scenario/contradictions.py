@@ -95,8 +95,6 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     yield from _no_way(scenario, known)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
-    if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
-        yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
@@ -117,6 +115,8 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not scenario.is_mission:
+        if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
+            yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
         if scenario.mission.zones:
             expected = "none without a mission: reference.shape = 'mission', or a swap"
             yield "mission.zones", repr(scenario.mission.zones), expected
@@ -133,7 +133,7 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     most_s = JOIN_MAX * SPACING * control.dt
     if not 0.0 < link.join_s <= most_s + TINY:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
-    if vehicle.on_loss != "land":
+    if vehicle.on_loss == "return":
         expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected
     # A vehicle that hears nothing flies its motion to the end before it brakes.

@@ -55,16 +55,16 @@ def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
     assert np.linalg.norm(place(air) - hovered) < 0.05
 
 
-def test_without_a_choice_it_lands() -> None:
+@pytest.mark.parametrize("armed", [True, False])
+def test_without_a_choice_it_lands(*, armed: bool) -> None:
     """`vehicle.land_after_s` of hovering and a second later, armed or not."""
-    for armed in (True, False):
-        air, running = leapt()
-        if not armed:
-            change(air, running, armed=False)
-        lands_s = air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
-        assert lands_s == pytest.approx(1.0 + 10.0 + 1.0, abs=1.0)
-        last = air.of(ModeChanged)[-1]
-        assert (last.after, last.reason) == ("land", str(Reason.LEAPT))
+    air, running = leapt()
+    if not armed:
+        change(air, running, armed=False)
+    lands_s = air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
+    assert lands_s == pytest.approx(1.0 + 10.0 + 1.0, abs=1.0)
+    last = air.of(ModeChanged)[-1]
+    assert (last.after, last.reason) == ("land", str(Reason.LEAPT))
 
 
 def test_arming_again_is_no_choice() -> None:

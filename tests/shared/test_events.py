@@ -200,14 +200,18 @@ SENTENCES = [
     (PlanningResumed(vehicle=1), "vehicle 1 gets plans again"),
     (
         StateLeapt(vehicle=1, by_m=(-12.0, 0.03, -0.1), land_after_s=10.0),
-        "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose vehicle.after_leap: "
-        "'old' (the leap is subtracted, the fence stays), 'new' (it counts, the fence moves with "
-        "it) or 'stay'; without a choice it lands 10 s after it has begun to hover",
+        (
+            "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose vehicle.after_leap: "
+            "'old' (the leap is subtracted, the fence stays), 'new' (it counts, the fence moves with "
+            "it) or 'stay'; without a choice it lands 10 s after it has begun to hover"
+        ),
     ),
     (
         StateLeapt(vehicle=1, by_m=(), land_after_s=0.0),
-        "vehicle 1: its velocity has leapt: choose vehicle.after_leap: 'old' (the leap is "
-        "subtracted, the fence stays), 'new' (it counts, the fence moves with it) or 'stay'",
+        (
+            "vehicle 1: its velocity has leapt: choose vehicle.after_leap: 'old' (the leap is "
+            "subtracted, the fence stays), 'new' (it counts, the fence moves with it) or 'stay'"
+        ),
     ),
     (
         FenceHolds(vehicle=1),
