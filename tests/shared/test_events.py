@@ -201,9 +201,9 @@ SENTENCES = [
     (
         StateLeapt(vehicle=1, by_m=(-12.0, 0.03, -0.1), land_after_s=10.0),
         (
-            "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose vehicle.after_leap: "
-            "'old' (the leap is subtracted, the fence stays), 'new' (it counts, the fence moves with "
-            "it) or 'stay'; without a choice it lands 10 s after it has begun to hover"
+            "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose "
+            "vehicle.after_leap: 'old' (the leap is subtracted, the fence stays), 'new' (it "
+            "counts, the fence moves with it) or 'stay'; without a choice it lands 10 s after it has begun to hover"
         ),
     ),
     (
