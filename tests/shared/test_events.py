@@ -203,7 +203,8 @@ SENTENCES = [
         (
             "vehicle 1: its position has leapt by (-12.00, +0.03, -0.10) m: choose "
             "vehicle.after_leap: 'old' (the leap is subtracted, the fence stays), 'new' (it "
-            "counts, the fence moves with it) or 'stay'; without a choice it lands 10 s after it has begun to hover"
+            "counts, the fence moves with it) or 'stay'; without a choice it "
+            "lands 10 s after it has begun to hover"
         ),
     ),
     (
