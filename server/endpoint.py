@@ -19,12 +19,13 @@ from skytether.server.sessions import Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
-from skytether.shared.core.events import SessionEnded
+from skytether.shared.core.events import ReferenceTooFast, SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.mission import Guided, given
 from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.pace import first_too_fast
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
@@ -76,6 +77,8 @@ class Server(Endpoint):
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         super().__init__()
+        if too_fast := first_too_fast(scenario):
+            self._events.append(ReferenceTooFast(**too_fast._asdict()))
         self.changeable = TRIGGER
         if scenario.reference.shape == "live":
             self.changeable |= POINT

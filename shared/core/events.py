@@ -92,6 +92,22 @@ class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"metrics at http://{address_text(self.host, self.port)}/metrics{whose}"
 
 
+class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The desired trajectory is faster than the vehicle can fly."""
+
+    at_s: float
+    """Time in the flight from which on it is, for the first time [s]."""
+    speed_mps: float
+    """Desired speed along an axis then [m/s]."""
+    most_mps: float
+    """Largest speed of the vehicle along this axis [m/s]."""
+
+    def __str__(self) -> str:
+        asked = f"the desired trajectory asks {self.speed_mps:.3g} m/s at {self.at_s:g} s"
+        most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
+        return f"{asked}, and the vehicle flies at most {most}: it cannot follow"
+
+
 class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A process is told to fly a vehicle that goes on for ever once it hears nothing any more."""
 
@@ -524,6 +540,7 @@ Event = (
     | Measured
     | Plaintext
     | NoFailsafe
+    | ReferenceTooFast
     | Counted
     | Omitted
     | RecordIncomplete

@@ -8,6 +8,7 @@ import numpy as np
 
 from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.pace import is_known, is_too_fast
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
@@ -85,6 +86,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     `settle` on [m/s]."""
     saturated: float | None
     """Share of the steps from `settle` on at which the input is at its bound on some axis."""
+    too_fast: float | None = None
+    """Share of the steps at which the desired trajectory is faster than u_max times the gain on
+    some axis, so that nothing can follow it; None where only the server knows it."""
     solve_ms_p50: float | None
     """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
@@ -172,6 +176,7 @@ def summarise(
         plan_age_s_mean=_mean(plan_age_s),
         effort_mps=math.sqrt((changes**2).sum(axis=1).mean()) if len(changes) else None,
         saturated=_mean((np.abs(flown["input"]) >= AT_BOUND * scenario.u_max).any(axis=1)),
+        too_fast=_too_fast(scenario, client),
         solve_ms_p50=_quantile(solve_ms, 0.5),
         solve_ms_p99=_quantile(solve_ms, 0.99),
         deadline_misses=missed,
@@ -200,6 +205,14 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
     at = np.searchsorted(known["step"], client["step"], side="right") - 1
     positions: Array = known["reference"][np.maximum(at, 0), :, 0]
     return positions
+
+
+def _too_fast(scenario: Scenario, client: Rows) -> float | None:
+    """Share of the steps at which the desired trajectory is too fast to be followed."""
+    if not (is_known(scenario) and len(client)):
+        return None
+    velocity = scenario.make_reference()(client["step"] * scenario.control.dt)[..., 1]
+    return float(is_too_fast(scenario, velocity).mean())
 
 
 def position_error(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:

@@ -24,6 +24,7 @@ from skytether.shared.core.events import (
     ModeChanged,
     PlanningStopped,
     RecordIncomplete,
+    ReferenceTooFast,
 )
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -35,7 +36,9 @@ from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
-TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, Fault
+UNSEEN = Fault, ReferenceTooFast
+"""Events that are printed after a flight in virtual time as well."""
+TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
 """Events that are printed during the flight."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open [s]."""
@@ -212,7 +215,7 @@ def _virtually(
     scenario, secure = options.config, options.secure
     flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
     for each in flown.events:
-        if isinstance(each.event, Fault):
+        if isinstance(each.event, UNSEEN):
             _tell(each.event)
     if options.record is None:
         return flown, None

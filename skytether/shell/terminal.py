@@ -104,6 +104,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("RMSE x, y, xy [m]", _values(".4f", s.rmse_x, s.rmse_y, s.rmse_xy)),
         ("RMSE z [m]", _values(".4f", s.rmse_z)),
         ("largest error [m]", _values(".4f", s.error_max)),
+        ("steps too fast to follow", _values(".3f", s.too_fast or None)),
         ("error of the estimate [m]", _values(".4f", s.estimate_error_m)),
         ("steps with a planned input", _values(".3f", s.covered)),
         ("modes [s]", ", ".join(f"{mode} {seconds:g}" for mode, seconds in s.modes.items())),

@@ -286,7 +286,8 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
         *("downlink_packets", "downlink_bytes", "uplink_packets_per_s", "uplink_bytes_per_s"),
         *("downlink_packets_per_s", "downlink_bytes_per_s", "packets_per_s", "bytes_per_s"),
         *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "aoi_s_mean", "aoi_s_peak"),
-        *("plan_age_s_mean", "effort_mps", "saturated", "solve_ms_p50", "solve_ms_p99"),
+        *("plan_age_s_mean", "effort_mps", "saturated", "too_fast"),
+        *("solve_ms_p50", "solve_ms_p99"),
         *("deadline_misses", "estimate_error_m", "secure"),
     ]
     assert (summary["scenario"], summary["seed"], summary["steps"]) == ("paper", 3, 240)
@@ -344,6 +345,22 @@ def test_a_flag_may_end_a_contradiction_of_the_file(
     assert main([name, *place, *flags]) == 0, capfd.readouterr().err
     assert main(["fly", contradictory, "--virtual"]) == 2
     assert "mine.toml: control.horizon: got 12" in capfd.readouterr().err
+
+
+def test_a_table_in_millimetres_is_flown_with_a_warning(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """First at 2 s, after a rest at the origin; the summary has the share of such steps."""
+    table, told = tmp_path / "mm.csv", tmp_path / "told.json"
+    table.write_text("t,x,y\n0,0,0\n2,0,0\n12,5100,0\n")
+    argv = ["fly", "demo", "--virtual", "--duration", "10", "--settle", "0", "--json", str(told)]
+    argv += ["--reference.shape", "csv", "--reference.file", str(table)]
+    assert main(argv) == 0
+    said = capfd.readouterr()
+    warning = "asks 510 m/s at 2 s, and the vehicle flies at most 1.6 m/s"
+    assert said.err.count(warning) == 1
+    assert "steps too fast to follow" in said.out
+    assert json.loads(told.read_text())["too_fast"] == pytest.approx(0.8, abs=0.01)
 
 
 def test_a_second_scenario_is_judged_as_it_is_flown(

@@ -15,7 +15,7 @@ import pytest
 
 import skytether
 from skytether.cli import processes
-from skytether.shared.core.events import NoAnswer
+from skytether.shared.core.events import NoAnswer, ReferenceTooFast
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import (
     Hello,
@@ -158,6 +158,21 @@ def test_a_scenario_made_by_hand_is_checked() -> None:
     for refuses in (skytether.check, skytether.fly, skytether.load):
         with pytest.raises(skytether.ConfigError, match=r"mine: duration: got -1.0, expected a"):
             refuses(wrong)
+
+
+def test_a_reference_that_nothing_can_follow_is_told() -> None:
+    """By an event of the server at its start, and in the summary; others are not."""
+    keys = {"reference.radius_m": 8.0, "reference.period_s": 10.0, "model.gain": 0.5}
+    flight = skytether.fly("demo", **SHORT, **keys)
+    (told,) = (each for each in flight.events if isinstance(each.event, ReferenceTooFast))
+    assert told.event == ReferenceTooFast(at_s=0.0, speed_mps=told.event.speed_mps, most_mps=0.8)
+    assert told.event.speed_mps == pytest.approx(2.0 * np.pi * 8.0 / 10.0)
+    assert told.time_ns < 10**9
+    assert flight.summary.too_fast == 1.0
+    usual = skytether.fly("demo", **SHORT)
+    assert usual.summary.too_fast == 0.0
+    assert not any(isinstance(each.event, ReferenceTooFast) for each in usual.events)
+    assert skytether.fly("target", **SHORT).summary.too_fast is None
 
 
 # -- flights ---------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ from skytether.shared.core.events import (
     PlanningResumed,
     PlanningStopped,
     RecordIncomplete,
+    ReferenceTooFast,
     Returned,
     ServerFull,
     SessionEnded,
@@ -91,6 +92,13 @@ SENTENCES = [
         (
             "metrics at http://0.0.0.0:9464/metrics, WITHOUT A PASSWORD: anybody on the network "
             "can read them"
+        ),
+    ),
+    (
+        ReferenceTooFast(at_s=2.0, speed_mps=510.0, most_mps=1.6),
+        (
+            "the desired trajectory asks 510 m/s at 2 s, and the vehicle flies at most 1.6 m/s "
+            "(model.u_max times model.gain): it cannot follow"
         ),
     ),
     (
