@@ -24,6 +24,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
+from skytether.client.memory import recall
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.client.vehicle import Measurement
@@ -50,7 +51,7 @@ CLOCK = Clock(MIDNIGHT_NS)
 """Clock of all hosts: the map of clocks does not depend on what they show."""
 BASE_NS = 50 * MILLISECOND_NS
 """Delay of every packet before any move [ns]."""
-HOLD_NS = 3 * SECOND_NS
+HOLD_NS = SECOND_NS
 """Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
 ARRIVED_M, RESTS_MPS = 0.3, 0.1
 """Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
@@ -82,7 +83,8 @@ class Kind(StrEnum):
     SERVER = "server"
     """The server is down, and begins anew without memory."""
     CLIENT = "client"
-    """The client of a vehicle is down, and begins anew."""
+    """The client of a vehicle is down, and begins anew with what it has kept; with
+    `vehicle.memory = "none"` that is nothing."""
     GOALS = "goals"
     """The vehicle is sent to the place of the amounts [m], and at the end to its own goal again."""
     ZONES = "zones"
@@ -111,7 +113,7 @@ RADIUS_M = (0.4, 1.5)
 
 @dataclass(frozen=True)
 class Move:
-    """Something that the adversary does."""
+    """Move of the adversary, for a while."""
 
     kind: Kind
     vehicle: Annotated[int, msgspec.Meta(ge=0)]
@@ -322,6 +324,10 @@ class Raid:
     def _new_client(self, number: int) -> AheadClient:
         """The next life of a vehicle's client."""
         lives, sink, world = self._lives[number], io.BytesIO(), self._world
+        keeps = isinstance(self._bodies[number], Body) and self._scenario.vehicle.memory != "none"
+        before, now_ns = None, CLOCK.local(world.now_ns)
+        if lives and (kept := world.memory(f"client {number}")):
+            before = recall(*kept, now_ns, self._scenario.terms())
         client = AheadClient(
             self._scenario,
             self._bodies[number],
@@ -331,6 +337,8 @@ class Raid:
             recorder=Recorder(client_columns(self._scenario.model.axes), sink),
             clock=CLOCK,
             world_ns=lambda: world.now_ns,
+            keeps=keeps,
+            before=before,
         )
         lives.append(Life(client, sink))
         return client
@@ -428,7 +436,7 @@ class Raid:
         return True
 
     def _track(self, number: int) -> Track:
-        """Where a vehicle truly was, from its first step on a mission on, through all its lives."""
+        """Track of a vehicle, from its first step on a mission on, through all its lives."""
         dt_s, scale = self._scenario.control.dt, self._scenario.mission.height_scale
         tracks: list[Track] = []
         for client, sink in self._lives[number]:
@@ -516,7 +524,7 @@ class Climbed(NamedTuple):
 
     best: Approach
     spares_m: list[float]
-    """What was left of the distances asked for, of each try [m]."""
+    """Spare distance of each try, see `spare_m` [m]."""
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:
@@ -525,7 +533,7 @@ def fly(scenario: Scenario, moves: Moves) -> Approach:
 
 
 def spare_m(scenario: Scenario, found: Approach) -> float:
-    """What is left of the distances asked for [m]; negative: one was not kept."""
+    """Distance beyond what is asked for, between vehicles or from zones [m]; negative: not kept."""
     return min(found.apart.distance_m - scenario.mission.separation_m, found.clear.distance_m)
 
 

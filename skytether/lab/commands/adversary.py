@@ -45,7 +45,7 @@ class Kept(msgspec.Struct, frozen=True):
     nearest: Approach
     """Flight with the least spare distance."""
     spares_m: Sequence[float]
-    """What was left of the distances asked for, of each flight [m]."""
+    """Spare distance of each flight, see `spare_m` [m]."""
 
 
 ATTACK_BYTES_MAX = 16_000_000
