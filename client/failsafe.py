@@ -37,7 +37,7 @@ BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
 """Causes for which somebody else flies the vehicle, or nobody."""
-GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY})
+GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
 """Causes for which the vehicle brakes, and lands."""
 BROKEN = frozenset(
     {

@@ -164,7 +164,7 @@ class BadLine(Endpoint):
             lambda: long(1, 1, SET_MODE, 0, 1.0, float(mode % 256), 0, 0, 0, 0, 0),
             lambda: dialect.MAVLink_set_mode_message(1, 1, mode),
             lambda: dialect.MAVLink_set_position_target_local_ned_message(
-                now_ms, 1, 1, 1, 0b110111000000, x, y, -z, *v, 0, 0, 0, 0, 0
+                now_ms, 2, 1, 1, 0b110111000000, x, y, -z, *v, 0, 0, 0, 0, 0
             ),
             lambda: dialect.MAVLink_home_position_message(
                 1, 2, 3, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0

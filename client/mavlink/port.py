@@ -13,7 +13,9 @@ from skytether.client.mavlink.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
 from skytether.client.mavlink.launch import Launch, Phase
+from skytether.client.mavlink.obedience import Obedience
 from skytether.client.mavlink.positions import Positions, Vector
+from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
 from skytether.client.navigation import Leaps
@@ -24,11 +26,14 @@ from skytether.mavlink.frames import turned
 from skytether.mavlink.text import Texts
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import (
+    AboardEvent,
     AboardFailure,
     AutopilotMode,
     AutopilotRefused,
     AutopilotText,
     NotTakenOff,
+    SecondCommander,
+    Strays,
 )
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.core.line import Line
@@ -50,6 +55,8 @@ LATE = 1.1
 """Share of the time between two setpoints after which one is repeated: a step may come late."""
 ZERO_NS = 50 * MILLISECOND_NS
 """Time between two setpoints of zero, where a mode needs a stream of them [ns]."""
+FRESH_NS = 200 * MILLISECOND_NS
+"""Age up to which a velocity is compared with what was told [ns]."""
 CLOSES = 3
 """Times that a vehicle in the air is told to land when its process ends."""
 SAME_TEXT_NS = 30 * SECOND_NS
@@ -159,6 +166,11 @@ class Port(Endpoint):
         self._repeat_ns = round(LATE * each / parts)
         self._was_armed = False
         """Whether a life of the client has armed it since a person last said that it may be."""
+        self._rivals, self._obedience = Rivals(), Obedience(scenario)
+        self._yields = False
+        """Whether a second commander has the vehicle: nothing is sent."""
+        self._said_ns: dict[Reason, int] = {}
+        """Times at which a second commander was told of, by the way it was noticed."""
         self._returns_below_m = returns_below_m(scenario)
         self._was_disarmed = False
         """Whether it was disarmed since it flew: it is not flown again."""
@@ -221,8 +233,13 @@ class Port(Endpoint):
         if not condition.armed or self._was_disarmed:
             self._was_disarmed = True
             return Reason.DISARMED
+        self._yields = False
         if condition.mode != self._flavour.guided:
+            self._obedience.begin()
             return Reason.TAKEN
+        if rival := self._rival(now_ns):
+            self._yields = self._keys.second_commander == "yield"
+            return Reason.TAKEN if self._yields else rival
         if condition.is_astray(now_ns=now_ns):
             return Reason.ASTRAY
         if condition.battery_is_low(now_ns=now_ns):
@@ -232,8 +249,33 @@ class Port(Endpoint):
         silent = came_ns is None or now_ns - came_ns > silence_ns
         return Reason.MUTE if silent or not condition.is_fresh(now_ns=now_ns) else None
 
+    def _rival(self, now_ns: int) -> Reason | None:
+        """How a second commander is noticed; None where there is none."""
+        rivals, obedience = self._rivals, self._obedience
+        event: AboardEvent
+        if rivals.are_there(now_ns=now_ns):
+            system, component, said = rivals.newest
+            cause = Reason.RIVAL
+            event = SecondCommander(
+                vehicle=self._vehicle, system=system, component=component, said=said
+            )
+        elif obedience.strays(now_ns=now_ns):
+            cause = Reason.STRAYED
+            event = Strays(vehicle=self._vehicle, off_mps=obedience.off_mps)
+        else:
+            return None
+        if now_ns - self._said_ns.get(cause, -SAME_TEXT_NS) >= SAME_TEXT_NS:
+            self._said_ns[cause] = now_ns
+            self._events.append(event)
+        return cause
+
     def fly(self, velocity: tuple[float, float, float]) -> None:
         """Send a velocity now, unless one was sent just before, and repeat it for a while."""
+        came_ns = self.positions.came_ns
+        if came_ns is not None and self.now_ns - came_ns <= FRESH_NS:
+            self._obedience.step(velocity, self.positions.velocity, now_ns=self.now_ns)
+        else:
+            self._obedience.begin()
         self._velocity, self._flown_ns = velocity, self.now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         if self._sent_ns is None or self.now_ns - self._sent_ns >= 0.9 * least_ns:
@@ -265,11 +307,17 @@ class Port(Endpoint):
                 self._meet(message, sender, datagram.peer)
             if sender != self._target:
                 self._counts["foreign"] += 1
+                self._hear_other(message, sender, now_ns)
             elif not self._is_for_us(message):
                 self._counts["for_others"] += 1
             else:
                 self._counts["heard"] += 1
                 self._hear(message, now_ns)
+
+    def _hear_other(self, message: Message, sender: tuple[int, int], now_ns: int) -> None:
+        """Take a message of neither the autopilot nor us."""
+        if self._target is not None and sender != (self._keys.system, self._keys.component):
+            self._rivals.hear(message, self._target[0], now_ns=now_ns)
 
     def _meet(self, message: Message, sender: tuple[int, int], peer: Address) -> None:
         """Take who sends a heartbeat for our autopilot, if it is one."""
@@ -454,7 +502,7 @@ class Port(Endpoint):
             launch is not None
             and launch.phase is Phase.FLYING
             and self._flown_ns is not None
-            and not self._was_disarmed
+            and not (self._was_disarmed or self._yields)
             and condition.armed
             and condition.mode == self._flavour.guided
         )

@@ -97,6 +97,32 @@ class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: its autopilot is in {self.mode}, {armed}"
 
 
+class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle has heard somebody else tell its autopilot where to fly."""
+
+    system: int
+    """Number of the sender's system in MAVLink."""
+    component: int
+    """Number of its component."""
+    said: str
+    """Kind of its newest message."""
+
+    def __str__(self) -> str:
+        who = f"system {self.system}, component {self.component}"
+        return f"vehicle {self.vehicle}: {who} commands its autopilot as well: {self.said}"
+
+
+class Strays(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle does not do what it is told, by more than wind and errors of its model explain."""
+
+    off_mps: float
+    """Difference between its velocity and those that it can have [m/s]."""
+
+    def __str__(self) -> str:
+        off = f"flies {self.off_mps:.1f} m/s otherwise than it is told"
+        return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
+
+
 class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle is not armed, for its autopilot would do what is not safe in silence."""
 
@@ -161,5 +187,7 @@ AboardEvent = (
     | AutopilotMode
     | ArmingAwaited
     | OriginAwaited
+    | SecondCommander
+    | Strays
     | AboardFailure
 )

@@ -377,6 +377,10 @@ class MavlinkConfig(Section, frozen=True):
     armed where it begins: that point is its first goal, on the ground. With `takeoff` a client that
     begins while the vehicle is in the air knows its origin from `vehicle.memory`; else the vehicle
     hovers until this key is set."""
+    second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
+    """Answer to somebody else who commands the autopilot, or to a vehicle that does not do what it
+    is told: it brakes, and lands if that goes on; or it yields, as to a pilot, until that is
+    over."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Time that the autopilot may take until it is heard, and for each step on its way into the
     air [s]."""

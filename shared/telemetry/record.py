@@ -62,6 +62,8 @@ class Reason(IntEnum):
     WAITED = 24
     RESUMED = 25
     HOMEWARD = 26
+    RIVAL = 27
+    STRAYED = 28
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -93,6 +95,8 @@ REASON_TEXTS = {
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
     Reason.HOMEWARD: "the server has been silent for long",
+    Reason.RIVAL: "somebody else commands its autopilot",
+    Reason.STRAYED: "it does not do what it is told",
     Reason.WAITED: "what it waits for has not come for long",
     Reason.RESUMED: "its process has restarted, and it goes on along its motion",
 }

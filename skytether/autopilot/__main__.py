@@ -56,6 +56,7 @@ class AutopilotOptions:
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
             "estimate@20-25: it does not know where it is; "
             "drift@20-25: its accelerometers fail, it moves and does not notice; "
+            "commander@20-25: somebody else commands it, 3 m/s north, 50 times a second; "
             "leap@20: the position that it reports leaps by 12 m.",
         ),
     ] = ()

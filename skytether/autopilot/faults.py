@@ -8,14 +8,20 @@ from skytether.autopilot.flavours import FlightMode
 from skytether.autopilot.flight import REST, PilotedVehicle, Vector
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
 
-FaultName = Literal["silence", "pilot", "disarm", "battery", "estimate", "drift", "leap"]
+FaultName = Literal[
+    "silence", "pilot", "disarm", "battery", "estimate", "drift", "leap", "commander"
+]
 NAMES: tuple[str, ...] = get_args(FaultName)
-LASTING = ("silence", "estimate", "drift", "leap")
+LASTING = ("silence", "estimate", "drift", "leap", "commander")
 """Faults that may end."""
 DRIFT: Vector = (3.5, 0.0, 0.0)
 """Velocity at which the vehicle moves unnoticed with the fault `drift` [m/s]."""
+COMMANDED: Vector = (3.0, 0.0, 0.0)
+"""Velocity that a second commander sends with the fault `commander` [m/s]."""
+COMMANDED_NS = 20 * MILLISECOND_NS
+"""Time between two of his set-points [ns]."""
 LEAP: Vector = (-12.0, 0.0, 0.0)
 """Displacement of the reported position with the fault `leap` [m]."""
 LOW_CHARGE = 0.05
@@ -65,6 +71,8 @@ class Script:
     def __init__(self, faults: Sequence[ScriptedFault]) -> None:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
         self._lasting: list[ScriptedFault] = []
+        self._commands = False
+        """Whether somebody else commands the vehicle, over another line of the autopilot."""
         self.silent = False
         """Whether the autopilot sends nothing."""
 
@@ -78,6 +86,8 @@ class Script:
             self._begin(fault, flight)
             if fault.until_ns is not None:
                 self._lasting.append(fault)
+        if self._commands and flight.now_ns % COMMANDED_NS == 0:
+            flight.want(COMMANDED, None)
         for fault in list(self._lasting):
             if fault.until_ns is not None and fault.until_ns <= past_ns:
                 self._lasting.remove(fault)
@@ -100,6 +110,8 @@ class Script:
                 self.silent = wrong
             case "drift":
                 flight.drift = DRIFT if wrong else REST
+            case "commander":
+                self._commands = wrong
             case "leap":
                 flight.displaced = LEAP if wrong else REST
             case _:

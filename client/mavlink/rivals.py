@@ -1,0 +1,100 @@
+"""Second commanders: others on the line that tell our autopilot where to fly.
+
+An autopilot obeys whoever speaks last, and does not say whom. What a router or a radio shows us of
+others is all that can be seen of them here; of those it does not show, `obedience` sees the effect.
+"""
+
+from collections import deque
+
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import SECOND_NS
+
+WINDOW_NS = SECOND_NS
+"""Time within which set-points are counted [ns]."""
+LEAST = 2
+"""Set-points within it that make a second commander: one may be a stray."""
+QUIET_NS = 3 * SECOND_NS
+"""Silence after which it is gone [ns]."""
+STREAMS = frozenset(
+    {
+        "SET_POSITION_TARGET_LOCAL_NED",
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        "SET_ATTITUDE_TARGET",
+        "SET_ACTUATOR_CONTROL_TARGET",
+    }
+)
+"""Set-points, of which a stream is sent."""
+GOTO = frozenset(
+    {
+        int(dialect.MAV_CMD_DO_REPOSITION),
+        int(dialect.MAV_CMD_DO_ORBIT),
+        int(dialect.MAV_CMD_DO_CHANGE_SPEED),
+        int(dialect.MAV_CMD_OVERRIDE_GOTO),
+    }
+)
+"""Commands that lead a vehicle in its present mode, and are sent once. Another mode is seen in its
+heartbeats."""
+GUIDED_ITEM = (2, 3)
+"""Values of `current` of a mission's item that is flown to at once, or sets an altitude."""
+STICK = 50
+"""Deflection of a stick that counts, of 1000, or of 500 µs."""
+CENTRE_US = 1500
+UNUSED_US = (0, 65535)
+"""Pulse widths of a channel that is not overridden [µs]."""
+
+
+class Rivals:
+    """Others that command our autopilot, as far as the line shows them."""
+
+    def __init__(self) -> None:
+        self._times_ns: deque[int] = deque(maxlen=LEAST)
+        self._active_ns: int | None = None
+        """Time of the newest set-point of a second commander; None without one."""
+        self.newest: tuple[int, int, str] = (0, 0, "")
+        """Numbers of its system and component, and the kind of its newest message."""
+
+    def hear(self, message: Message, system: int, *, now_ns: int) -> None:
+        """Take a message of somebody else.
+
+        Args:
+            message: what came.
+            system: number of our autopilot's system.
+            now_ns: time now.
+        """
+        weight = _weight(message, system)
+        for _ in range(weight):
+            self._times_ns.append(now_ns)
+        if weight and len(self._times_ns) == LEAST and now_ns - self._times_ns[0] <= WINDOW_NS:
+            self._active_ns = now_ns
+            sender = message.get_srcSystem(), message.get_srcComponent()
+            self.newest = *sender, message.get_type()
+
+    def are_there(self, *, now_ns: int) -> bool:
+        """Whether there is a second commander now."""
+        return self._active_ns is not None and now_ns - self._active_ns <= QUIET_NS
+
+
+def _weight(message: Message, system: int) -> int:
+    """Number of set-points that a message counts for."""
+    kind = message.get_type()
+    named = message.target if kind == "MANUAL_CONTROL" else getattr(message, "target_system", None)
+    if named not in (0, system):
+        return 0
+    match kind:
+        case "MANUAL_CONTROL":
+            return int(max(abs(message.x), abs(message.y), abs(message.r)) > STICK)
+        case "RC_CHANNELS_OVERRIDE":
+            sticks = (message.chan1_raw, message.chan2_raw, message.chan4_raw)
+            return int(any(_is_moved(pulse_us) for pulse_us in sticks))
+        case "COMMAND_LONG" | "COMMAND_INT":
+            return LEAST if message.command in GOTO else 0
+        case "MISSION_ITEM" | "MISSION_ITEM_INT":
+            return LEAST if message.current in GUIDED_ITEM else 0
+        case _:
+            return int(kind in STREAMS)
+
+
+def _is_moved(pulse_us: int) -> bool:
+    """Whether a channel is overridden with a stick that is not centred."""
+    return pulse_us not in UNUSED_US and abs(pulse_us - CENTRE_US) > STICK

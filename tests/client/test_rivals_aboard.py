@@ -1,0 +1,205 @@
+"""Second commanders of an autopilot: seen on the line, or by what the vehicle does."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from airborne import Air
+from skytether.autopilot.faults import COMMANDED
+from skytether.autopilot.flavours import FlavourName
+from skytether.lab.benchmarks.autopilots import MODELS
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.core.aboard import SecondCommander, Strays
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+SECOND = 1_000_000_000
+FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0]}
+STATION = Codec(255, 190)
+SLOW = {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [2.0]}
+
+
+def flying(flavour: FlavourName = "ardupilot", **table: Any) -> Air:
+    """A vehicle that has followed its plan for some seconds."""
+    default = {"duration": 60.0, "fence": FENCE, "model": SLOW | MODELS[flavour]}
+    air = Air(flavour, **default | table)
+    air.fly()
+    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
+    air.run(5.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    return air
+
+
+def modes(air: Air) -> list[tuple[str, str]]:
+    """Modes of the failsafe and their reasons."""
+    return [(each.after, each.reason) for each in air.of(ModeChanged)]
+
+
+def velocity(target: int = 1) -> Message:
+    """Set-point of somebody else."""
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        1, target, 1, 1, 0b110111000111, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0
+    )
+
+
+def sticks(x: int) -> Message:
+    """Sticks of a ground station, of which one is moved."""
+    return dialect.MAVLink_manual_control_message(1, x, 0, 500, 0, 0)
+
+
+def channels(roll_us: int) -> Message:
+    """Channels that a ground station overrides."""
+    return dialect.MAVLink_rc_channels_override_message(1, 1, roll_us, 1500, 0, 1500, 0, 0, 0, 0)
+
+
+def goto() -> Message:
+    """Command to fly to a place."""
+    return dialect.MAVLink_command_long_message(1, 1, 192, 0, -1.0, 0, 0, 0, 0, 0, 0)
+
+
+def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> None:
+    """Let somebody else say something on the line, again and again."""
+    for _ in range(round(seconds / every_s)):
+        air.tap.extra.append(STATION.encode(message))
+        air.run(every_s)
+
+
+# By what the vehicle does
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
+    flavour: FlavourName,
+) -> None:
+    """At 50 Hz he has the vehicle; it brakes in vain, and lands in a mode that does not obey."""
+    air = flying(flavour)
+    began, began_ns = np.array(air.flight.position()), air.world.now_ns
+    air.autopilot.script._commands = True
+    noticed_s = air.run(5.0, lambda: bool(air.of(Strays)))
+    assert noticed_s < 2.0
+    assert modes(air)[-1] == ("brake", str(Reason.STRAYED))
+    air.run(20.0, lambda: air.client._failsafe.mode is Mode.LAND)
+    assert (air.world.now_ns - began_ns) / SECOND < 4.5
+    assert modes(air)[-1] == ("land", str(Reason.STRAYED))
+    air.run(30.0, lambda: not air.flight.armed)
+    assert not air.flight.armed
+    assert np.linalg.norm(np.array(air.flight.position())[:2] - began[:2]) < 12.0
+
+
+WEATHER: dict[str, dict[str, Any]] = {
+    "calm": {},
+    "wind": {"steady_wind_mps": [6.0, -3.0, 0.0]},
+    "turbulence": {"steady_wind_mps": [4.0, 0.0, 0.0], "turbulence_mps": 8.0},
+}
+
+
+def unlike(flavour: FlavourName, slower: float, stronger: float) -> dict[str, Any]:
+    """Model of a vehicle that is unlike it."""
+    model = {"axes": 3, "tau_s": [0.5], "gain": 1.0, "u_max": [3.0]} | MODELS[flavour]
+    gain = model["gain"] if isinstance(model["gain"], list) else [model["gain"]] * 3
+    return model | {
+        "tau_s": [slower * each for each in model["tau_s"]],
+        "gain": [stronger * each for each in gain],
+    }
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("flavour", BOTH)
+@pytest.mark.parametrize("weather", WEATHER)
+@pytest.mark.parametrize("wrong", [(1.0, 1.0), (1.3, 0.8), (0.7, 1.2)])
+def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
+    flavour: FlavourName, weather: str, wrong: tuple[float, float]
+) -> None:
+    """Full speed from side to side, with the link cut for a while: nothing is noticed."""
+    air = Air(
+        flavour,
+        duration=60.0,
+        model=unlike(flavour, *wrong),
+        vehicle=WEATHER[weather],
+        reference={"period_s": 15.0},
+    )
+    air.fly(90.0)
+    air.run(16.0)
+    air.tap.deaf = False
+    air.world.stop("server")
+    air.run(8.0)
+    assert not air.of(Strays)
+    assert str(Reason.STRAYED) not in [why for _, why in modes(air)]
+
+
+# On the line
+
+
+@pytest.mark.parametrize("message", [velocity(), sticks(400), channels(1700)])
+def test_set_points_of_others_are_noticed_within_a_second(message: Message) -> None:
+    """Two within a second; it is told who they come from, and the vehicle brakes and lands."""
+    air = flying()
+    say(air, message, 0.5)
+    (told,) = air.of(SecondCommander)
+    assert (told.system, told.component, told.said) == (255, 190, message.get_type())
+    assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
+    say(air, message, 3.0)
+    assert modes(air)[-1] == ("land", str(Reason.RIVAL))
+
+
+def test_a_command_to_go_somewhere_counts_at_once() -> None:
+    """It is sent once, and leads the vehicle away."""
+    air = flying()
+    say(air, goto(), 0.1)
+    assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        velocity(target=2),
+        sticks(0),
+        channels(1500),
+        dialect.MAVLink_param_request_list_message(1, 1),
+    ],
+)
+def test_what_others_say_that_moves_nothing_is_left_to_them(message: Message) -> None:
+    """Another vehicle's set-points, sticks at rest, and questions."""
+    air = flying()
+    say(air, message, 2.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+    assert not air.of(SecondCommander)
+
+
+def test_one_stray_set_point_is_none() -> None:
+    """Nor are two that are further apart than a second."""
+    air = flying()
+    say(air, velocity(), 2.4, every_s=1.2)
+    assert air.client._failsafe.mode is Mode.TRACK
+
+
+def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
+    """Nothing is sent while he commands; three seconds after his last it hovers, and flies on."""
+    air = flying(mavlink={"second_commander": "yield"})
+    say(air, velocity(), 0.5)
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
+    quiet_ns = air.world.now_ns
+    say(air, velocity(), 3.0)
+    assert not air.setpoints(quiet_ns)
+    air.run(3.5)
+    assert ("hover", str(Reason.RETURNED)) in modes(air)
+    air.run(3.0)
+    assert air.client._failsafe.mode is Mode.TRACK
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away(flavour: FlavourName) -> None:
+    """The line shows nobody: the vehicle moves, though it was told to stand."""
+    air = flying(flavour, mavlink={"second_commander": "yield"})
+    air.autopilot.script._commands = True
+    air.run(3.0, lambda: bool(air.of(Strays)))
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
+    air.run(0.3)
+    quiet_ns = air.world.now_ns
+    air.run(2.0)
+    assert not air.setpoints(quiet_ns)
+    assert air.flight.velocity()[0] == pytest.approx(COMMANDED[0], abs=1.0)
