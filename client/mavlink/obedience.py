@@ -9,7 +9,7 @@ its dead time θ says. Whatever is further outside than
 
     1 m/s + fence.wind_mps
 
-over all axes, for 0.3 s, is no wind and no error of the model: somebody else commands the
+over all axes, for 0.1 s, is no wind and no error of the model: somebody else commands the
 autopilot, or it has failed. `python -m pytest tests/client/test_rivals_aboard.py` flies both
 autopilots in wind and turbulence, with models wrong by 30 % and 20 %: none is taken for that.
 """
@@ -29,7 +29,7 @@ SLOW_MPS2 = 1.0
 """Acceleration of the slowest vehicle [m/s²]."""
 MARGIN_MPS = 1.0
 """Difference of velocity that is allowed in calm air [m/s]."""
-NOTICED_NS = 300 * MILLISECOND_NS
+NOTICED_NS = 100 * MILLISECOND_NS
 """Time for which it has to be larger [ns]."""
 QUIET_NS = SECOND_NS
 """Time without, after which it obeys again [ns]."""

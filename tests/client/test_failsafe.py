@@ -798,7 +798,7 @@ def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 
 
-@pytest.mark.parametrize("cause", [Reason.BATTERY, Reason.ASTRAY])
+@pytest.mark.parametrize("cause", [Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED])
 def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -973,6 +973,12 @@ ROWS: dict[Reason, Callable[[], None]] = {
     ),
     Reason.ASTRAY: hindrance_test(
         test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.ASTRAY
+    ),
+    Reason.RIVAL: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.RIVAL
+    ),
+    Reason.STRAYED: hindrance_test(
+        test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.STRAYED
     ),
     Reason.MUTE: hindrance_test(test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it),
 }

@@ -24,6 +24,8 @@ from skytether.shared.core.aboard import (
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
+    SecondCommander,
+    Strays,
 )
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.core.events import (
@@ -220,6 +222,17 @@ SENTENCES = [
         (
             "vehicle 1: its velocity has leapt: choose vehicle.after_leap: 'old' (the leap is "
             "subtracted, the fence stays), 'new' (it counts, the fence moves with it) or 'stay'"
+        ),
+    ),
+    (
+        SecondCommander(vehicle=1, system=255, component=190, said="SET_ATTITUDE_TARGET"),
+        "vehicle 1: system 255, component 190 commands its autopilot as well: SET_ATTITUDE_TARGET",
+    ),
+    (
+        Strays(vehicle=1, off_mps=2.34),
+        (
+            "vehicle 1 flies 2.3 m/s otherwise than it is told: somebody else commands it, or its "
+            "autopilot fails"
         ),
     ),
     (
