@@ -41,6 +41,7 @@ from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.journal import take_up
 from skytether.shell.log import LogFormat
 from skytether.shell.memory import MemoryFile, folder
 from skytether.shell.options import Argument
@@ -83,8 +84,8 @@ class ClientOptions:
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     new_flight: bool = False
-    """Begin a new flight: what an earlier run has kept in `vehicle.memory` does not count. A person
-    says so; the command of a service must not."""
+    """Begin a new flight: what an earlier run has kept in `vehicle.memory`, and what was set in
+    flight, does not count. A person says so; the command of a service must not."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
     plugin: command.Plugins = ()
@@ -99,7 +100,8 @@ def fly(argv: Sequence[str]) -> None:
     server flies another scenario, is full, or has another client under this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
-    scenario, server = options.config, command.address("--server", options.server)
+    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
+    scenario, server = taken_up.scenario, command.address("--server", options.server)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -117,7 +119,7 @@ def fly(argv: Sequence[str]) -> None:
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
-    warnings = command.flight_warnings(scenario)
+    warnings = command.flight_warnings(scenario) + taken_up.news
     columns = client_columns(scenario.model.axes)
     with (
         _memory(options, flying, keyring) as memory,
@@ -171,6 +173,7 @@ def fly(argv: Sequence[str]) -> None:
             json=None if alone else options.json,
             recording=recording,
             control=options.control,
+            journal=taken_up.journal,
             feed=feed,
             metrics=command.optional_address("--metrics", options.metrics),
             line=line,

@@ -22,6 +22,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command, process
 from skytether.shell.command import ScenarioFlags, ScenarioName
+from skytether.shell.journal import take_up
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
 from skytether.shell.udp import files_max, leads_back, sockets_max
@@ -61,6 +62,9 @@ class NetemOptions:
     """File for what was counted, and the CPU time it took."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    new_flight: bool = False
+    """Begin a new flight: what was set in flight in an earlier run, and lies beside the socket of
+    --control, does not count. A person says so; the command of a service must not."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     metrics: str | None = None
@@ -90,12 +94,13 @@ def emulate(argv: Sequence[str]) -> None:
     bind = command.address("--bind", options.bind)
     _check_server(server, bind)
     part = process.part_of(options.record)
+    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
     with (
         process.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
         process.fed(options.feed, options.record, "netem", options, secure=False) as feed,
     ):
         recorder = process.recorder("netem", PACKET_COLUMNS, recording, feed)
-        endpoint = Proxy(options.config, server=server, flows=flows, recorder=recorder)
+        endpoint = Proxy(taken_up.scenario, server=server, flows=flows, recorder=recorder)
         process.drive(
             "netem",
             endpoint,
@@ -108,8 +113,10 @@ def emulate(argv: Sequence[str]) -> None:
             json=options.json,
             recording=recording,
             control=options.control,
+            journal=taken_up.journal,
             feed=feed,
             metrics=command.optional_address("--metrics", options.metrics),
+            warnings=taken_up.news,
         )
 
 

@@ -29,6 +29,7 @@ from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal, workers
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.journal import take_up
 from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
 from skytether.shell.udp import AddressError
@@ -63,6 +64,9 @@ class ServerOptions:
     """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    new_flight: bool = False
+    """Begin a new flight: what was set in flight in an earlier run, and lies beside the socket of
+    --control, does not count. A person says so; the command of a service must not."""
     feed: Path | None = None
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     metrics: str | None = None
@@ -135,8 +139,10 @@ def _work(
         from skytether.server.secure import FORMS, SecureGate  # its ciphers take 30 ms, and 9 MB
 
         gate, forms = SecureGate(keyring, entropy=secrets.token_bytes), FORMS
-    axes, planned = options.config.model.axes, options.config.control.horizon
-    record, columns = own(options.record), server_columns(axes, options.config.control.scheme)
+    taken_up = take_up(own(options.control), options.config, new_flight=options.new_flight)
+    scenario = taken_up.scenario
+    axes, planned = scenario.model.axes, scenario.control.horizon
+    record, columns = own(options.record), server_columns(axes, scenario.control.scheme)
     part = process.part_of(record)
     stopwatch = Stopwatch(time.perf_counter_ns)
     with (
@@ -144,7 +150,7 @@ def _work(
         process.fed(own(options.feed), record, "server", options, secure=gate.secure) as feed,
     ):
         endpoint = Server(
-            options.config,
+            scenario,
             boot_id=secrets.randbits(64),
             entropy=secrets.token_bytes,
             gate=gate,
@@ -167,8 +173,9 @@ def _work(
             stopwatch=stopwatch,
             recording=recording,
             control=own(options.control),
+            journal=taken_up.journal,
             feed=feed,
             metrics=metrics,
-            warnings=command.flight_warnings(options.config),
+            warnings=command.flight_warnings(options.config) + taken_up.news,
             ready=lambda: _ready(options.config),
         )

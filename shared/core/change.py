@@ -9,6 +9,7 @@ changes in virtual time.
 """
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ import msgspec
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import Changed, ChangeRefused
+from skytether.shared.core.events import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 
@@ -45,11 +46,19 @@ class Running:
     Args:
         endpoint: what flies it.
         scenario: the scenario that the endpoint was made with.
+        settings: values that were set in an earlier run, which it has.
     """
 
-    def __init__(self, endpoint: Endpoint, scenario: Scenario) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        scenario: Scenario,
+        settings: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
         self._endpoint = endpoint
         self._scenario = scenario
+        self.settings = settings
+        """All values that were set in flight, by key; another object after each change."""
 
     @property
     def scenario(self) -> Scenario:
@@ -85,6 +94,7 @@ class Running:
         # Only now, when the whole scenario was checked: a change is made as a whole, or not at all.
         self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
+        self.settings = {**self.settings, **values}
         changed = tuple(
             Changed(key=key, before=was, after=becomes)
             for key in values
@@ -94,6 +104,10 @@ class Running:
         for event in changed:
             self._endpoint.tell(event)
         return changed
+
+    def tell(self, event: Event) -> None:
+        """Report an event through the endpoint."""
+        self._endpoint.tell(event)
 
     def refuse(self, reason: str) -> None:
         """Report through the endpoint that a change is refused."""
@@ -145,14 +159,30 @@ class Running:
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
             what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
-        laid = reading.to_table(self._scenario)
-        for key, value in values.items():
-            *sections, name = key.split(".")
-            _at(laid, ".".join(sections))[name] = value
+        return with_values(self._scenario, values)
+
+
+def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
+    """A scenario with other values laid over it.
+
+    Args:
+        scenario: with which nothing is wrong.
+        values: plain values by key.
+
+    Raises:
+        ConfigError: there is no such key, or the scenario cannot be flown so.
+    """
+    laid = reading.to_table(scenario)
+    for key, value in values.items():
+        *sections, name = key.split(".")
         try:
-            return reading.check(laid, known=self._scenario)
-        except RecursionError:
-            raise ConfigError("got values that are nested too deeply") from None
+            _at(laid, ".".join(sections))[name] = value
+        except (KeyError, TypeError):
+            raise ConfigError(f"{key[:KEY_SHOWN_MAX]}: no such key") from None
+    try:
+        return reading.check(laid, known=scenario)
+    except RecursionError:
+        raise ConfigError("got values that are nested too deeply") from None
 
 
 _DECODER = msgspec.json.Decoder(dict[str, Any])

@@ -507,6 +507,19 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: what an earlier run kept is not followed: {self.reason}"
 
 
+class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """What was set in flight in an earlier run of the process is in force again."""
+
+    path: str
+    """Journal that has it."""
+    values: dict[str, Any]
+    """Values by key."""
+
+    def __str__(self) -> str:
+        each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
+        return f"in force again from {self.path}, as it was set in flight: {each}"
+
+
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """What the next run of a process must know cannot be written."""
 
@@ -575,5 +588,6 @@ Event = (
     | Recalled
     | NotRecalled
     | NotKept
+    | SettingsRecalled
     | Finished
 )

@@ -244,14 +244,14 @@ def run(
         part = ["--record", str(parts / name)] if recorded else []
         heeds = ["--control", str(control / name)] if control else []
         tells = ["--feed", str(feeds_in(feeds)[name])] if feeds else []
-        told = ["--json", str(parts / f"{name}.json"), *part, *heeds, *tells]
+        # Whoever says `fly` begins a new flight.
+        told = ["--json", str(parts / f"{name}.json"), "--new-flight", *part, *heeds, *tells]
         return [name, str(file), *told, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
     netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
-    # Whoever says `fly` begins a new flight.
-    client = [*common("client", recorded=True), *fleet, *keys, "--new-flight"]
+    client = [*common("client", recorded=True), *fleet, *keys]
     client += ["--set-parameters"] * set_parameters
 
     def hear(line: LogLine) -> None:

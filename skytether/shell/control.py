@@ -8,6 +8,7 @@ that cannot be delivered is dropped.
 import asyncio
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -17,6 +18,8 @@ from typing import Any
 import msgspec
 
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.core.events import NotKept
+from skytether.shell.journal import Journal
 from skytether.shell.local import Local
 
 REST_S = 0.01
@@ -40,13 +43,14 @@ class Control:
     Args:
         path: path of the socket, mode 0600; a socket that no process listens at is replaced.
         running: the endpoint's keys that may change.
+        journal: where what is set is kept for the next run of the process.
 
     Raises:
         LocalError: the socket cannot be made there.
     """
 
-    def __init__(self, path: Path, running: Running) -> None:
-        self._running = running
+    def __init__(self, path: Path, running: Running, journal: Journal | None = None) -> None:
+        self._running, self._journal = running, journal
         self._local = Local(path, socket.SOCK_DGRAM)
         self._socket = self._local.socket
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -69,18 +73,52 @@ class Control:
     def _read(self) -> None:
         assert self._loop is not None
         self._loop.remove_reader(self._socket)
-        began_s = time.monotonic()
+        began_s, is_writing = time.monotonic(), False
         try:
             request, sender = self._socket.recvfrom(REQUEST_BYTES_MAX + 1)
+            before = self._running.settings
             answer = self._running.answer(request, now_ns=time.monotonic_ns())
-            if sender:
-                self._socket.sendto(answer, sender)
-        except OSError:  # no datagram after all, or the sender's socket is full or gone
+            is_writing = self._journal is not None and self._running.settings is not before
+            if is_writing:
+                # The endpoint goes on meanwhile, however slow the disk is.
+                threading.Thread(target=self._keep, args=(answer, sender), daemon=True).start()
+            else:
+                self._answer(answer, sender)
+        except OSError:  # no datagram after all
             pass
         finally:
-            rest_s = max(REST_S, RESTS * (time.monotonic() - began_s))
-            self._loop.call_later(rest_s, self._listen)
+            if not is_writing:
+                rest_s = max(REST_S, RESTS * (time.monotonic() - began_s))
+                self._loop.call_later(rest_s, self._listen)
             self._after()
+
+    def _keep(self, answer: bytes, sender: Any) -> None:
+        """Write what was set, and acknowledge it then; in a thread."""
+        assert self._journal is not None
+        fault = ""
+        try:
+            self._journal.write(self._running.settings)
+        except OSError as error:
+            fault = str(error.strerror or error)
+            said = f"it is in force, and forgotten when the process restarts: {fault}"
+            answer = msgspec.json.encode(Answer(refused=said))
+        self._answer(answer, sender)
+        if loop := self._loop:
+            with suppress(RuntimeError):  # it has closed meanwhile
+                loop.call_soon_threadsafe(self._go_on, fault)
+
+    def _go_on(self, fault: str) -> None:
+        """Go on after what was set is kept, or could not be."""
+        if fault:
+            self._running.tell(NotKept(reason=fault))
+        if self._loop is not None:
+            self._loop.call_later(REST_S, self._listen)
+        self._after()
+
+    def _answer(self, answer: bytes, sender: Any) -> None:
+        if sender:
+            with suppress(OSError):  # the sender's socket is full or gone
+                self._socket.sendto(answer, sender)
 
     def end(self) -> None:
         """Answer no more requests."""
@@ -181,7 +219,9 @@ def answer_of(text: bytes) -> Answer:
 
 
 @contextmanager
-def controlled(path: Path | None, running: Running) -> Iterator[Control | None]:
+def controlled(
+    path: Path | None, running: Running, journal: Journal | None = None
+) -> Iterator[Control | None]:
     """Control socket at a path for as long as the block takes; None without a path.
 
     Raises:
@@ -190,7 +230,7 @@ def controlled(path: Path | None, running: Running) -> Iterator[Control | None]:
     if path is None:
         yield None
         return
-    control = Control(path, running)
+    control = Control(path, running, journal)
     try:
         yield control
     finally:

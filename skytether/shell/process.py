@@ -33,6 +33,7 @@ from skytether.shell.command import CONFIGURATION, CommandError, Options, unseal
 from skytether.shell.control import controlled
 from skytether.shell.driver import Shell, run
 from skytether.shell.feed import Feed
+from skytether.shell.journal import Journal
 from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
@@ -102,6 +103,7 @@ def drive(
     stopwatch: Stopwatch | None = None,
     recording: RecordFile | None = None,
     control: Path | None = None,
+    journal: Journal | None = None,
     feed: Feed | None = None,
     metrics: Address | None = None,
     line: Line | None = None,
@@ -124,6 +126,7 @@ def drive(
         json: file for its last figures.
         recording: its recorder, which is waited for at the end.
         control: path of the socket for changes in flight.
+        journal: what was set in flight in an earlier run, and will be in this one.
         feed: feed of its rows and events.
         metrics: HTTP address for its figures.
         warnings: warnings for the operator about the scenario.
@@ -132,13 +135,13 @@ def drive(
     Raises:
         CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
     """
-    running = Running(endpoint, options.config)
+    running = journal.running(endpoint) if journal else Running(endpoint, options.config)
     if feed:
         feed.open(opened(process, options.scenario, running, feed))
     with ExitStack() as stack:
         served = stack.enter_context(_served(metrics, process, options))
         try:
-            heeds = stack.enter_context(controlled(control, running))
+            heeds = stack.enter_context(controlled(control, running, journal))
             shell = Shell(
                 endpoint,
                 bind,

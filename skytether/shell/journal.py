@@ -1,0 +1,174 @@
+"""Journal of what an operator has set in flight, beside the control socket of its process.
+
+What is set by `skytether set` or on the page outlives the process: zones, goals, whether a vehicle
+is armed. It is written before it is acknowledged, and read when the process starts again. A journal
+that is damaged, of another scenario or of another day is refused, and the process does not begin: a
+server that has lost a zone must not plan.
+"""
+
+import os
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from skytether.shared.base import files
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.change import Running, with_values
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.core.events import Event, SettingsRecalled
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell.command import CONFIGURATION, CommandError
+
+SUFFIX = ".set"
+"""Ending of a journal's name, behind that of the socket."""
+BYTES_MAX = 1_000_000
+"""Largest size of a journal [B]."""
+DAY_S = 86_400.0
+"""Age above which a journal counts as one of another flight [s]."""
+
+
+class _Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """What a journal holds."""
+
+    scenario: str
+    """Digest of the scenario that the process was started with."""
+    time_s: float
+    """Time at which something was set last [s; Unix time]."""
+    values: dict[str, Any]
+    """Values that were set, by key."""
+    digest: str = ""
+    """Digest of the others."""
+
+    def sealed(self) -> "_Entry":
+        """The same with the digest that belongs to it."""
+        bare = msgspec.structs.replace(self, digest="")
+        return msgspec.structs.replace(self, digest=_digest(msgspec.json.encode(bare)))
+
+
+class Journal:
+    """Journal of one process.
+
+    Args:
+        path: path of it.
+        scenario: scenario that the process is started with.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario) -> None:
+        self._path, self._base = path, scenario
+        self._name = _digest(reading.to_toml(scenario))
+        self.values: Mapping[str, Any] = {}
+        """Values that were set in an earlier run."""
+        self.scenario = scenario
+        """The scenario with these."""
+
+    def read(self) -> SettingsRecalled | None:
+        """Take up what was set in an earlier run; None where there is nothing.
+
+        Raises:
+            CommandError: there is a journal that cannot be followed.
+        """
+        try:
+            held = files.read(self._path, BYTES_MAX, private=True)
+            entry = msgspec.json.decode(held, type=_Entry)
+            self._check(entry)
+            self.scenario, self.values = with_values(self._base, entry.values), entry.values
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise self._refused(str(error.strerror or error)) from None
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            raise self._refused("it is damaged") from None
+        except ConfigError as error:
+            raise self._refused(str(error)) from None
+        return SettingsRecalled(path=str(self._path), values=dict(entry.values))
+
+    def running(self, endpoint: Endpoint) -> Running:
+        """Keys that an endpoint flies with, which was made with the scenario of this journal."""
+        return Running(endpoint, self.scenario, self.values)
+
+    def _check(self, entry: _Entry) -> None:
+        """Refuse an entry that is not of this flight.
+
+        Raises:
+            ConfigError: with the reason.
+        """
+        if entry != entry.sealed():
+            raise ConfigError("it is damaged")
+        if entry.scenario != self._name:
+            raise ConfigError("it was set while another scenario was flown")
+        age_s = time.time() - entry.time_s
+        if not -DAY_S < age_s < DAY_S:
+            raise ConfigError(f"it was set {abs(age_s) / DAY_S:.1f} days ago")
+
+    def _refused(self, why: str) -> CommandError:
+        said = f"{self._path}: what was set in flight cannot be taken up: {why}"
+        return CommandError(f"{said}; --new-flight begins without it", CONFIGURATION)
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Write all that was set so far; returns when it is on the disk.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        entry = _Entry(scenario=self._name, time_s=time.time(), values=dict(values)).sealed()
+        beside = self._path.with_name(self._path.name + ".new")
+        with suppress(FileNotFoundError):
+            beside.unlink()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        with os.fdopen(os.open(beside, flags, 0o600), "wb") as file:
+            file.write(msgspec.json.encode(entry))
+            file.flush()
+            os.fsync(file.fileno())
+        beside.rename(self._path)
+
+    def forget(self) -> None:
+        """Remove it: a person begins a new flight.
+
+        Raises:
+            CommandError: it cannot be removed.
+        """
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            said = f"{self._path}: cannot be removed: {error.strerror or error}"
+            raise CommandError(said, CONFIGURATION) from None
+
+
+class TakenUp(NamedTuple):
+    """Scenario of a process that begins, with what was set in an earlier run."""
+
+    journal: Journal | None
+    """Journal of what will be set; None without a control socket."""
+    scenario: Scenario
+    news: list[Event]
+    """News for the operator about what is in force again."""
+
+
+def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
+    """Take up what was set in an earlier run, from the journal beside a control socket.
+
+    Args:
+        control: path of the socket; None without one.
+        scenario: scenario that the process is started with.
+        new_flight: whether what was set before does not count.
+
+    Raises:
+        CommandError: there is a journal that cannot be followed.
+    """
+    if control is None:
+        return TakenUp(None, scenario, [])
+    journal = Journal(control.with_name(control.name + SUFFIX), scenario)
+    if new_flight:
+        journal.forget()
+    recalled = journal.read()
+    return TakenUp(journal, journal.scenario, [recalled] if recalled else [])
+
+
+def _digest(content: bytes) -> str:
+    return blake2b(content, digest_size=16).hexdigest()
