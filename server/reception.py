@@ -15,6 +15,7 @@ from skytether.server.tick import Grid
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
+    BegunAnew,
     Event,
     NumberTaken,
     ServerFull,
@@ -157,6 +158,9 @@ class Reception:
         self._tell_ns = now_ns + TELL_NS
 
     def _hello(self, hello: Hello, call: Call, address: Address, now_ns: int) -> None:
+        row = self._sessions.row_of_other_life(hello)
+        if row is not None and self._controller.restart(row):
+            self._events.append(BegunAnew(vehicle=hello.vehicle))
         refusal, number = self._refusal(hello, address, now_ns), 0
         if refusal is Refusal.ACCEPTED:
             number = self._sessions.welcome(hello, address, call.line, now_ns).number

@@ -161,6 +161,13 @@ class Sessions:
             return None
         return welcomed if _is_expected(welcomed, now_ns) else None
 
+    def row_of_other_life(self, hello: Hello) -> int | None:
+        """Row of the vehicle that says HELLO, where it is that of another life of its client."""
+        live = self._live.get(hello.vehicle)
+        if live is None:
+            return self._kept.get(hello.vehicle)
+        return None if live.boot_id == hello.boot_id else live.row
+
     def is_full(self, hello: Hello, now_ns: int) -> bool:
         """Whether there is no room for the vehicle that says HELLO."""
         known = self._has_row(hello.vehicle) or hello.vehicle in self.coming

@@ -221,6 +221,12 @@ class Controller:
         """Distance by which a vehicle of a mission may be elsewhere for want of its clock [m]."""
         return self._together.clock_m(row) if self._together else None
 
+    def restart(self, row: int) -> bool:
+        """Take note that the client of a vehicle on a mission has begun anew; whether that is
+        news.
+        """
+        return self._together is not None and self._together.restart(row)
+
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""
         self.last_step[row] = self._sent_step[row] = -1

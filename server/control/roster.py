@@ -24,6 +24,8 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
+ANEW = 20
+"""Steps after a client has begun anew up to which an observation may be of its earlier life."""
 DECIDES, REPEATS = 1, 2
 """Flags in `Roster.looks`: a motion may be planned for the vehicle at this step; its last one is
 sent once more."""
@@ -129,6 +131,9 @@ class Roster:
         from these, or their place on the grid."""
         self.decided: set[int] = set()
         """Rows of the vehicles that have a motion to be sent at their newest step."""
+        self.restarted: dict[int, int] = {}
+        """Step at which the client of a vehicle has begun anew without what it kept, by row: until
+        it is observed, the vehicle may stand anywhere on its motions."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None of none."""
 
@@ -139,6 +144,16 @@ class Roster:
         if row in self.known:
             # Another life of the vehicle counts steps of its own.
             self.known[row].goal = None
+
+    def restart(self, row: int) -> bool:
+        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        known = self.known.get(row)
+        if known is None or row in self.restarted:
+            return False
+        self.restarted[row] = self.now + self.ahead(row)
+        known.off_m = max(known.off_m, self._stopping_m(known))
+        self._changed.add(row)
+        return True
 
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of the grid in common."""
@@ -174,6 +189,9 @@ class Roster:
         if observation.step <= self.observed_step[row]:
             return False
         k = observation.step
+        # One that was made before the client began anew says nothing of where it stands.
+        if k > self.restarted.get(row, k) + ANEW or not self.rows.heard[row]:
+            self.restarted.pop(row, None)
         self.observed_step[row] = k
         self.state[row] = observation.state
         known = self.known.setdefault(row, Known())
@@ -230,7 +248,7 @@ class Roster:
         off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
         known.speed_mps = float(np.linalg.norm(state[:, 1]))
         if known.in_force.step < 0:  # it brakes, and rests further on than where it was seen
-            off_m = max(off_m, known.speed_mps * (self._tau_s + known.speed_mps / self._braking))
+            off_m = max(off_m, self._stopping_m(known))
         elif off_m <= 0.0:
             self.absent.discard(number)
         elif number not in self.absent:
@@ -238,6 +256,10 @@ class Roster:
             if not known.off_m:
                 self.left.append((number, off_m))
         known.off_m = 0.0 if number in self.absent else max(off_m, 0.0)
+
+    def _stopping_m(self, known: Known) -> float:
+        """Distance in which a vehicle that brakes comes to rest [m]."""
+        return known.speed_mps * (self._tau_s + known.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
         """Resting place of a vehicle without a motion: where it begins its mission, or is."""
@@ -255,6 +277,8 @@ class Roster:
         # Of all rows, for others keep apart from those that are silent too.
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
+        for row in self.restarted:
+            self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
         if moved:
             self._changed.update(rows[self._found[:n] != 0].tolist())
         if self.decided:

@@ -128,6 +128,10 @@ class Together:
         """See `Scheme`."""
         self._roster.forget(row)
 
+    def restart(self, row: int) -> bool:
+        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        return self._roster.restart(row)
+
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
         return self._roster.observe(row, observation)
@@ -250,7 +254,9 @@ class Together:
             straight: takes the vehicles that may fly straight, to be planned for together.
         """
         known.waits = ""
-        if self._plans(known, k):
+        if row in self._roster.restarted:
+            known.waits = "its client, which has begun anew"
+        elif self._plans(known, k):
             self._fly_on(row, known, k, straight)
 
     def _plans(self, known: Known, k: int) -> bool:

@@ -301,6 +301,16 @@ class ServerFull(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} from {address} is refused: {full}"
 
 
+class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
+    """The client of a vehicle on a mission has begun anew, and does not go on with its motion."""
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: its client has begun anew without its motion; until it is "
+            "heard, others keep away from all of that"
+        )
+
+
 class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
     """The server has refused a vehicle whose number is that of another one, which it hears."""
 
@@ -570,6 +580,7 @@ Event = (
     | SessionEnded
     | SessionRefused
     | ServerFull
+    | BegunAnew
     | NumberTaken
     | NoSession
     | NoAnswer
