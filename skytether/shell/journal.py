@@ -34,7 +34,7 @@ DAY_S = 86_400.0
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """What a journal holds."""
+    """Content of a journal."""
 
     scenario: str
     """Digest of the scenario that the process was started with."""
@@ -46,7 +46,7 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True):
     """Digest of the others."""
 
     def sealed(self) -> "_Entry":
-        """The same with the digest that belongs to it."""
+        """Copy with the digest that belongs to it."""
         bare = msgspec.structs.replace(self, digest="")
         return msgspec.structs.replace(self, digest=_digest(msgspec.json.encode(bare)))
 

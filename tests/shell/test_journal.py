@@ -75,7 +75,7 @@ def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> N
 
 
 def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path) -> None:
-    """And goes on with what is set then."""
+    """Later settings are added to it."""
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
     _, scenario, news = begun(tmp_path)
     assert scenario.network.uplink.loss == 0.25
