@@ -19,12 +19,16 @@ from skytether.shared.base.hint import hint
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 
 REQUEST_BYTES_MAX = 4096
 """Largest size of a request [B]."""
 WHOLE = "impairments"
 """Key that says all of a direction of the network: the direction itself stands for it."""
+ONCE = keys_of(InFlight.LEAP)
+"""Keys with which something is decided once: no later run of the process takes them up."""
 KEY_SHOWN_MAX = 60
 """Largest number of characters that a message repeats of a key that there is not."""
 
@@ -94,7 +98,9 @@ class Running:
         # Only now, when the whole scenario was checked: a change is made as a whole, or not at all.
         self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
-        self.settings = {**self.settings, **values}
+        lasting = {key: value for key, value in values.items() if key not in ONCE}
+        if lasting:
+            self.settings = {**self.settings, **lasting}
         changed = tuple(
             Changed(key=key, before=was, after=becomes)
             for key in values

@@ -15,12 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.shared.core.aboard import (
+    ArmingAwaited,
     AutopilotFound,
     AutopilotMode,
     AutopilotParameter,
     AutopilotRefused,
     AutopilotText,
     NotTakenOff,
+    OriginAwaited,
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
@@ -30,6 +32,7 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.core.events import (
     AutopilotSaid,
+    BegunAnew,
     BrowserRefused,
     Changed,
     ChangeRefused,
@@ -51,12 +54,15 @@ from skytether.shared.core.events import (
     NoFailsafe,
     NoSession,
     NotFlown,
+    NotKept,
+    NotRecalled,
     NumberTaken,
     Omitted,
     PageServed,
     Plaintext,
     PlanningResumed,
     PlanningStopped,
+    Recalled,
     RecordIncomplete,
     ReferenceTooFast,
     Returned,
@@ -64,6 +70,7 @@ from skytether.shared.core.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    SettingsRecalled,
     StateDoubted,
     StateLeapt,
     Unanswered,
@@ -162,6 +169,45 @@ SENTENCES = [
     (
         ServerFull(vehicle=3, host="192.0.2.1", port=5, room=64),
         ("vehicle 3 from 192.0.2.1:5 is refused: the server is full (room for 64); see --vehicles"),
+    ),
+    (
+        BegunAnew(vehicle=3),
+        (
+            "vehicle 3: its client has begun anew without its motion; until it is heard, others "
+            "keep away from all of that"
+        ),
+    ),
+    (Recalled(vehicle=1, goes_on=True), "vehicle 1 goes on with the flight of an earlier run"),
+    (
+        Recalled(vehicle=1, goes_on=False),
+        "vehicle 1: the flight of an earlier run is too long ago to go on",
+    ),
+    (
+        NotRecalled(vehicle=1, reason="it is damaged"),
+        "vehicle 1: what an earlier run kept is not followed: it is damaged",
+    ),
+    (
+        NotKept(reason="disk full"),
+        "what the next run of this process must know cannot be kept: disk full",
+    ),
+    (
+        SettingsRecalled(path="s.set", values={"armed": True}),
+        "in force again from s.set, as it was set in flight: armed = True",
+    ),
+    (
+        ArmingAwaited(vehicle=1, why="it was armed by somebody else"),
+        (
+            "vehicle 1 is not armed: it was armed by somebody else; arm it anew: "
+            "skytether set SOCKET armed=true, or on the page"
+        ),
+    ),
+    (
+        OriginAwaited(vehicle=1, place=(20.0, -12.0, 3.0)),
+        (
+            "vehicle 1 hovers at [20.00, -12.00, 3.00] of its autopilot's local frame (north, "
+            "east, up), and its origin is not known; say where its origin lies there: "
+            "skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        ),
     ),
     (
         NumberTaken(vehicle=3, host="192.0.2.1", port=5, holder="[::1]:6"),

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
 from skytether.netem.proxy import Proxy
+from skytether.shared.core.change import Running
 from skytether.shared.core.events import Event, NotKept
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -175,3 +177,12 @@ def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
         "it is in force, and forgotten when the process restarts: No space left on device"
     ]
     assert NotKept(reason="No space left on device") in events
+
+
+def test_what_is_decided_once_is_not_decided_again_by_the_next_run() -> None:
+    """A choice after a leap belongs to that leap."""
+    endpoint = mock.Mock(changeable=frozenset({"vehicle.after_leap", "armed"}))
+    endpoint.objection.return_value = ""
+    running = Running(endpoint, DEMO)
+    running.change({"vehicle.after_leap": "old", "armed": False}, now_ns=0)
+    assert running.settings == {"armed": False}
