@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from heapq import heappop, heappush
-from itertools import combinations, product
+from itertools import combinations
 from typing import Annotated, NamedTuple
 
 import msgspec
@@ -107,6 +107,8 @@ AMOUNTS = {
     Kind.COPIES: ((0.0, 1.5),),
 }
 """Least and greatest of each amount of a kind; places are anywhere on the mission."""
+SLOW = ("uplink", "downlink", "")
+"""Ways in which a vehicle may be slow at first."""
 RADIUS_M = (0.4, 1.5)
 """Least and greatest radius of a zone [m]."""
 
@@ -588,11 +590,14 @@ class Draws:
         rng, moves = self._rng, list[Move]()
         kinds = [kind for kind in self._kinds if kind is not Kind.DELAYS]
         if Kind.DELAYS in self._kinds:
-            high_s = float(rng.uniform(0.0, AMOUNTS[Kind.DELAYS][0][1]))
-            for vehicle, way in product(self._vehicles, ("uplink", "downlink")):
-                if rng.random() < 0.5:
-                    amounts = (high_s, high_s)
-                    moves.append(Move(Kind.DELAYS, vehicle, way, 0, self._last_ns, amounts))
+            # Most vehicles slow in one direction alone: that is what no round trip shows.
+            high_s = float(rng.uniform(*AMOUNTS[Kind.DELAYS][0]))
+            ways = rng.choice(4, len(self._vehicles), p=(0.4, 0.4, 0.1, 0.1))
+            moves += [
+                Move(Kind.DELAYS, vehicle, SLOW[way], 0, self._last_ns, (high_s, high_s))
+                for vehicle, way in zip(self._vehicles, ways.tolist(), strict=True)
+                if way < len(SLOW)
+            ]
         if kinds:
             moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
         return tuple(moves[-self._most :])
