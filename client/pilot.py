@@ -319,7 +319,7 @@ class Pilot:
     def is_held(self) -> bool:
         """Whether the fence holds the vehicle back; it does not where it lands or is not ours."""
         holds = self._fence is not None and self._fence.holds
-        return holds and self._failsafe.mode not in (*STOPPED, Mode.LAND)
+        return holds and self._failsafe.mode not in (*STOPPED, Mode.LAND, Mode.RETURN)
 
     def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
         """Largest speed of what is told [m/s]: without a plan what was flown is braked along.

@@ -16,11 +16,13 @@ STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
     "link cut for 5 s": (["BRAKE", "HOVER", "TRACK"], SILENCE_S, "flies on"),
     "server killed": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),
     "client killed": ([], (0.0, 0.0), "has landed"),
-    "autopilot sends nothing": (["BRAKE", "HOVER"], (0.45, 0.65), "hovers"),
+    "autopilot sends nothing": (["BRAKE", "HOVER", "LAND"], (0.45, 0.65), "has landed"),
     "autopilot sends nothing for 5 s": (["BRAKE", "HOVER", "TRACK"], (0.45, 0.65), "flies on"),
     "pilot takes over": (["MANUAL"], (0.0, 0.3), "pilot has it"),
     "battery low": (["BRAKE", "HOVER", "LAND"], (2.0, 2.6), "has landed"),
     "estimate lost": (["MANUAL"], (0.0, 0.3), "has landed"),
+    "second commander": (["BRAKE", "HOVER", "LAND"], (0.3, 1.6), "has landed"),
+    "position leaps": (["BRAKE", "HOVER", "LAND"], (0.0, 0.2), "has landed"),
 }
 """Modes of the client after each fault, when it goes into the first of them [s], and the end."""
 STANDS_S: dict[FlavourName, float] = {"ardupilot": 4.0, "px4": 10.0}

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from skytether.figures.colours import MODE_COLOURS
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import ModeChanged
 from skytether.shared.scenario import reading
@@ -429,3 +430,8 @@ def test_netem_alone_is_a_network_and_no_flight() -> None:
     for plot in plots.of_link():
         look = plots.Look(state, demo().state.vehicles[1].curves(plots.POINTS), now_ns)
         assert {len(line.values(look)) for line in plot.lines} == {len(plot.grid(look))}
+
+
+def test_every_mode_has_a_colour() -> None:
+    """A pilot who takes over, and a return, are shown as any other mode."""
+    assert set(MODE_COLOURS) == set(Mode)

@@ -63,6 +63,8 @@ CaseName = Literal[
     "pilot takes over",
     "battery low",
     "estimate lost",
+    "second commander",
+    "position leaps",
 ]
 SCRIPTED: dict[CaseName, FaultName] = {
     "autopilot sends nothing": "silence",
@@ -70,6 +72,8 @@ SCRIPTED: dict[CaseName, FaultName] = {
     "pilot takes over": "pilot",
     "battery low": "battery",
     "estimate lost": "estimate",
+    "second commander": "commander",
+    "position leaps": "leap",
 }
 """Faults of the autopilot itself."""
 ENDING = frozenset({"link cut for 5 s", "autopilot sends nothing for 5 s"})
