@@ -102,14 +102,14 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
     assert fleet.next_wake_ns() == 2 * SECOND_NS
     assert not fleet.finished
     assert fleet.failure is None
-    fleet.wake(now_ns=20 * SECOND_NS)
+    fleet.wake(now_ns=140 * SECOND_NS)
     assert fleet.finished
     failures = [
-        NoAnswer(vehicle=number, host="nowhere", port=1, waited_s=19.0) for number in (1, 2, 3)
+        NoAnswer(vehicle=number, host="nowhere", port=1, waited_s=139.0) for number in (1, 2, 3)
     ]
     assert fleet.failure == failures[0]
     assert fleet.events() == tuple(failures)
-    assert str(failures[1]) == "vehicle 2: no answer from nowhere:1 in 19 s"
+    assert str(failures[1]) == "vehicle 2: no answer from nowhere:1 in 139 s"
     assert fleet.next_wake_ns() is None
 
 

@@ -42,7 +42,7 @@ def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
     """Else a mode that the autopilot has left is believed again."""
     monkeypatch.setattr(Condition, "_is_overtaken", lambda *_: False)
     with pytest.raises(AssertionError, match=r"AUTO\.LOITER"):
-        fly("px4", 5, duration=SETTLE_S + 5.0)
+        fly("px4", 12, duration=SETTLE_S + 5.0)
 
 
 @pytest.mark.long

@@ -45,7 +45,9 @@ def test_the_documented_keys_change_in_flight() -> None:
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
     assert named["server"] == TRIGGER | POINT | ZONES | GOALS
-    assert named["client"] == SimulatedVehicle.changeable | keys_of(InFlight.ARMED)
+    assert named["client"] == SimulatedVehicle.changeable | keys_of(
+        InFlight.ARMED, InFlight.LEAP, InFlight.ORIGIN
+    )
     assert named["netem"] == {"network.uplink", "network.downlink"}
     assert Proxy.changeable == {
         name for name in KEYS if name.startswith(("network.uplink.", "network.downlink."))

@@ -16,9 +16,9 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
+from skytether.shared.scenario.catalogue import KEYS, TERMS, differences, keys_of
 from skytether.shared.scenario.dotted import flat, lay
-from skytether.shared.scenario.owners import Owner
+from skytether.shared.scenario.owners import InFlight, Owner
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 
@@ -60,7 +60,10 @@ OTHER: dict[str, Any] = {
     "fence.speed_mps": 10.0,
     "mavlink.takeoff_m": 5.0,
     "mavlink.origin": "autopilot",
+    "mavlink.second_commander": "yield",
     "vehicle.exhausted": "hold",
+    "vehicle.memory": "none",
+    "vehicle.on_loss": "return",
     "vehicle.tau_s": [0.5],
     "vehicle.gain": 0.9,
     "vehicle.dead_time_s": 0.1,
@@ -169,7 +172,7 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
     assert not server.figures()["vehicles"]
 
 
-@pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values()))
+@pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values() - keys_of(InFlight.LEAP)))
 def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
     """The vehicle flies."""
     ours, theirs = differing(key, tmp_path)

@@ -88,7 +88,11 @@ FILES = {
     "many columns": ("way.csv", f"t,x,y,{WIDE}\n" + "0\n" * 4_000_000, "at most 64 columns"),
     "long words": ("way.csv", "t,x,y\n0,0," + "9" * 10_000_000, "line 2: field larger than"),
     "zones nested deeply": ("zones.json", "[" * 4_000_000, "a GeoJSON file"),
-    "many features": ("zones.json", '{"features":[' + "{}," * 1_300_000 + "{}]}", "feature 1"),
+    "many features": (
+        "zones.json",
+        '{"type":"FeatureCollection","units":"m","features":[' + "{}," * 1_300_000 + "{}]}",
+        "feature 1",
+    ),
     "a long coordinate": (
         "zones.json",
         '{"features":[{"geometry":{"type":"Point","coordinates":[' + "9" * 3_000_000 + ",0]}}]}",

@@ -228,7 +228,7 @@ def test_a_network_that_loses_everything_is_no_flight() -> None:
     """The client gives up, and says why."""
     lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
     flight = fly(packaged("paper", settle=0.0, network=lost))
-    assert str(flight.failure) == "vehicle 1: no answer from netem 1:0 in 16 s"
+    assert str(flight.failure) == "vehicle 1: no answer from netem 1:0 in 121 s"
     assert len(flight.client) == 0
 
 
