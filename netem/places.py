@@ -16,7 +16,6 @@ So who holds a place must go on exchanging packets at the rate of a slow vehicle
 and who has one address keeps no more than HOST_FLOWS from others.
 """
 
-import ipaddress
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -36,9 +35,6 @@ HOST_FLOWS = 64
 TRIALS = 8
 """Divisor of the number of places: so large a part of them is not kept from new clients by a host
 with more than HOST_FLOWS."""
-NETWORK_BYTES = 8
-"""Length of the part of an IPv6 address that stands for a host [B]: whoever has one address of a
-network of 64 bits has them all."""
 
 
 @dataclass(slots=True)
@@ -53,7 +49,7 @@ class Flow:
     used_ns: int
     """Time of its newest packet, either way."""
     host: str
-    """Host of the client, see `host_of`."""
+    """Host of the client, see `shared.core.endpoint.host_of`."""
     order: "Order"
     """Flows among which it stands: those that have earned their place, or the others."""
     laps: int
@@ -178,15 +174,3 @@ class Places:
         flow.order.remove(flow)
         flow.order = order
         order.append(flow)
-
-
-def host_of(client: Address) -> str:
-    """Host that a client's address counts for: its IPv4 address, or its network of IPv6."""
-    name = client[0]
-    if ":" not in name:
-        return name
-    try:
-        address = ipaddress.IPv6Address(name)
-    except ValueError:
-        return name
-    return address.packed[:NETWORK_BYTES].hex()

@@ -15,9 +15,15 @@ from typing import Any, Literal
 
 from skytether.netem.fate import Fates
 from skytether.netem.link import QUEUE_MAX, Lane, Link
-from skytether.netem.places import Flow, Places, host_of
+from skytether.netem.places import Flow, Places
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
+from skytether.shared.core.endpoint import (
+    Address,
+    Datagram,
+    Endpoint,
+    host_of,
+    make_datagram,
+)
 from skytether.shared.core.events import Fault, FlowOpened, Returned
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight

@@ -6,6 +6,7 @@ is asked for them (`figures`). `shell.driver` drives one on real UDP sockets; `s
 many in virtual time.
 """
 
+import ipaddress
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,6 +19,10 @@ from skytether.shared.scenario.schema import Scenario
 Address = tuple[str, int]
 """Host and port of a UDP socket. The host is a name, an IPv4 address or an IPv6 address without
 brackets, as in `fe80::1%eth0` where it needs a scope."""
+
+NETWORK_BYTES = 8
+"""Length of the part of an IPv6 address that stands for a host [B]: whoever has one address of a
+network of 64 bits has them all."""
 
 EVENTS_MAX = 1024
 """Events kept until the driver reads them; older ones give way, and are counted."""
@@ -39,6 +44,17 @@ class Datagram(NamedTuple):
 
 make_datagram: Callable[[tuple[bytes, Address, int]], Datagram] = partial(tuple.__new__, Datagram)
 """A datagram, of its three values: in half of the time that `Datagram` takes."""
+
+
+def host_of(address: Address) -> str:
+    """Host that a sender counts for where each may have a share: IPv4 address or IPv6 network."""
+    name = address[0]
+    if ":" not in name:
+        return name
+    try:
+        return ipaddress.IPv6Address(name).packed[:NETWORK_BYTES].hex()
+    except ValueError:
+        return name
 
 
 class Form(NamedTuple):

@@ -31,13 +31,14 @@ from skytether.probe.wire import (
 )
 from skytether.server.gate import Call, Gate
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name, host_of
 from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; one without a probe for IDLE_NS may be replaced."""
+"""Most measurements at once; then one gives way that had no probe for IDLE_NS, or one of a host
+with more than others have."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
@@ -66,6 +67,8 @@ class ProbeSession:
 
     heard_ns: int
     """Time of the newest probe [ns]."""
+    host: str
+    """Host of the prober."""
     logged: int = 0
     """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
@@ -105,7 +108,8 @@ class Listener(Endpoint):
     def _hear(self, call: Call, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
         if isinstance(message, ProbeHello):
-            room = len(self._sessions) < SESSIONS_MAX or self._oldest_idle(now_ns) is not None
+            room = self._gives_way(datagram.peer, now_ns) is not None
+            room = room or len(self._sessions) < SESSIONS_MAX
             welcome = ProbeWelcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
             packet = call.line.seal(encode(welcome))
             if len(packet) > len(datagram.payload):
@@ -132,19 +136,29 @@ class Listener(Endpoint):
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
         if session is None:
             if len(self._sessions) >= SESSIONS_MAX:
-                idle = self._oldest_idle(now_ns)
-                if idle is None:
+                gone = self._gives_way(peer, now_ns)
+                if gone is None:
                     raise ProtocolError(Drop.FULL)
-                del self._sessions[idle]
-            session = self._sessions[name] = ProbeSession(now_ns)
+                del self._sessions[gone]
+            session = self._sessions[name] = ProbeSession(now_ns, host_of(peer))
         session.heard_ns = now_ns
         self._sessions.move_to_end(name)
         return session
 
-    def _oldest_idle(self, now_ns: int) -> bytes | None:
-        """Session that may be replaced, or None."""
+    def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
+        """Session that gives way to a new one of a sender, where there is no room; or None.
+
+        Nobody keeps others out with many sessions: of the host with the most, the oldest gives way
+        to a host with fewer.
+        """
         name, session = next(iter(self._sessions.items()), (None, None))
-        return name if session and now_ns - session.heard_ns > IDLE_NS else None
+        if session is None or now_ns - session.heard_ns > IDLE_NS:
+            return name
+        counts = Counter(each.host for each in self._sessions.values())
+        host, most = counts.most_common(1)[0]
+        if most <= counts[host_of(peer)] + 1:
+            return None
+        return next(name for name, each in self._sessions.items() if each.host == host)
 
     def _probe(
         self, session: ProbeSession, probe: Probe, call: Call, datagram: Datagram, now_ns: int

@@ -12,10 +12,10 @@ from skytether.netem import link as link_module
 from skytether.netem import places as places_module
 from skytether.netem.fate import Fates
 from skytether.netem.link import Link
-from skytether.netem.places import EARNED_NS, EXCHANGES, HOST_FLOWS, IDLE_NS, Flow, host_of
+from skytether.netem.places import EARNED_NS, EXCHANGES, HOST_FLOWS, IDLE_NS, Flow
 from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.endpoint import Datagram, host_of
 from skytether.shared.core.events import FlowOpened, Returned
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 

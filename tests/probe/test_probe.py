@@ -176,24 +176,35 @@ def test_an_open_session_is_answered_at_its_own_address_alone(train: int) -> Non
     assert {sent.peer for sent in far.outbox()} == {prober}
 
 
+def begin(far: Listener, prober: tuple[str, int], now_ns: int) -> bool:
+    """Whether a prober is told that there is room, and gets an answer to a probe."""
+    far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), prober), now_ns=now_ns)
+    (packet,) = far.outbox()
+    welcome = decode(packet.payload)
+    assert isinstance(welcome, ProbeWelcome)
+    probe = encode(Probe(welcome.nonce + welcome.cookie, 0, 0, 0), 96)
+    far.receive(Datagram(probe, prober), now_ns=now_ns)
+    assert len(far.outbox()) == welcome.room
+    return welcome.room
+
+
 def test_a_listener_has_room_for_so_many_measurements() -> None:
     """The next one is refused, until one has been silent for a minute."""
     far = listener()
-    for port in range(SESSIONS_MAX):
-        session = session_of(far, ("prober", port), 0)
-        far.receive(Datagram(encode(Probe(session, 0, 0, 0), 96), ("prober", port)), now_ns=0)
-        assert len(far.outbox()) == 1
-    for now_ns, room in ((1, False), (IDLE_NS + 2, True)):
-        far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), ("new", 1)), now_ns=now_ns)
-        (packet,) = far.outbox()
-        welcome = decode(packet.payload)
-        assert isinstance(welcome, ProbeWelcome)
-        assert welcome.room == room
-        session = welcome.nonce + welcome.cookie
-        probe = encode(Probe(session, 0, 0, 0), 96)
-        far.receive(Datagram(probe, ("new", 1)), now_ns=now_ns)
-        assert len(far.outbox()) == room
-        assert far.figures()["sessions"] == SESSIONS_MAX
+    assert all(begin(far, (f"prober {number}", 1), 0) for number in range(SESSIONS_MAX))
+    assert not begin(far, ("new", 1), 1)
+    assert begin(far, ("new", 1), IDLE_NS + 2)
+    assert far.figures()["sessions"] == SESSIONS_MAX
+
+
+def test_a_host_with_many_measurements_keeps_no_other_out() -> None:
+    """Its oldest gives way, until it has no more than others; none of its own does."""
+    far = listener()
+    assert all(begin(far, ("crowd", port), port) for port in range(SESSIONS_MAX))
+    assert not begin(far, ("crowd", SESSIONS_MAX), SESSIONS_MAX)
+    others = [(f"prober {number}", 1) for number in range(SESSIONS_MAX)]
+    assert [begin(far, other, 99) for other in others] == [True] * 15 + [False]
+    assert far.figures()["sessions"] == SESSIONS_MAX
 
 
 def test_a_train_is_answered_together_or_as_far_as_it_has_come() -> None:

@@ -164,6 +164,64 @@ def test_a_refused_websocket_may_not_be_shown_in_a_frame(page: Page) -> None:
     assert headers["X-Frame-Options"] == "DENY"
 
 
+class Asked:
+    """Operator that notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+
+    def ask(self, process: str, values: dict[str, Any]) -> None:
+        """Note a change."""
+        self.asked.append((process, values))
+
+    def close(self) -> None:
+        """See `Operator`."""
+
+
+def labelled(browser: ClientConnection, label: str) -> str:
+    """Id of the next element that is shown with a label."""
+    while True:
+        payload = browser.recv(timeout=PATIENCE_S)
+        assert isinstance(payload, bytes)
+        for message in messages(payload):
+            if message.get("props", {}).get("label") == label:
+                return str(message["uuid"])
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "yes", "expected"),
+    [
+        ("Cut the link", True, "Yes, cut it", "netem"),
+        ("Loss [%]", 100.0, "Yes, cut it", "netem"),
+        ("Armed", False, "Yes, disarm", "client"),
+    ],
+)
+def test_what_may_end_a_flight_is_asked_once_more(
+    flown: PageFlight, label: str, value: object, yes: str, expected: str
+) -> None:
+    """One click changes nothing; a second one, elsewhere, does."""
+    flight, operator = PageFlight(), Asked()
+    flight.state, flight.operator = flown.state, operator  # type: ignore[assignment]
+    table = reading.to_table(flown.state.scenario)["network"]
+    keys = {f"network.{way}.{key}": each for way in table for key, each in _keys(table[way])}
+    flight.values = {"netem": keys, "client": {"armed": True}}
+    served = Page("127.0.0.1", 0, [flight], now_ns=lambda: flown.state.newest_ns)
+    with closing(served), joined(served) as browser:
+        send(browser, **CAMERA)
+        pressed = labelled(browser, label)
+        until(lambda: served._panels)
+        send(browser, type="GuiUpdateMessage", uuid=pressed, updates={"value": value})
+        meant = labelled(browser, yes)
+        assert operator.asked == []
+        send(browser, type="GuiUpdateMessage", uuid=meant, updates={"value": True})
+        until(lambda: operator.asked)
+    assert [process for process, _ in operator.asked] == [expected]
+
+
+def _keys(table: object) -> list[tuple[str, object]]:
+    return list(table.items()) if isinstance(table, dict) else []
+
+
 def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> None:
     """With the name of an element of the browser's own; nothing of it is kept."""
     with joined(page) as browser:
