@@ -19,7 +19,14 @@ from skytether.server.control.scheme import Packing
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
-from skytether.shared.core.events import Degraded, Fault, LeftTube, PlanningResumed, PlanningStopped
+from skytether.shared.core.events import (
+    Degraded,
+    Fault,
+    InZone,
+    LeftTube,
+    PlanningResumed,
+    PlanningStopped,
+)
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
@@ -185,6 +192,9 @@ class Ticker:
         if left := controller.left:
             self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
             left.clear()
+        if inside := controller.inside:
+            self._events += [InZone(vehicle=each, zone=zone) for each, zone in inside]
+            inside.clear()
         # Last, for a horizon that was sent at this tick stands in place of a heartbeat.
         if owed:
             self._send_heartbeats(owed, now_ns)

@@ -209,6 +209,13 @@ class Controller:
         return self._together.objection(zones) if self._together else ""
 
     @property
+    def inside(self) -> list[tuple[int, str]]:
+        """Vehicles of a mission that were found at rest within a zone, and its name; to be
+        emptied.
+        """
+        return self._together.inside if self._together else []
+
+    @property
     def left(self) -> list[tuple[int, float]]:
         """Vehicles of a mission that have left their tube, and by how much [m]; to be emptied."""
         return self._together.left if self._together else []

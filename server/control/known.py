@@ -70,6 +70,8 @@ class Known:
         """Whether a zone has held it back since it was found stuck last."""
         self.aside: Aside | None = None
         """Place it has stepped aside to; None if it flies to its own goal."""
+        self.in_zone = False
+        """Whether it rests within a zone, or too near to one."""
         self.waits = ""
         """Reason why it waits, in words for the operator; empty if it does not."""
 

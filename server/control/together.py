@@ -58,6 +58,13 @@ ROUNDS = 5
 """Number of times that constraints are taken in for one of them."""
 STUCK = 0.3
 """Share of the way to what is aimed at, 2 m at most, below which a plan is taken for stuck."""
+TURN = 2.0 * np.pi * np.arange(32) / 32
+AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
+"""Directions in which a vehicle that rests within a zone looks for a way out."""
+OUT_M, OUT_STEPS = 0.1, 500
+"""Distance from one place that is looked at to the next [m], and number of these."""
+NEARER_M = 1e-3
+"""Distance by which it may come nearer to the zone that it leaves [m]."""
 ZONE = "a zone"
 """Reason why a vehicle waits that a zone holds back."""
 CLOCK_POINTS = 33
@@ -98,6 +105,8 @@ class Together:
         self.planned = np.zeros((block, terms.axes, 2))
         self._roster = roster
         self.counts, self.left = roster.counts, roster.left
+        self.inside: list[tuple[int, str]] = []
+        """Vehicles that were found at rest within a zone since this was emptied, and its name."""
         self.observed_step = roster.observed_step
         mission = scenario.mission
         clear = self._clear = scenario.clearances
@@ -294,6 +303,10 @@ class Together:
             known.aside = None
         goal = known.aside.place if known.aside else home
         place = known.in_force.motion.position[-1]
+        if (out := self._way_out(row, known, place)) is not None:
+            self._roster.gather()
+            self._find(row, known, k, out)
+            return
         if max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M:
             known.turned = 0.0
             if known.aside:
@@ -314,6 +327,31 @@ class Together:
             if known.barred and not asked and self._aims.close(known, k, place, goal):
                 self.counts["closed"] += 1
             known.barred = False
+
+    def _way_out(self, row: int, known: Known, place: Array) -> Array | None:
+        """Nearest place clear of zones, for a vehicle that rests within one [m]; None of one that
+        is clear.
+
+        No motion leads there: it was there when the server began, which knew of no zone before.
+        """
+        room_m = self._clear.tube_m
+        if not self._zones or self._zones.clearance(place[None]).min() >= room_m:
+            known.in_zone = False
+            return None
+        if not known.in_zone:
+            known.in_zone = True
+            zone = self._zones.in_the_way(place[None], room_m)
+            self.inside.append((self._roster.number_of(row), zone))
+        around = np.zeros((len(AROUND), len(place)))
+        around[:, :2] = AROUND
+        for far_m in np.arange(1, OUT_STEPS) * OUT_M:
+            found: Array = place + far_m * around
+            clear_m = self._zones.clearance(found).min(axis=1)
+            best = int(clear_m.argmax())
+            if clear_m[best] >= self._clear.planned_clear_m:
+                there: Array = found[best]
+                return there
+        return None
 
     def _fly_straight(self, straight: list[Straight]) -> None:
         """Find motions of vehicles that may fly straight, one after the other; none are left."""
@@ -473,5 +511,23 @@ class Together:
         hit = apart.too_near(common, base, k - ahead, row, lands, flown, keep_m, error)
         if self._zones:
             points, _ = motion.at(apart.pieces_of(k, motion.last), self._dt_s)
-            hit[-1] = touches(self._zones, points, self._clear.tube_m + self._clear.bend_m)
+            hit[-1] = self._meets_zone(points)
         return hit
+
+    def _meets_zone(self, points: Array) -> bool:
+        """Whether a way through points comes too near to a zone; from one that it begins in, or is
+        too near to already, it may only come out.
+        """
+        room_m = self._clear.tube_m + self._clear.bend_m
+        if not touches(self._zones, points, room_m):
+            return False
+        away_m = self._zones.clearance(points)
+        is_clear = away_m[0] >= room_m
+        if is_clear.all():
+            return True
+        others = [zone for zone, clear in zip(self._zones.zones, is_clear, strict=True) if clear]
+        if others and touches(Zones(others), points, room_m):
+            return True
+        left = away_m[:, ~is_clear]
+        so_far = np.minimum(np.maximum.accumulate(left, axis=0), room_m)
+        return bool((left < so_far - NEARER_M).any())

@@ -433,6 +433,16 @@ class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} reports a state that it cannot have reached: not believed"
 
 
+class InZone(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle on a mission was found at rest within a zone, by a server that has just begun."""
+
+    zone: str
+    """Zone, as the scenario writes it."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is led out"
+
+
 class LeftTube(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle of a mission is further from its motion than the others reckon with."""
 
@@ -591,6 +601,7 @@ Event = (
     | ModeChanged
     | PlanningStopped
     | StateDoubted
+    | InZone
     | LeftTube
     | StateLeapt
     | FenceHolds

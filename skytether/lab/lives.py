@@ -6,9 +6,11 @@ all vehicles are put side by side by the time of the world.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +23,14 @@ from skytether.client.simulated.weather import Weather
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.change import Running, with_values
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.sim.world import Clock, World
 
@@ -49,6 +54,19 @@ class Restart(NamedTuple):
     """Time until the next life begins [s]."""
     remembers: bool = True
     """Whether that finds what the life before has kept."""
+
+
+class Death(NamedTuple):
+    """A server that dies, and begins anew without its memory."""
+
+    at_s: float
+    """Time of the world [s]."""
+    down_s: float
+    """Time until the next life begins [s]."""
+    remembers: bool = True
+    """Whether that takes up what was set in flight before."""
+    zones: str = ""
+    """Zones of the scenario that it begins with, where these are others."""
 
 
 class Track(NamedTuple):
@@ -77,10 +95,18 @@ class Lives:
 
     Args:
         scenario: what is flown; a mission.
-        restarts: which processes die, and when.
+        restarts: which processes of vehicles die, and when.
+        deaths: when the server dies.
+        settings: what an operator sets at the server: times [s], and values by key.
     """
 
-    def __init__(self, scenario: Scenario, restarts: Sequence[Restart] = ()) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        restarts: Sequence[Restart] = (),
+        deaths: Sequence[Death] = (),
+        settings: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    ) -> None:
         self.scenario, self.events = scenario, list[tuple[float, str, Event]]()
         self.world = World(self._hear)
         goals = scenario.make_reference()
@@ -99,15 +125,42 @@ class Lives:
                 clock=Clock(CLOCK_NS),
                 start_ns=start_ns,
             )
-        self.server = Server(
-            scenario,
-            boot_id=1,
-            entropy=stream(scenario.seed, "entropy").bytes,
-            room=self.count,
-        )
+        self._servers = 0
+        self.server = self._server(scenario)
+        self._running = Running(self.server, scenario)
         self.world.add(SERVER[0], self.server, clock=Clock(CLOCK_NS))
         for each in restarts:
             self._plan(each)
+        for death in deaths:
+            self._plan_death(death)
+        for at_s, values in settings:
+            self.world.at(seconds_to_ns(at_s), partial(self._set, values))
+
+    def _server(self, scenario: Scenario) -> Server:
+        self._servers += 1
+        entropy = stream(scenario.seed, "entropy", self._servers).bytes
+        return Server(scenario, boot_id=self._servers, entropy=entropy, room=self.count)
+
+    def _set(self, values: Mapping[str, Any]) -> None:
+        with suppress(ConfigError):  # the refusal is an event
+            self.world.act(SERVER[0], partial(self._running.change, values))
+
+    def _plan_death(self, death: Death) -> None:
+        """Schedule a death of the server, and its next life."""
+
+        def live() -> None:
+            scenario, settings = self.scenario, self._running.settings
+            if death.zones:
+                scenario = with_values(scenario, {"mission.zones": death.zones})
+            if death.remembers:
+                scenario = with_values(scenario, settings)
+            self.server = self._server(scenario)
+            self._running = Running(self.server, scenario, settings if death.remembers else {})
+            self.world.restart(SERVER[0], self.server)
+
+        begins_ns = seconds_to_ns(death.at_s)
+        self.world.at(begins_ns, lambda: self.world.stop(SERVER[0]))
+        self.world.at(begins_ns + seconds_to_ns(death.down_s), live)
 
     def _hear(self, time_ns: int, host: str, event: Event) -> None:
         self.events.append((time_ns / SECOND_NS, host, event))
@@ -178,6 +231,21 @@ class Lives:
         times.append(np.array([self.world.now_ns / SECOND_NS]))
         places.append(np.concatenate(places)[-1:])
         return Track(np.concatenate(times), np.concatenate(places))
+
+    def inside_s(self, zones: Zones, since_s: float = 0.0) -> float:
+        """Time that vehicles were within zones, all together [s].
+
+        Args:
+            zones: where nobody is to be.
+            since_s: time of the world from which on it counts [s].
+        """
+        at_s = np.arange(since_s, self.world.now_ns / SECOND_NS, LOOK_NS / SECOND_NS)
+        inside = 0
+        for number in self._lives:
+            t, place = self.track(number)
+            places = np.stack([np.interp(at_s, t, x) for x in place.T], axis=1)
+            inside += int((zones.clearance(places).min(axis=1) < 0.0).sum())
+        return inside * LOOK_NS / SECOND_NS
 
     def least_m(self) -> float:
         """Smallest distance between two vehicles at any time [m]."""

@@ -46,6 +46,7 @@ from skytether.shared.core.events import (
     Flying,
     HostFound,
     HostMissing,
+    InZone,
     LeftTube,
     Listening,
     Measured,
@@ -284,6 +285,10 @@ SENTENCES = [
     (
         FenceHolds(vehicle=1),
         "vehicle 1 is held back by its fence",
+    ),
+    (
+        InZone(vehicle=1, zone="box(1, 2, 3, 4)"),
+        "vehicle 1 is at rest in box(1, 2, 3, 4), tube included: it is led out",
     ),
     (
         LeftTube(vehicle=1, off_m=0.123),

@@ -1,0 +1,97 @@
+"""A client that is killed in flight and started again by its service, over real UDP."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import AsyncExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from airborne import scenario
+from skytether.cli.processes import Child, started
+from skytether.shared.core.aboard import ArmingAwaited, AutopilotMode
+from skytether.shared.core.events import Flying, Recalled
+from skytether.shared.core.events import address_text as text
+from skytether.shared.scenario.reading import to_toml
+from skytether.shell.control import Caller
+
+pytestmark = pytest.mark.long
+
+
+class Service:
+    """A client that is started again and again, and what its runs say.
+
+    Args:
+        stack: ends it.
+        arguments: its command line.
+    """
+
+    def __init__(self, stack: AsyncExitStack, arguments: list[str]) -> None:
+        self._stack, self._arguments = stack, arguments
+        self.events: list[Any] = []
+        """Events of the present run."""
+
+    async def start(self) -> Child:
+        """Start it once more."""
+        self.events = events = list[Any]()
+        child = started("client", *self._arguments, on_event=lambda line: events.append(line.event))
+        return await self._stack.enter_async_context(child)
+
+    def of(self, kind: type) -> list[Any]:
+        """Events of a kind of the present run."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+async def until(so: Callable[[], object]) -> None:
+    """Wait until something is so."""
+    async with asyncio.timeout(120.0):
+        while not so():
+            await asyncio.sleep(0.1)
+
+
+async def test_killed_in_flight_and_started_again_it_arms_nothing_before_a_person_says_so(
+    tmp_path: Path,
+) -> None:
+    """As under `Restart=always`: the autopilot's own failsafe lands the vehicle meanwhile."""
+    told: list[str] = []
+    anywhere = ("--bind", "127.0.0.1:0")
+    socket = tmp_path / "client.sock"
+
+    def arm() -> None:
+        with closing(Caller(socket)) as caller:
+            caller.ask({"armed": True})
+
+    async with AsyncExitStack() as stack:
+        autopilot = await stack.enter_async_context(
+            started(
+                "autopilot",
+                "demo",
+                *anywhere,
+                "--ready",
+                "2",
+                on_event=lambda line: told.append(str(line.event)),
+            )
+        )
+        address = f"udpout:{text(*autopilot.address)}"
+        vehicle = {"kind": "mavlink", "address": address, "memory": str(tmp_path / "state")}
+        file = tmp_path / "scenario.toml"
+        file.write_bytes(to_toml(scenario(duration=300.0, vehicle=vehicle)))
+        server = await stack.enter_async_context(started("server", str(file), *anywhere))
+        to_server = ["--server", text(*server.address), "--control", str(socket)]
+        service = Service(stack, [str(file), *to_server, "--no-armed", "--set-parameters"])
+        first = await service.start()
+        await until(socket.exists)
+        await asyncio.to_thread(arm)
+        await until(lambda: service.of(Flying))
+        first.process.kill()
+        await first.process.wait()
+        assert (tmp_path / "client.sock.set").exists()
+        await until(lambda: any(said.startswith("Disarm") for said in told))
+        await service.start()
+        await until(lambda: service.of(ArmingAwaited))
+        assert service.of(Recalled)
+        await asyncio.sleep(3.0)
+        assert not any(mode.armed for mode in service.of(AutopilotMode))
+        await asyncio.to_thread(arm)
+        await until(lambda: any(mode.armed for mode in service.of(AutopilotMode)))

@@ -1,0 +1,39 @@
+"""Missions whose server dies: what an operator has set, and vehicles that are found in a zone."""
+
+from skytether.lab.lives import Death, Lives
+from skytether.shared.core.events import InZone
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.schema import Scenario
+
+BOX = "box(-1.5, 1.5, -1.5, 1.5)"
+CENTRE = zones.parse(BOX, 2)
+
+
+def swap() -> Scenario:
+    """Four vehicles that swap places across the centre."""
+    table = reading.to_table(reading.load("swap"))
+    table |= {"duration": 50.0, "seed": 3}
+    table["link"]["timeout_s"] = 9.0  # a server that has begun anew is noticed by its silence
+    table["reference"]["shape"] = "swap(4)"
+    return reading.check(table, "swap")
+
+
+def test_a_zone_set_in_flight_is_kept_clear_of_after_a_death_of_the_server() -> None:
+    """It was set while nobody could fly into it; without the journal vehicles are inside it."""
+    setting = [(1.5, {"mission.zones": BOX})]
+    kept = Lives(swap(), deaths=[Death(2.0, 1.0)], settings=setting)
+    kept.fly(30.0)
+    assert kept.inside_s(CENTRE) == 0.0
+    forgotten = Lives(swap(), deaths=[Death(2.0, 1.0, remembers=False)], settings=setting)
+    forgotten.fly(30.0)
+    assert forgotten.inside_s(CENTRE) > 1.0
+
+
+def test_a_vehicle_found_at_rest_in_a_zone_is_told_and_led_out() -> None:
+    """The server began again with a zone across motions; nobody stays in it."""
+    flight = Lives(swap(), deaths=[Death(6.0, 0.5, zones="box(-2, 2, -2, 2)")])
+    flight.fly(45.0)
+    told = [event for _, _, event in flight.events if isinstance(event, InZone)]
+    assert told
+    assert flight.inside_s(zones.parse("box(-2, 2, -2, 2)", 2), since_s=40.0) == 0.0
+    assert flight.least_m() > 0.5

@@ -1,0 +1,65 @@
+"""The units of systemd in `deploy/`: what they start, and that it never takes off by itself."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skytether.client.__main__ import ClientOptions
+from skytether.server.__main__ import ServerOptions
+from skytether.shell import command
+
+UNITS = Path(__file__).parents[2] / "deploy" / "systemd"
+CLIENT, SERVER = UNITS / "skytether-client@.service", UNITS / "skytether-server.service"
+BINARY = "/opt/skytether/bin/skytether"
+
+
+def settings(unit: Path) -> dict[str, str]:
+    """Settings of a unit by name; the last one counts."""
+    text = re.sub(r"\\\n\s*", "", unit.read_text())
+    return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
+
+
+def started(unit: Path, name: str) -> list[str]:
+    """Arguments of the command that a unit starts, with a scenario that is there."""
+    words = shlex.split(settings(unit)["ExecStart"].replace("%i", "1"))
+    assert words[:3] == [BINARY, name, "/etc/skytether/field.toml"]
+    return ["demo", *words[3:]]
+
+
+def test_the_client_starts_unarmed_and_as_a_flight_that_goes_on() -> None:
+    """Whatever ends it, it is started again: a person arms it, and nobody else."""
+    options = command.parse(ClientOptions(), started(CLIENT, "client"), "client", "")
+    assert not options.config.armed
+    assert not options.new_flight
+    assert options.control == Path("/run/skytether-1/client.sock")
+    unit = settings(CLIENT)
+    assert unit["Restart"] == "always"
+    assert unit["StartLimitIntervalSec"] == "0"
+    assert unit["RuntimeDirectory"] == "skytether-%i"
+    assert unit["RuntimeDirectoryPreserve"] == "restart"
+    assert unit["StateDirectory"] == "skytether"
+
+
+def test_the_server_keeps_what_was_set_where_it_outlives_the_computer() -> None:
+    """Its control socket, and the journal beside that, lie in its state folder."""
+    options = command.parse(ServerOptions(), started(SERVER, "server"), "server", "")
+    assert not options.new_flight
+    assert options.control
+    assert str(options.control.parent) == f"/var/lib/{settings(SERVER)['StateDirectory']}"
+    assert settings(SERVER)["Restart"] == "always"
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="this machine has no systemd")
+@pytest.mark.parametrize("unit", [CLIENT, SERVER], ids=lambda unit: unit.name)
+def test_systemd_finds_no_fault_with_a_unit(unit: Path, tmp_path: Path) -> None:
+    """Each setting is one that it knows."""
+    copy = tmp_path / unit.name
+    copy.write_text(unit.read_text().replace(BINARY, sys.executable))
+    verify = ["systemd-analyze", "verify", "--man=no", str(copy)]
+    run = subprocess.run(verify, capture_output=True, text=True, check=False)
+    assert (run.returncode, unit.name in run.stderr) == (0, False), run.stderr
