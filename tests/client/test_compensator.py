@@ -11,7 +11,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reading import check
 from skytether.shared.wire.drop import ProtocolError
-from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon
+from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, Trajectory
 
 quick = settings(max_examples=60, deadline=None)
 
@@ -149,6 +149,60 @@ def test_without_compensation_the_newest_first_input_is_flown(step: int, exhaust
     compensator.offer(horizon(7, INPUTS + 0.2), 9, 8)
     compensator.offer(horizon(6, INPUTS + 0.3), 9, 8)
     np.testing.assert_allclose(chosen(compensator, step, HERE), INPUTS[:, 0] + 0.2, rtol=1e-6)
+
+
+def on_spline(regulator: Array | None = None) -> Compensator:
+    """Compensator with a trajectory from step 100 on, of two intervals at a steady velocity."""
+    knots = np.array([[[1.0, 0.4], [1.2, 0.4]], [[2.0, -0.2], [1.9, -0.2]]], np.float32)
+    compensator = Compensator(
+        terms(scheme="trajectory", feedback=True, exhausted="brake"), regulator
+    )
+    assert compensator.offer(Trajectory(1, 1, 100, 0, 10, 5, knots), 100, 90)
+    return compensator
+
+
+def test_the_first_knot_of_a_spline_is_where_the_vehicle_is_to_be() -> None:
+    """Position and velocity: there the regulator asks for nothing beside the desired velocity."""
+    regulator = np.array([[2.0, 0.5, 0.0]] * 2)
+    there = np.array([[1.0, 0.4], [2.0, -0.2]], np.float32).astype(float)
+    compensator = on_spline(regulator)
+    assert compensator.lead == [tuple(axis) for axis in there.tolist()]
+    assert chosen(compensator, 100, there).tolist() == pytest.approx([0.4, -0.2], abs=1e-5)
+    faster = there + np.array([[0.0, 0.1], [0.0, 0.0]])
+    (x, y) = chosen(on_spline(regulator), 100, faster)
+    assert (x, y) == (pytest.approx(0.4 - 0.5 * 0.1, abs=1e-5), pytest.approx(-0.2, abs=1e-5))
+
+
+def test_a_place_is_held_at_rest() -> None:
+    """Where the vehicle is, whatever its velocity; nothing else is in force."""
+    compensator = Compensator(
+        terms(scheme="trajectory", feedback=True, exhausted="brake"),
+        np.array([[1.0, 0.0, 0.0]] * 2),
+    )
+    compensator.rest(7, [(1.0, 0.3), (2.0, 0.0)])
+    assert compensator.rests
+    assert compensator.lead == [(1.0, 0.0), (2.0, 0.0)]
+    for step in (7, 8, 100_000):
+        assert chosen(compensator, step, np.array([[1.0, 0.0], [2.0, 0.0]])).tolist() == [0.0, 0.0]
+    assert chosen(compensator, 100_001, np.array([[0.9, 0.0], [2.0, 0.0]]))[0] > 0.0
+    assert compensator.in_force == NO_HORIZON
+    assert not compensator.covered
+
+
+def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
+    """Not since it came, nor since the newest step; another one begins anew."""
+    compensator = holding(100)
+    for step in (103, 104, 107):
+        chosen(compensator, step, HERE)
+        assert compensator.since == 103
+    compensator.offer(horizon(106), 108, 106)
+    compensator.drop(108, np.zeros(2))
+    chosen(compensator, 109, HERE)
+    assert compensator.since == 103  # that one was dropped before it was flown
+    compensator.offer(horizon(108), 110, 108)
+    compensator.note(110, [0.0, 0.0])
+    compensator.note(111, [0.0, 0.0])
+    assert compensator.since == 110
 
 
 def test_horizon_from_the_future_is_refused() -> None:

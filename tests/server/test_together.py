@@ -38,7 +38,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import ChangeRefused, SessionEnded
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.law.motion import INTERVALS, SPACING, Motion, resting
+from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.mission import Mission, swap
@@ -272,6 +272,39 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
             assert is_hit
 
 
+def test_the_box_of_a_motion_is_just_around_it() -> None:
+    """Out and back within an interval it reaches half of v T / 2, between its two knots."""
+    out_and_back = Motion(0, np.array([[1.0, 5.0]] * 2), np.array([[0.8, 0.0], [-0.8, 0.0]]))
+    flown = FlownMotions(np.array([1.0, 0.5]), DT_S)
+    flown.add(1, out_and_back, 0, NEVER, 0.0)
+    furthest = out_and_back.at(np.array([SPACING / 2.0]), DT_S)[0][0, 0]
+    assert flown.arrays.high[0].tolist() == pytest.approx([furthest, 2.5])
+    assert flown.arrays.low[0].tolist() == pytest.approx([2.0 - furthest, 2.5])
+    steady = Motion(0, np.array([[0.0, 1.0], [0.4, 1.0]]), np.array([[0.8, 0.0], [0.8, 0.0]]))
+    flown.add(2, steady, 0, NEVER, 0.0)
+    assert flown.arrays.low[1].tolist() == pytest.approx([0.0, 0.5])
+    assert flown.arrays.high[1].tolist() == pytest.approx([0.4, 0.5])
+
+
+def test_a_motion_that_lands_has_a_box_down_to_the_ground() -> None:
+    """Not where it never lands, nor where it is below the ground already."""
+    flown = FlownMotions(np.ones(3), DT_S)
+    for lands, height, low in ((NEVER, 4.0, 4.0), (60, 4.0, 0.0), (60, -1.0, -1.0)):
+        flown.replace(1, [resting(0, np.array([1.0, 2.0, height]))], 0, lands, 0.0)
+        assert flown.arrays.low[0].tolist() == [1.0, 2.0, low]
+        assert flown.arrays.high[0].tolist() == [1.0, 2.0, height]
+
+
+@pytest.mark.parametrize(("begin", "end"), [(0, 20), (3, 20), (0, 21), (20, 20), (30, 20)])
+def test_no_piece_begins_after_a_motion_has_come_to_rest(begin: int, end: int) -> None:
+    """The pieces follow each other, and the last one reaches its end; at rest there is one."""
+    steps = apart.pieces_of(begin, end)
+    assert steps[0] == begin
+    assert steps[-1] >= end
+    assert len(steps) == 2 or steps[-2] < end
+    assert np.diff(steps) == pytest.approx(SPACING / SAMPLES)
+
+
 @given(st.integers(0, 2**31), st.integers(0, 150), st.integers(0, 150))
 def test_vehicles_that_may_land_come_too_near_below_their_motions(
     seed: int, lands: int, others_land: int
@@ -418,6 +451,56 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
     assert made._hit(0, near, 100).tolist() == [False, is_hit, False]
+
+
+def ready() -> Together:
+    """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
+    made = alone()
+    for row, x in ((0, 4.0), (1, -4.0)):
+        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
+        made._roster.known[row].in_force = Sent(90, resting(100, np.array([x, 0.0])))
+        made.observe(row, observation(101, 90, (x, 0.0)))
+    return made
+
+
+def planned(made: Together) -> Motion:
+    """Motion that is decided for the first vehicle at step 101."""
+    made.plan(np.arange(2), np.array([101, 101]), None)  # type: ignore[arg-type]
+    motion = made._roster.known[0].next
+    assert motion is not None
+    return motion
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.5])
+def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
+    """Though it may fly straight: it is still passing somebody. Bit by bit it turns back."""
+    made = ready()
+    made._roster.known[0].turned = turned
+    end = planned(made).position[-1]
+    assert end[0] < 3.0  # on its way from x = 4 m to -4 m
+    assert (end[1] > 0.5) == (turned > 0.0)
+    assert made._roster.known[0].turned == max(0.0, turned - aims.TURN_BACK)
+
+
+@pytest.mark.parametrize(("until", "is_aside"), [(0, True), (-1, False)])
+def test_a_vehicle_is_aside_up_to_its_last_step(until: int, is_aside: bool) -> None:
+    """One step later it flies to its own goal again, though the other has not passed."""
+    made = ready()
+    place = np.array([4.0, 3.0])
+    made._roster.known[0].aside = aside.Aside(place, asker=1, until=until)
+    end = planned(made).position[-1]
+    assert (made._roster.known[0].aside is not None) == is_aside
+    assert (end[1] > 0.5, end[0] < 3.5) == (is_aside, not is_aside)
+
+
+def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
+    """The very same one, from the first step on after a third of that age."""
+    made = ready()
+    known, last = made._roster.known[0], 90 + made._again
+    assert made._plans(known, last)
+    assert known.next is None
+    assert not made._plans(known, last + 1)
+    assert known.next is known.in_force.motion  # type: ignore[union-attr]
 
 
 def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:

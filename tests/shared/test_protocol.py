@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from skytether.shared.law.heartbeat import NUMBERS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
@@ -311,6 +312,16 @@ def test_an_observation_is_small_for_an_hour(step: int, flown: int) -> None:
     """At steps from 10 to 50 ms, of two axes, with a silence of a few seconds asked for."""
     assert len(encode(told_by(step, min(flown, step), splines=True, silence=255))) <= 48
     assert len(encode(told_by(step, step, splines=True, silence=255))) <= 48
+
+
+def test_the_longest_silence_is_told_as_far_as_the_wire_has_numbers() -> None:
+    """An hour in steps of a millisecond would be 7.2 million half steps."""
+    asked = Hearing(3600 * SECOND_NS, MILLISECOND_NS, 3600 * SECOND_NS)
+    beat = Heartbeat(1, 1, 0, 0, 0, 0, asked.silence)
+    assert decode(encode(beat), TERMS) == beat
+    with pytest.raises(ProtocolError) as refused:
+        decode(encode(beat._replace(silence=asked.silence + 1)), TERMS)
+    assert refused.value.reason is Drop.FIELD
 
 
 def test_the_longest_observation() -> None:
