@@ -23,10 +23,11 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
+    Close,
     Heartbeat,
     Hello,
     Horizon,
@@ -213,6 +214,49 @@ def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
     assert server.client.events() == ()
     assert server.client.failure is None
     assert server.rows()["step"].tolist() == list(range(100))
+
+
+def test_another_scenario_in_flight_is_dropped() -> None:
+    """The vehicle goes on with its horizon; only before the first session is it a failure."""
+    server = flying()
+    server.welcome(terms=server.terms._replace(horizon=server.terms.horizon + 1))
+    assert server.client.failure is None
+    assert server.client.dropped == {Drop.OTHER_TERMS: 1}
+
+
+def test_nothing_of_a_closed_session_is_heard() -> None:
+    """Another WELCOME opens it again."""
+    server, beat = flying(vehicle={"exhausted": "brake"}), Heartbeat(4, 7, 0, 0, 0, 1, 25)
+    server.say(beat)
+    server.say(Close(4, 7))
+    server.say(beat)
+    assert server.client.dropped == {Drop.UNKNOWN_SESSION: 1}
+    server.welcome()
+    server.say(beat)
+    assert server.client.dropped == {Drop.UNKNOWN_SESSION: 1}
+
+
+def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() -> None:
+    """Clocks of two lives of the server cannot be compared: it brakes for the restart alone."""
+    server = flying(vehicle={"exhausted": "brake"})
+    for step in range(45):
+        server.wake()
+        server.horizon(step, 0.5)
+    server.client.events()
+    ahead_ns = server.now_ns + 10_000 * SECOND_NS
+    server.say(Welcome(4, 8, 99, 2, ahead_ns, Refusal.ACCEPTED, server.terms))
+    told = [event.reason for event in server.client.events() if isinstance(event, ModeChanged)]
+    assert told == [str(Reason.RESTARTED)]
+
+
+def test_packets_are_numbered_anew_in_each_session() -> None:
+    """The server counts losses by these numbers."""
+    server = flying()
+    numbers = [said.number for _ in range(3) for said in server.wake()]  # type: ignore[union-attr]
+    server.session = 8
+    server.welcome()
+    numbers += [said.number for _ in range(2) for said in server.wake()]  # type: ignore[union-attr]
+    assert [number - numbers[0] for number in numbers] == [0, 1, 2, 0, 1]
 
 
 def test_the_epoch_is_the_moment_the_session_opens() -> None:

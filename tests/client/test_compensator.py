@@ -10,7 +10,7 @@ from skytether.shared.law import rule
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reading import check
-from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, Trajectory
 
 quick = settings(max_examples=60, deadline=None)
@@ -279,6 +279,33 @@ def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: 
         flown.append(float(np.linalg.norm(chosen(compensator, step, HERE))))
         assert compensator.covered == (step <= 104)
     assert flown == pytest.approx([1.0, 1.0, after], abs=1e-6)
+
+
+def test_a_horizon_that_is_over_when_it_comes_is_not_braked_along() -> None:
+    """Its last input is flown for one step; a step later another one was braked along long ago."""
+    for late, is_held in ((H - 1, True), (H, False)):
+        compensator = Compensator(terms(exhausted="brake"))
+        if is_held:
+            assert compensator.offer(horizon(100), 100 + late, 99)
+        else:
+            with pytest.raises(ProtocolError) as refused:
+                compensator.offer(horizon(100), 100 + late, 99)
+            assert refused.value.reason is Drop.TOO_LATE
+
+
+@pytest.mark.parametrize("after", ["dropped", "replaced"])
+def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> None:
+    """The server repeats what it does not know to be in force; older ones are late."""
+    compensator = holding(100)
+    assert not compensator.offer(horizon(100), 103, 100)
+    assert (compensator.stale, compensator.repeated) == (1, 1)
+    if after == "dropped":
+        compensator.drop(103, np.zeros(2))
+        assert compensator.observed == -1
+    else:
+        compensator.offer(horizon(102), 103, 102)
+    assert not compensator.offer(horizon(100), 104, 100)
+    assert (compensator.stale, compensator.repeated) == (2, 1)
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])

@@ -417,7 +417,8 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     made.observe(0, observation(41 + made._join, 10, (4.0, 0.0)))
     assert known.motions() == [first]
     assert made.counts["horizons_lost"] == 1
-    assert not made.observe(0, observation(30, 10, (4.0, 0.0)))
+    for old in (30, 41 + made._join):  # late, and a copy of the newest
+        assert not made.observe(0, observation(old, 10, (4.0, 0.0)))
 
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
@@ -574,6 +575,29 @@ def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
     known.learn(prompt=False)
     known.sent.clear()
     assert known.owed(104) is None
+
+
+def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
+    """It is said once in that time; whoever comes nearer, or has another goal, is not stuck."""
+    known, goal = Known(), np.array([4.0, 0.0])
+    patience = known_vehicles.PATIENCE
+    assert not known.is_stuck(0, goal, 10.0)
+    assert not known.is_stuck(100, goal, 10.0 - 0.9 * known_vehicles.NEARER_M)
+    found = [step for step in range(101, 3 * patience) if known.is_stuck(step, goal, 9.8)]
+    assert found == [patience, 2 * patience]
+    assert not known.is_stuck(3 * patience, goal, 9.0)
+    assert not known.is_stuck(4 * patience - 1, goal, 9.0)
+    assert not known.is_stuck(4 * patience, -goal, 9.0)
+
+
+def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
+    """Up to there the vehicle may be anywhere; it is taken for where it was seen last."""
+    made, until = alone(), 70 + LONGEST
+    for step, x, taken_x in ((100, -4.0, -4.0), (until, -3.5, -3.5), (until + 1, -3.0, -3.5)):
+        made.observe(1, observation(step, 70, (x, 0.0)))
+        known = made._roster.known[1].in_force
+        assert known is not None
+        assert known.motion.position[-1].tolist() == [taken_x, 0.0]
 
 
 def test_who_gets_a_motion_again_says_so_again() -> None:
@@ -986,6 +1010,16 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
     assert aside.first_on(way, homes[:0], 0.9) is None
     around = np.array([[-0.5, 0.5], [-0.5, -0.5], [0.6, 0.6]])
     assert aside.first_on(way, around, 0.9) == 2
+
+
+def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
+    """Before that one is reached, the way may be another."""
+    corner = 1.1 * aside.AHEAD_M
+    way = np.array([[0.0, 0.0], [corner, 0.0], [corner + 4.0, 0.0]])
+    ahead = np.array([[corner + 2.0, 0.0]])
+    assert aside.first_on(way, ahead, 1.0) is None
+    assert aside.first_on(way[1:], ahead, 1.0) == 0
+    assert aside.first_on(way, np.array([[3.0, 0.0]]), 1.0) == 0
 
 
 def test_one_that_is_too_near_already_steps_aside_away_from_the_other() -> None:
