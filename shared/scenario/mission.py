@@ -322,11 +322,11 @@ def mission(path: Path, axes: int) -> Mission:
         ValueError: with what is wrong, and in which line.
     """
     rows = read_table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
-    numbers = rows[:, 0].astype(np.int64)
-    if not len(rows) or (numbers != rows[:, 0]).any():
-        raise ValueError("column vehicle: expected numbers")
-    if numbers.min() < 1 or numbers.max() > VEHICLES_MAX:
+    numbers = rows[:, 0]
+    known = (numbers >= 1) & (numbers <= VEHICLES_MAX) & (numbers == np.rint(numbers))
+    if not len(rows) or not known.all():
         raise ValueError(f"column vehicle: expected numbers from 1 to {VEHICLES_MAX}")
+    numbers = numbers.astype(np.int64)
     goals = {}
     order = np.argsort(numbers, kind="stable")
     names, begins = np.unique(numbers[order], return_index=True)

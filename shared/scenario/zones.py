@@ -331,7 +331,14 @@ def _geojson(written: str, text: str) -> list[Zone]:
         told = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"a GeoJSON file ({error})") from None
-    return list(_features(f"{Path(file).name}", told)) or _none(written)
+    found: list[Zone] = []
+    corners = 0
+    for zone in _features(f"{Path(file).name}", told):
+        found.append(zone)
+        corners += len(zone.corners)
+        if corners > CORNERS_MAX:  # each ring takes a time in the square of its corners
+            raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
+    return found or _none(written)
 
 
 def _none(written: str) -> list[Zone]:

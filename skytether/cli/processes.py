@@ -267,7 +267,8 @@ def run(
         interrupted=interrupted,
         on_event=hear,
     )
-    if interrupted() and not (parts / "client.json").exists():
+    told = parts / "client.json"  # made at once, and written at the end
+    if interrupted() and not (told.exists() and told.stat().st_size):
         raise CommandError("interrupted before the first step", INTERRUPTED)
     return shortfalls
 

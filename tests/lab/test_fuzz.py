@@ -33,6 +33,7 @@ COUNTS = {
     "control": 150,
     "recording": 4,
     "scenario": 150,
+    "files": 1_000,
     "feed": 5_000,
     "page": 300,
     "log": 5_000,

@@ -10,7 +10,7 @@ from skytether.lab.fuzz.feeds import FeedTarget, PageTarget
 from skytether.lab.fuzz.handshake import Holder, Strangers
 from skytether.lab.fuzz.recordings import RecordingFile
 from skytether.lab.fuzz.target import Target
-from skytether.lab.fuzz.texts import ControlTarget, LogLines, ScenarioFile
+from skytether.lab.fuzz.texts import ControlTarget, LogLines, NamedFiles, ScenarioFile
 
 
 class Both(Target):
@@ -44,6 +44,7 @@ TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
         "control": lambda _: ControlTarget(),
         "recording": RecordingFile,
         "scenario": ScenarioFile,
+        "files": NamedFiles,
         "feed": lambda _: FeedTarget(),
         "page": lambda _: PageTarget(),
         "log": lambda _: LogLines(),

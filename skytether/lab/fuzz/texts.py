@@ -1,7 +1,6 @@
 """Targets for texts: scenarios, requests for changes in flight, and output of processes."""
 
 import importlib
-import tomllib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,13 +14,16 @@ from skytether.lab.fuzz.flown import flown
 from skytether.lab.fuzz.mutators import text_changed, words_of
 from skytether.lab.fuzz.target import Target
 from skytether.netem.proxy import Proxy
+from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
-from skytether.shared.scenario import contradictions, policies, reading, reference
+from skytether.shared.scenario import contradictions, mission, policies, reading, reference, zones
+from skytether.shared.scenario.air import traces
+from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
-from skytether.shared.wire import handshake
+from skytether.shared.wire import handshake, keys
 from skytether.shared.wire.protocol import Hello, Welcome, decode, encode
 from skytether.shell import log
 from skytether.shell.control import ANSWER_BYTES_MAX, ControlError, answer_of
@@ -72,6 +74,7 @@ class ScenarioFile(Text):
         contradictions,
         policies,
         reference,
+        toml,
         importlib.import_module("tomllib._parser"),
     )
 
@@ -90,7 +93,7 @@ class ScenarioFile(Text):
             scenario = reading.load(str(self._path))
         except ConfigError:
             return
-        again = tomllib.loads(reading.to_toml(scenario).decode())
+        again = toml.loads(reading.to_toml(scenario).decode())
         assert reading.check(again) == scenario
         terms, largest = scenario.terms(), 2**64 - 1
         hello = encode(Hello(2**16 - 1, largest, terms))
@@ -100,6 +103,59 @@ class ScenarioFile(Text):
         assert len(hello) <= handshake.HELLO_BYTES_MAX
         assert len(welcome) <= handshake.WELCOME_BYTES_MAX
         assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
+
+
+class NamedFiles(Text):
+    """Target for files that a scenario names: tables, zones, traces, and keys.
+
+    The first byte of an input chooses the reader, which raises an error for the user, or gives
+    values that can be flown.
+    """
+
+    code = (reference, mission, zones, traces, keys)
+    largest = 20_000
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "it"
+        row = "64 bytes from 192.0.2.1: icmp_seq={0} ttl=57 time={0}.5 ms"
+        stamps = '{"client":{"send":{"monotonic":%d}}}'
+        trip = f'{{"lost":"false","delay":{{"rtt":2000000}},"timestamps":{stamps}}}'
+        ring = "[[[0,0],[9,0],[9,9],[0,9],[0,0]]]"
+        feature = '{{"type":"Feature","properties":{},"geometry":{{"type":"{}","coordinates":{}}}}}'
+        box = feature.format('{"kind":"fence"}', "Polygon", ring)
+        point = feature.format('{"radius_m":3}', "Point", "[4,4]")
+        texts = (
+            "t,x,y\n0,0,0\n5,1.5,-2\n",
+            "vehicle,t,x,y\n1,0,0,0\n1,5,4,4\n2,0,9,0\n",
+            f'{{"type":"FeatureCollection","units":"m","features":[{box},{point}]}}',
+            "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
+            "\n".join(map(row.format, (1, 2, 4))),
+            f'{{"round_trips":[{trip % 5},{trip % 9}]}}',
+            "0\n3\n3\n17\n",
+            keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
+        )
+        kinds = b"\0\1\2\3\3\3\4\5"
+        known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
+        super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read the file."""
+        self._path.write_bytes(payload[1:])
+        with suppress(ConfigError, PolicyError, ValueError):
+            match (payload or b"\0")[0] % 6:
+                case 0:
+                    assert np.isfinite(reference.from_csv(self._path, 2)(SAMPLES_S)).all()
+                case 1:
+                    mission.mission(self._path, 2).nearest(1.0, 1.0)
+                case 2:
+                    zones.parse(f'geojson("{self._path}")', 2).clearance(np.zeros((2, 2)))
+                case 3:
+                    found = traces._recorded.__wrapped__(str(self._path), "auto")
+                    assert np.isfinite(found.delay_s[~found.lost]).all()
+                case 4:
+                    assert np.isfinite(traces._deliveries.__wrapped__(str(self._path))).all()
+                case _:
+                    keys.parse("it", payload[1:])
 
 
 class ControlTarget(Text, EndpointInFlight):
