@@ -81,7 +81,7 @@ class Kind(StrEnum):
     COPIES = "copies"
     """Each packet comes once more, later by the amount [s]."""
     SERVER = "server"
-    """The server is down, and begins anew without memory."""
+    """The server is down, and begins anew with nothing but what the operator has set."""
     CLIENT = "client"
     """The client of a vehicle is down, and begins anew with what it has kept; with
     `vehicle.memory = "none"` that is nothing."""
@@ -305,6 +305,8 @@ class Raid:
             client = self._new_client(number)
             self._world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
         self._servers = 0
+        self._kept = scenario
+        """Scenario with all that was set, as the journal of the server keeps it."""
         self._running: Running | None = None
         """Server and its scenario, while it is up."""
         self._world.add(SERVER[0], self._new_server(), clock=CLOCK)
@@ -319,8 +321,8 @@ class Raid:
         self._servers += 1
         entropy = stream(self._scenario.seed, "entropy", self._servers).bytes
         boot_id, room = BOOT_ID + self._servers, len(self._goals.vehicles)
-        self._server = Server(self._scenario, boot_id=boot_id, entropy=entropy, room=room)
-        self._running = Running(self._server, self._scenario)
+        self._server = Server(self._kept, boot_id=boot_id, entropy=entropy, room=room)
+        self._running = Running(self._server, self._kept)
         return self._server
 
     def _new_client(self, number: int) -> AheadClient:
@@ -401,7 +403,8 @@ class Raid:
         for key, text in texts.items():
             with suppress(ConfigError):
                 self._world.act(SERVER[0], partial(running.change, {key: text}))
-        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, running.scenario.zones))
+        self._kept = running.scenario
+        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, self._kept.zones))
 
     # -- what is flown -----------------------------------------------------------------------------
 
