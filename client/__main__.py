@@ -166,7 +166,11 @@ def fly(argv: Sequence[str]) -> None:
             options,
             bind=None,
             peers=[server],
-            waiting_for=f"the server at {options.server}",
+            waiting_for=(
+                f"its autopilot at {scenario.vehicle.address}"
+                if line
+                else f"the server at {options.server}"
+            ),
             secure=keyring is not None,
             insecure=options.insecure,
             log=options.log,

@@ -19,6 +19,7 @@ from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.aboard import AutopilotWaits
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
 from skytether.shared.core.events import (
     Failure,
@@ -27,7 +28,11 @@ from skytether.shared.core.events import (
     Flying,
     ModeChanged,
     NotFlown,
+    ServerHeard,
+    ServerSilent,
     StateLeapt,
+    Welcomed,
+    address_text,
     metres,
 )
 from skytether.shared.law.heartbeat import Hearing
@@ -42,6 +47,13 @@ VEHICLE_SOCKET = 1
 """Number of the socket through which the vehicle's own port talks; the server's is 0."""
 ARMED = keys_of(InFlight.ARMED)
 """Key with which a person says that plans may be flown."""
+WAITED_NS = 2 * SECOND_NS
+"""Time after which it is said what a vehicle waits for that cannot be flown yet [ns]."""
+SILENT_NS = 3 * SECOND_NS
+"""Time beyond the time-out after which the server of a vehicle on the ground counts as silent [ns].
+
+It answers two HELLOs a second: of eight, one comes through a network that loses a fifth each way.
+"""
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which it is said again that the fence holds the vehicle back [ns]."""
 AFTER_LEAP = "vehicle.after_leap"
@@ -123,6 +135,12 @@ class Client(Endpoint):
         self._land_after_s = scenario.vehicle.land_after_s
         self._leap_told: tuple[float, ...] | None = None
         """Leap that was told."""
+        self._waits_for, self._waits_ns, self._told_wait = "", 0, ""
+        """What is missing before it can be flown, since when, and what of that was said last."""
+        self._welcomed: int | None = None
+        """Number of the session that was told, of a vehicle that is not flown yet."""
+        self._silent_ns: int | None = None
+        """Time of the newest packet of a server that was said to be silent."""
         self._held_ns = 0
         """Time before which it is not said again that the fence holds the vehicle."""
         self.horizons = 0
@@ -278,8 +296,42 @@ class Client(Endpoint):
         """Hand on what the vehicle's port wants sent and said; its vehicle may be up now."""
         if self._pilot.next_ns is None:
             self._begin(now_ns)
+        if self._pilot.next_ns is None and not self.failure:
+            self._watch_ground(now_ns)
         self._out += [Datagram(said, peer, VEHICLE_SOCKET) for said, peer, _ in port.outbox()]
         self._events += port.events()
+
+    def _watch_ground(self, now_ns: int) -> None:
+        """Say what a vehicle waits for that is not flown yet, and how its link is meanwhile."""
+        session, (host, port) = self._session, self._server
+        waits_for = self._flies.waits_for
+        if session.number is None:
+            if self._flies.is_ready:
+                waits_for = f"an answer of the server at {address_text(host, port)}"
+        elif session.number != self._welcomed:
+            self._welcomed = session.number
+            self._events.append(Welcomed(vehicle=self.vehicle, host=host, port=port))
+        else:
+            self._watch_link(now_ns)
+        if waits_for != self._waits_for:
+            self._waits_for, self._waits_ns = waits_for, now_ns
+        if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._told_wait:
+            self._told_wait = waits_for
+            if waits_for:
+                self._events.append(AutopilotWaits(vehicle=self.vehicle, waits_for=waits_for))
+
+    def _watch_link(self, now_ns: int) -> None:
+        """Say that the server is silent, and that it is heard again."""
+        newest_ns = self._session.echo.received_ns
+        if self._silent_ns is not None:
+            if newest_ns > self._silent_ns:
+                silent_s = (newest_ns - self._silent_ns) / SECOND_NS
+                self._events.append(ServerHeard(vehicle=self.vehicle, silent_s=silent_s))
+                self._silent_ns = None
+        elif now_ns - newest_ns > self._timeout_ns + SILENT_NS:
+            self._silent_ns = newest_ns
+            silent_s = (now_ns - newest_ns) / SECOND_NS
+            self._events.append(ServerSilent(vehicle=self.vehicle, silent_s=silent_s))
 
     def _fly(self, now_ns: int) -> None:
         """Fly the step that is due, and tell the server."""

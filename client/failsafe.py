@@ -47,6 +47,7 @@ BROKEN = frozenset(
         Reason.MALFORMED,
         Reason.RESYNC,
         Reason.MUTE,
+        Reason.UNUSABLE,
     }
 )
 """Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""

@@ -90,6 +90,11 @@ class Vehicle(ABC):
         """Whether a server may be asked for a session: the vehicle is there, and set up safely."""
         return True
 
+    @property
+    def waits_for(self) -> str:
+        """What is missing before it can be flown, in words; empty where nothing is."""
+        return ""
+
     def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - most fly from the start
         """Whether the vehicle can be flown by velocities; asked until it can, it sees to that."""
         return True

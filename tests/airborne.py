@@ -164,6 +164,7 @@ class Air:
         self.autopilot = Autopilot(
             self.scenario,
             flavour,
+            peers=[("client", 1)] if self.scenario.vehicle.address.startswith("udp:") else [],
             ready_s=ready_s,
             faults=[parse_fault(each) for each in faults],
             recorder=Recorder(TRUTH_COLUMNS, self.truth),

@@ -57,6 +57,8 @@ class Companion:
         """Position that is sent with it [m]."""
         self.beats = True
         """Whether it sends heartbeats."""
+        self.kinds = [18, 6] if self.flavour.bytewise else [18]
+        """Kinds of its heartbeats: PX4 sends its texts to ground stations alone."""
         self.autopilot.wake(now_ns=self.now_ns)
 
     @property
@@ -85,7 +87,8 @@ class Companion:
         beat_ns = 0
         while self.now_ns < until_ns and not watch():
             if self.beats and self.now_ns >= beat_ns:
-                self.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+                for kind in self.kinds:
+                    self.send(dialect.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3))
                 beat_ns = self.now_ns + 1_000_000_000
             if self.velocity is not None:
                 self.setpoint()

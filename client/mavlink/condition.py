@@ -1,5 +1,7 @@
 """Condition of the vehicle, as its autopilot has told it last."""
 
+from math import isfinite
+
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -58,6 +60,8 @@ class Condition:
         """Voltage of the battery [V]."""
         self.home: tuple[float, float, float] | None = None
         """Latitude and longitude of home [°], and its altitude above the sea [m]."""
+        self.home_up = 0.0
+        """Altitude of home in the autopilot's local frame [m]."""
         self._is_bad: dict[str, bool] = {}
         """Whether the estimate is bad, by the message that says so."""
         self._astray_ns: int | None = None
@@ -94,6 +98,7 @@ class Condition:
                 self._bad("ESTIMATE", not knows, now_ns)
             case "HOME_POSITION":
                 self.home = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                self.home_up = -message.z if isfinite(message.z) else 0.0
 
     def _is_overtaken(self, number: int, now_ns: int) -> bool:
         if self._number_ns is None or now_ns - self._number_ns > OVERTAKEN_NS:

@@ -55,7 +55,11 @@ class Flavour:
     steps: tuple[LaunchStep, ...]
     """Way into the air."""
     streams_first: bool
-    """Whether setpoints must be coming before it goes into its guided mode."""
+    """Whether setpoints must be coming before it goes into its guided mode, and bring it back."""
+    words_for_stations: bool
+    """Whether it sends its texts to ground stations alone."""
+    time_out: str
+    """Name of the parameter for how long it waits for setpoints [s]."""
     above_sea: bool
     """Whether the altitude of take-off is told above the sea, and not above home."""
     bytewise: bool
@@ -89,6 +93,8 @@ ARDUPILOT = Flavour(
     own=frozenset({4}),
     steps=(LaunchStep.GUIDE, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB),
     streams_first=False,
+    words_for_stations=False,
+    time_out="GUID_TIMEOUT",
     above_sea=False,
     bytewise=False,
     submodes=False,
@@ -121,6 +127,8 @@ PX4 = Flavour(
     own=frozenset({_px4(4, 1), _px4(4, 2), _px4(4, 3), _px4(6)}),
     steps=(LaunchStep.HOLD, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB, LaunchStep.GUIDE),
     streams_first=True,
+    words_for_stations=True,
+    time_out="COM_OF_LOSS_T",
     above_sea=True,
     bytewise=True,
     submodes=True,

@@ -129,6 +129,8 @@ class Launch:
         """Whether nothing is to begin any more."""
         self._way_down = flavour.land
         """Number of the mode in which it comes down."""
+        self.waits_for = ""
+        """What is missing before it takes off, in words; empty where nothing is."""
         self._words = ""
         """Newest reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
@@ -192,7 +194,7 @@ class Launch:
             self.took_off = True
             self._enter(Phase.CLIMBING, now_ns)
         else:
-            self._since_ns = None
+            self._since_ns, self.waits_for = None, "armed = true"
 
     def _go_on(self, now_ns: int) -> None:
         """Fly a vehicle on that is in the air, or let it hover until its origin is known."""
@@ -223,7 +225,7 @@ class Launch:
             self.waits_for_word, self._asks_for_word = "", False
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
-        self.phase = phase
+        self.phase, self.waits_for = phase, ""
         self._begin_step(0, now_ns)
 
     def _begin_step(self, step: int, now_ns: int) -> None:
@@ -258,7 +260,7 @@ class Launch:
         condition = self._condition
         match step:
             case LaunchStep.HOLD:
-                return condition.mode in self._flavour.own
+                return condition.mode in self._flavour.own - {self._flavour.guided}
             case LaunchStep.GUIDE:
                 return condition.mode == self._flavour.guided
             case LaunchStep.ARM:
@@ -273,6 +275,8 @@ class Launch:
         """Wait for the autopilot, but no longer than it may take."""
         if self._since_ns is None:
             self._since_ns = now_ns
+        if self.phase is Phase.GROUND:
+            self.waits_for = f"its autopilot, {doing}: {why}"
         if now_ns - self._since_ns > self._patience_ns:
             waited = f"{doing} in {self._patience_ns / SECOND_NS:g} s"
             self._fail(waited, self._silence(now_ns) or self._words or why, now_ns)
@@ -381,7 +385,9 @@ class Launch:
             if self._condition.home is None:
                 self._words = "it does not know where home is"
                 return None
-            altitude += self._condition.home[2]
+            # Home was set some time ago, and the estimate of the height has drifted since.
+            ground = self._positions.origin[2] - self._condition.home_up
+            altitude += self._condition.home[2] + ground
         nan = float("nan")
         return self._long(TAKE_OFF, 0.0, 0.0, 0.0, nan, nan, nan, altitude)
 

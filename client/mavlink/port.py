@@ -7,35 +7,46 @@ nothing in here repeats what was said by somebody who is gone.
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
-from skytether.client.mavlink.clock import BootClock
+from skytether.client.mavlink.clock import DRIFT_MAX, BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
-from skytether.client.mavlink.launch import Launch, Phase
+from skytether.client.mavlink.launch import (
+    ACCEPTED,
+    IN_PROGRESS,
+    QUIET_NS,
+    RESULTS,
+    Launch,
+    Phase,
+)
 from skytether.client.mavlink.obedience import Obedience
 from skytether.client.mavlink.positions import Positions, Vector
 from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
+from skytether.client.mavlink.texts import SAME_TEXT_NS, LoggedTexts
 from skytether.client.navigation import Leaps
 from skytether.client.vehicle import Frame
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
-from skytether.mavlink.text import Texts
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import (
     AboardEvent,
     AboardFailure,
+    AutopilotElsewhere,
     AutopilotMode,
+    AutopilotMoved,
     AutopilotRefused,
-    AutopilotText,
     NotTakenOff,
+    PositionsDropped,
     SecondCommander,
     Strays,
 )
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.core.events import address_text
 from skytether.shared.core.line import Line
 from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
@@ -51,6 +62,9 @@ UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
 SETPOINTS_MAX_HZ = 50.0
 """Largest number of setpoints in a second."""
+LOOK_NS = 300 * MILLISECOND_NS
+"""Time after a pause of setpoints from which on a heartbeat tells of now [ns]: those before it may
+have waited for us in a queue."""
 LATE = 1.1
 """Share of the time between two setpoints after which one is repeated: a step may come late."""
 ZERO_NS = 50 * MILLISECOND_NS
@@ -59,10 +73,8 @@ FRESH_NS = 200 * MILLISECOND_NS
 """Age up to which a velocity is compared with what was told [ns]."""
 CLOSES = 3
 """Times that a vehicle in the air is told to land when its process ends."""
-SAME_TEXT_NS = 30 * SECOND_NS
-"""Time for which a text is not told again [ns]."""
-TEXTS_KEPT = 16
-"""Texts that are remembered."""
+ADDRESSES_TOLD = 4
+"""Most addresses of others that are told while the autopilot is silent."""
 VELOCITY_ALONE = 0b110111000111
 """Type mask of a setpoint: neither position nor acceleration, nor yaw or its rate."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
@@ -120,11 +132,24 @@ class Port(Endpoint):
         altitude: altitude to take off to [m].
     """
 
+    _setup: Setup | None = None
+    """Judge of its parameters; None, as its launch and its streams, before it was heard."""
+    _launch: Launch | None = None
+    _streams: Streams | None = None
+    _unfit: NotTakenOff | None = None
+    """Event after which it is not flown, of one that is unfit or was not heard."""
+    _set_up_ns: int | None = None
+    """Time at which all was set up but the clock."""
+
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, altitude: float) -> None:
         super().__init__()
         self._keys = keys = scenario.mavlink
         self._vehicle, self._altitude = vehicle, altitude
         self._peer: Address | None = line.peer
+        self._line, self._may_move = scenario.vehicle.address, line.kind == "udp"
+        """Line, and whether the autopilot may have another address on it after a restart."""
+        self._elsewhere: list[Address] = []
+        """Other addresses from which something came while the autopilot was silent."""
         self._codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self._clock = BootClock()
         self._condition = Condition(keys.battery_min, keys.battery_min_v)
@@ -136,22 +161,19 @@ class Port(Endpoint):
             leaps=Leaps(scenario),
         )
         """Measurements."""
-        self._texts = Texts()
-        self._told_ns: dict[str, int] = {}
-        """Texts that were told, and when."""
+        self._texts = LoggedTexts(vehicle, self._events)
         self.sets_parameters = False
         """Whether parameters that are not safe are set."""
         self._target: tuple[int, int] | None = None
         """Numbers of the autopilot's system and component; None before it was heard."""
         self._flavour: Flavour = ARDUPILOT
-        self._setup: Setup | None = None
-        self._launch: Launch | None = None
-        self._streams: Streams | None = None
-        self._unfit: NotTakenOff | None = None
         self._counts: Counter[str] = Counter()
         self.now_ns = 0
         """Time of the newest call."""
         self._began_ns: int | None = None
+        self._jumps, self._unusable = 0, False
+        """Jumps of the clock before it was set up; whether it was told that positions are
+        dropped."""
         self._tick_ns = 0
         self._beat_ns = self._clock_ns = 0
         """Times of the next heartbeat, and of the next question for the clock."""
@@ -161,6 +183,8 @@ class Port(Endpoint):
         """Time at which the pilot said so; None before he did."""
         self._sent_ns: int | None = None
         """Time of the newest setpoint."""
+        self._looks_ns: int | None = None
+        """Time since which setpoints wait for the mode to be heard, after a pause; else None."""
         each = scenario.dt_ns
         parts = -(-each * keys.setpoints_hz // SECOND_NS)
         self._repeat_ns = round(LATE * each / parts)
@@ -183,9 +207,26 @@ class Port(Endpoint):
         return self._setup is not None and self._setup.is_done and self._clock.is_known
 
     @property
+    def waits_for(self) -> str:
+        """What is missing before the vehicle can be flown, in words; empty where nothing is."""
+        if self._setup is None or self._launch is None:
+            return f"a heartbeat of its autopilot at {self._line}"
+        if not self._setup.is_done:
+            return self._setup.waits_for
+        return self._launch.waits_for if self._clock.is_known else self._clock_fault()
+
+    def _clock_fault(self) -> str:
+        """What is missing of a clock that is not known, in words."""
+        rate = self._clock.wrong_rate
+        if rate is None:
+            return "an answer of its autopilot to TIMESYNC"
+        expected = f"expected 1 within {DRIFT_MAX:.0%}"
+        return f"a clock of its autopilot that can be followed: its speed is {rate:.3g}, {expected}"
+
+    @property
     def failure(self) -> AboardFailure | None:
         """Event after which the vehicle is not flown."""
-        if self._setup is None or self._launch is None:
+        if self._unfit or self._setup is None or self._launch is None:
             return self._unfit
         return self._setup.failure or self._launch.failure
 
@@ -244,10 +285,33 @@ class Port(Endpoint):
             return Reason.ASTRAY
         if condition.battery_is_low(now_ns=now_ns):
             return Reason.BATTERY
-        silence_ns = seconds_to_ns(self._keys.silence_s)
-        came_ns = self.positions.came_ns
-        silent = came_ns is None or now_ns - came_ns > silence_ns
-        return Reason.MUTE if silent or not condition.is_fresh(now_ns=now_ns) else None
+        return self._silence(now_ns)
+
+    def _silence(self, now_ns: int) -> Reason | None:
+        """Cause that the autopilot says nothing that can be used, if that is so."""
+        if not self._is_past(self.positions.came_ns, now_ns):
+            self._unusable = False
+            return None if self._condition.is_fresh(now_ns=now_ns) else Reason.MUTE
+        if self._is_past(self.positions.heard_ns, now_ns):
+            return Reason.MUTE
+        self._tell_unusable()
+        return Reason.UNUSABLE
+
+    def _is_past(self, came_ns: int | None, now_ns: int) -> bool:
+        """Whether something came longer ago than the autopilot may be silent."""
+        return came_ns is None or now_ns - came_ns > seconds_to_ns(self._keys.silence_s)
+
+    def _tell_unusable(self) -> None:
+        """Say once why no position can be used."""
+        if self._unusable or not self.positions.fault:
+            return
+        self._unusable = True
+        fault = self.positions.fault
+        if (rate := self._clock.wrong_rate) is not None:
+            fault += (
+                f", and the speed of its clock is {rate:.3g}, expected 1 within {DRIFT_MAX:.0%}"
+            )
+        self._events.append(PositionsDropped(vehicle=self._vehicle, why=fault))
 
     def _rival(self, now_ns: int) -> Reason | None:
         """How a second commander is noticed; None where there is none."""
@@ -300,8 +364,11 @@ class Port(Endpoint):
         self.now_ns = now_ns
         if self._peer is not None and datagram.peer != self._peer:
             self._counts["elsewhere"] += 1
+            if self._is_quiet(now_ns):
+                self._hear_elsewhere(datagram, now_ns)
             return
-        for message in self._codec.decode(datagram.payload):
+        messages = self._codec.decode(datagram.payload)
+        for message in messages:
             sender = message.get_srcSystem(), message.get_srcComponent()
             if self._target is None and message.get_type() == "HEARTBEAT":
                 self._meet(message, sender, datagram.peer)
@@ -313,6 +380,59 @@ class Port(Endpoint):
             else:
                 self._counts["heard"] += 1
                 self._hear(message, now_ns)
+        if self._target is None and self._is_quiet(now_ns) and self._may_move:
+            self._tell_elsewhere(datagram.peer, messages)
+
+    def _is_quiet(self, now_ns: int) -> bool:
+        """Whether the autopilot has been silent for a while, at the address that it has."""
+        since_ns = self._condition.heard_ns or self._began_ns or now_ns
+        return now_ns - since_ns > QUIET_NS
+
+    def _hear_elsewhere(self, datagram: Datagram, now_ns: int) -> None:
+        """Take the autopilot from its new address, where it may have one, or say what comes."""
+        codec = Codec(self._keys.system, self._keys.component)
+        messages = codec.decode(datagram.payload)
+        for message in messages:
+            sender = message.get_srcSystem(), message.get_srcComponent()
+            same = sender == self._target and message.get_type() == "HEARTBEAT"
+            if same and self._may_move and self._is_on_the_ground(message):
+                self._move(datagram.peer)
+                self.receive(datagram, now_ns=now_ns)
+                return
+        self._tell_elsewhere(datagram.peer, messages)
+
+    def _tell_elsewhere(self, peer: Address, messages: Sequence[Message]) -> None:
+        """Say once of each address that what comes from there is not the autopilot's."""
+        if peer in self._elsewhere or len(self._elsewhere) == ADDRESSES_TOLD:
+            return
+        self._elsewhere.append(peer)
+        expected = address_text(*self._peer) if self._peer else self._line
+        said = AutopilotElsewhere(
+            vehicle=self._vehicle,
+            came_from=address_text(*peer),
+            expected=expected,
+            content=_content(messages),
+        )
+        self._events.append(said)
+
+    def _is_on_the_ground(self, heartbeat: Message) -> bool:
+        """Whether the vehicle was disarmed before its silence, and says so now."""
+        armed = heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED
+        return not (self._condition.armed or armed)
+
+    def _move(self, peer: Address) -> None:
+        """Go on with the autopilot at another address: it has restarted, so all is set up anew."""
+        assert self._peer is not None
+        before, after = address_text(*self._peer), address_text(*peer)
+        self._events.append(AutopilotMoved(vehicle=self._vehicle, before=before, after=after))
+        self._peer = peer
+        self._elsewhere.clear()
+        self._set_up_anew()
+
+    def _set_up_anew(self) -> None:
+        """Look at the parameters of an autopilot that has restarted, before a flight alone."""
+        if self._target is not None and self._launch and self._launch.phase is Phase.GROUND:
+            self._set_up(self._target)
 
     def _hear_other(self, message: Message, sender: tuple[int, int], now_ns: int) -> None:
         """Take a message of neither the autopilot nor us."""
@@ -331,8 +451,13 @@ class Port(Endpoint):
             self._unfit = NotTakenOff(vehicle=self._vehicle, doing="not flown", why=why)
             self._events.append(self._unfit)
             return
-        keys = self._keys
-        self._flavour = flavour = FLAVOURS[message.autopilot]
+        self._flavour = FLAVOURS[message.autopilot]
+        self._set_up(sender)
+
+    def _set_up(self, sender: tuple[int, int]) -> None:
+        """Begin to look at the parameters, and to ask for streams."""
+        keys, flavour = self._keys, self._flavour
+        self._set_up_ns = None
         self._setup = Setup(
             self._vehicle,
             flavour,
@@ -387,8 +512,13 @@ class Port(Endpoint):
             case "TIMESYNC":
                 taken = self._clock.hear(message.tc1, message.ts1, now_ns=now_ns)
                 self._counts["untimely"] += not taken
+                if self._clock.jumps != self._jumps and self._clock.wrong_rate is None:
+                    self._jumps = self._clock.jumps
+                    self._set_up_anew()  # as after a reboot
             case "STATUSTEXT":
-                self._hear_text(message, launch, now_ns)
+                text = self._texts.hear(message, now_ns=now_ns)
+                if text and message.severity <= WARNING:
+                    launch.heard_words(text)
             case "COMMAND_ACK" if message.command == SET_INTERVAL:
                 self._hear_interval(message.result)
             case "COMMAND_ACK":
@@ -396,30 +526,13 @@ class Port(Endpoint):
             case _:
                 self._setup.hear(message)
 
-    def _hear_text(self, message: Message, launch: Launch, now_ns: int) -> None:
-        said = self._texts.take(message)
-        if not said:
-            return
-        text = "".join(letter if letter.isprintable() else "?" for letter in said)
-        if message.severity <= WARNING:
-            launch.heard_words(text)
-        told_ns = self._told_ns.pop(text, None)
-        if told_ns is not None and now_ns - told_ns < SAME_TEXT_NS:
-            self._told_ns[text] = told_ns
-            return
-        self._told_ns[text] = now_ns
-        if len(self._told_ns) > TEXTS_KEPT:
-            del self._told_ns[next(iter(self._told_ns))]
-        self._events.append(
-            AutopilotText(vehicle=self._vehicle, text=text, severity=message.severity)
-        )
-
     def _hear_interval(self, result: int) -> None:
         """Count a refusal of a stream, and tell the first."""
-        if result == dialect.MAV_RESULT_ACCEPTED:
+        if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._counts["streams_refused"]:
-            asked, answer = "send a stream at its rate", f"result {result}"
+            asked = f"send {self._streams.newest if self._streams else 'a stream'} at its rate"
+            answer = RESULTS.get(result, f"result {result}")
             self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
         self._counts["streams_refused"] += 1
 
@@ -444,26 +557,19 @@ class Port(Endpoint):
 
     def _tick(self, now_ns: int) -> None:
         assert self._began_ns is not None
+        self._texts.tick(now_ns=now_ns)
         if self._peer is not None and now_ns >= self._beat_ns and not self._is_given_up(now_ns):
             self._beat_ns = now_ns + HEARTBEAT_NS
-            self._say(
-                dialect.MAVLink_heartbeat_message(
-                    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-                    dialect.MAV_AUTOPILOT_INVALID,
-                    0,
-                    0,
-                    dialect.MAV_STATE_ACTIVE,
-                    3,
-                )
-            )
+            self._say(_heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER))
+            if self._may_be_station():
+                self._say(_heartbeat(dialect.MAV_TYPE_GCS))
         if self._setup is None or self._launch is None or self._streams is None:
             patience_ns = seconds_to_ns(self._keys.patience_s)
             if self._target is None and now_ns - self._began_ns > patience_ns and not self._unfit:
                 why = "no heartbeat of an autopilot has come, see vehicle.address"
-                doing = f"not heard in {self._keys.patience_s:g} s"
-                self._unfit = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
-                self._events.append(self._unfit)
+                self._give_up("not heard", why)
             return
+        self._await_clock(now_ns)
         if now_ns >= self._clock_ns:
             self._clock_ns = now_ns + (CLOCK_NS if self._clock.is_known else CLOCK_BEGIN_NS)
             self._say(dialect.MAVLink_timesync_message(0, self._clock.ask(now_ns=now_ns)))
@@ -482,6 +588,35 @@ class Port(Endpoint):
         lands = launch is not None and launch.phase is Phase.LANDING
         return lands and not self._condition.is_fresh(now_ns=now_ns)
 
+    def _may_be_station(self) -> bool:
+        """Whether we tell PX4 that we are a ground station too: it says nothing in words to others.
+
+        Not where PX4 acts when it loses its ground station: it would miss the loss of another one.
+        """
+        setup = self._setup
+        return (
+            setup is not None
+            and setup.is_done
+            and self._flavour.words_for_stations
+            and setup.value("NAV_DLL_ACT") == 0.0
+        )
+
+    def _await_clock(self, now_ns: int) -> None:
+        """Give up where everything but the clock was set up long ago."""
+        assert self._setup is not None
+        if not self._setup.is_done or self._clock.is_known or self._unfit:
+            self._set_up_ns = None
+        elif self._set_up_ns is None:
+            self._set_up_ns = now_ns
+        elif now_ns - self._set_up_ns > seconds_to_ns(self._keys.patience_s):
+            self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
+
+    def _give_up(self, doing: str, why: str) -> None:
+        """Fail: something has not come in time."""
+        doing = f"{doing} in {self._keys.patience_s:g} s"
+        self._unfit = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
+        self._events.append(self._unfit)
+
     def _setpoint_ns(self) -> int | None:
         """Time of the next setpoint; None where none is to be sent."""
         launch, sent_ns = self._launch, self._sent_ns
@@ -489,7 +624,7 @@ class Port(Endpoint):
             return None
         if launch.streams_zeros:
             return self.now_ns if sent_ns is None else sent_ns + ZERO_NS
-        if not self._may_fly():
+        if not self._may_fly() or self._looks_ns is not None:
             return None
         assert self._flown_ns is not None
         due_ns = self._flown_ns if sent_ns is None else sent_ns + self._repeat_ns
@@ -507,12 +642,29 @@ class Port(Endpoint):
             and condition.mode == self._flavour.guided
         )
 
+    def _may_go_on(self, now_ns: int) -> bool:
+        """Whether setpoints may go on; after a long pause the autopilot has to be heard first.
+
+        PX4 has left its guided mode then, and the first setpoint would bring it back by itself.
+        """
+        if not self._flavour.streams_first or self._sent_ns is None or self._setup is None:
+            return True
+        loss_s = self._setup.value(self._flavour.time_out) or 0.0
+        if self._looks_ns is None and now_ns - self._sent_ns > seconds_to_ns(loss_s):
+            self._looks_ns = now_ns
+        if self._looks_ns is None:
+            return True
+        heard_ns = self._condition.heartbeat_ns
+        if heard_ns is not None and heard_ns - self._looks_ns >= LOOK_NS:
+            self._looks_ns = None
+        return self._looks_ns is None
+
     def _send_velocity(self, now_ns: int) -> None:
         """Send the velocity that is flown, or zero where a stream of that is wanted."""
         launch = self._launch
         if launch is None or self._target is None:
             return
-        if not (launch.streams_zeros or self._may_fly()):
+        if not (launch.streams_zeros or (self._may_fly() and self._may_go_on(now_ns))):
             return
         velocity = (0.0, 0.0, 0.0) if launch.streams_zeros else self._velocity
         north, east, down = turned(velocity)
@@ -581,3 +733,18 @@ class Port(Endpoint):
         if self._setup is not None and self._setup.fence:
             told["fence"] = self._setup.fence
         return told
+
+
+def _content(messages: Sequence[Message]) -> str:
+    """Content of a datagram in words."""
+    if not messages:
+        return "what is no MAVLink"
+    newest = messages[-1]
+    sender = f"system {newest.get_srcSystem()}, component {newest.get_srcComponent()}"
+    return f"{newest.get_type()} of {sender}"
+
+
+def _heartbeat(kind: int) -> Message:
+    """Heartbeat of a MAV_TYPE that is no autopilot."""
+    active = dialect.MAV_STATE_ACTIVE
+    return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, active, 3)

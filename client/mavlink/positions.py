@@ -30,6 +30,17 @@ DRIFT_PARTS = 40
 SPEED_MAX = 1e3
 """Largest speed on an axis that is believed [m/s]."""
 
+FAULTS = {
+    "not_finite": "they are not finite",
+    "far": "they are further away, or faster, than can be",
+    "unsynchronised": "the autopilot's clock is not known",
+    "doubled": "they come twice",
+    "impossible": "their stamps lie in the future",
+    "old": f"they are older than {OLD_NS / SECOND_NS:g} s",
+    "late": "older ones come after newer ones",
+}
+"""Reasons for which a position is dropped, in words."""
+
 Vector = tuple[float, float, float]
 
 
@@ -83,10 +94,19 @@ class Positions:
         """Newest velocity, in our axes [m/s]."""
         self.came_ns: int | None = None
         """Time at which the newest measurement came."""
+        self.heard_ns: int | None = None
+        """Time at which the newest came that was taken or dropped."""
         self.taken = 0
         """Number of measurements taken."""
         self.dropped: Counter[str] = Counter()
         """Number of those that were dropped, by reason."""
+        self._fault = ""
+        """Reason for which the newest was dropped; empty where it was taken."""
+
+    @property
+    def fault(self) -> str:
+        """Reason for which the newest was dropped, in words; empty where it was taken."""
+        return FAULTS.get(self._fault, "")
 
     @property
     def altitude(self) -> float:
@@ -95,7 +115,8 @@ class Positions:
 
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Take a message, or drop and count it."""
-        reason = self._wrong(message, now_ns)
+        self.heard_ns = now_ns
+        self._fault = reason = self._wrong(message, now_ns)
         if reason:
             self.dropped[reason] += 1
             return

@@ -88,6 +88,17 @@ class Setup:
         """Parameters of the autopilot's own fence that are known: values by name."""
         return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
 
+    def value(self, name: str) -> float | None:
+        """Value of a parameter; None where it is not known."""
+        return self._values.get(name)
+
+    @property
+    def waits_for(self) -> str:
+        """What is not known yet, in words."""
+        if self._version is None:
+            return "the version of its autopilot"
+        return f"parameters of its autopilot: {', '.join(list(self._tries)[:AT_ONCE])}"
+
     # What is heard
 
     def hear(self, message: Message) -> None:

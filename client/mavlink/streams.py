@@ -45,6 +45,8 @@ class Streams:
 
     def __init__(self, rates: Mapping[int, float], target: tuple[int, int]) -> None:
         self._target = target
+        self.newest = ""
+        """Name of the message that was asked for last."""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
 
     def hear(self, number: int) -> None:
@@ -63,6 +65,7 @@ class Streams:
             stream.window_ns = stream.least_ns if comes else max(stream.least_ns, longer_ns)
             stream.until_ns, stream.count = now_ns + stream.window_ns, 0
             if not comes:
+                self.newest = dialect.mavlink_map[number].msgname
                 command = dialect.MAVLink_command_long_message(
                     *self._target,
                     SET_INTERVAL,

@@ -65,6 +65,11 @@ class MavlinkVehicle(Vehicle):
         """See `Vehicle`."""
         return self._port.is_ready
 
+    @property
+    def waits_for(self) -> str:
+        """See `Vehicle`."""
+        return self._port.waits_for
+
     def take_off(self, *, now_ns: int) -> bool:
         """See `Vehicle`; a vehicle on the ground is armed only where its scenario is."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)

@@ -86,6 +86,62 @@ class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}, its autopilot: {self.text}"
 
 
+class TextsOmitted(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's autopilot has said more in words than is logged one by one."""
+
+    count: int
+    """Number of texts that were not logged."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: {self.count} more texts of its autopilot are not logged"
+
+
+class AutopilotWaits(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle on the ground cannot be flown yet."""
+
+    waits_for: str
+    """What is missing, in words."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle} waits for {self.waits_for}"
+
+
+class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
+    """Datagrams come to the line of a silent autopilot from another address, and are dropped."""
+
+    came_from: str
+    """HOST:PORT of their sender."""
+    expected: str
+    """HOST:PORT of the autopilot."""
+    content: str
+    """What they contain, in words."""
+
+    def __str__(self) -> str:
+        silent = f"vehicle {self.vehicle}: nothing comes from its autopilot at {self.expected}"
+        return f"{silent}; {self.content} from {self.came_from} is dropped"
+
+
+class AutopilotMoved(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle on the ground hears its autopilot from another address after a silence."""
+
+    before: str
+    """HOST:PORT that it had."""
+    after: str
+    """HOST:PORT that it has."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: its autopilot is at {self.after}, it was at {self.before}"
+
+
+class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
+    """Positions come from a vehicle's autopilot, but none of them can be used."""
+
+    why: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: positions of its autopilot are dropped: {self.why}"
+
+
 class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle's autopilot is in another mode, or has been armed or disarmed."""
 
@@ -184,6 +240,11 @@ AboardEvent = (
     | ParametersSet
     | AutopilotRefused
     | AutopilotText
+    | TextsOmitted
+    | AutopilotWaits
+    | AutopilotElsewhere
+    | AutopilotMoved
+    | PositionsDropped
     | AutopilotMode
     | ArmingAwaited
     | OriginAwaited

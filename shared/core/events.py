@@ -376,6 +376,38 @@ class Unanswered(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: no answer from {at} yet, asking for another {left}"
 
 
+class Welcomed(VehicleEvent, frozen=True, kw_only=True):
+    """The server has opened a session for a vehicle that cannot be flown yet."""
+
+    host: str
+    """Host that the vehicle says HELLO to."""
+    port: int
+
+    def __str__(self) -> str:
+        at = address_text(self.host, self.port)
+        return f"vehicle {self.vehicle}: session open with the server at {at}"
+
+
+class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle that is not flown yet hears nothing of the server any more."""
+
+    silent_s: float
+    """Time since the newest packet [s]."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: the server has been silent for {self.silent_s:.1f} s"
+
+
+class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle that is not flown yet hears the server again."""
+
+    silent_s: float
+    """Time without a packet [s]."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: the server is heard again, after {self.silent_s:.1f} s"
+
+
 class Flying(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle's first session has opened, and with it the flight has begun."""
 
@@ -597,6 +629,9 @@ Event = (
     | Unanswered
     | HostMissing
     | HostFound
+    | Welcomed
+    | ServerSilent
+    | ServerHeard
     | Flying
     | ModeChanged
     | PlanningStopped

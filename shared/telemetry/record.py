@@ -64,6 +64,7 @@ class Reason(IntEnum):
     HOMEWARD = 26
     RIVAL = 27
     STRAYED = 28
+    UNUSABLE = 29
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -99,6 +100,7 @@ REASON_TEXTS = {
     Reason.STRAYED: "it does not do what it is told",
     Reason.WAITED: "what it waits for has not come for long",
     Reason.RESUMED: "its process has restarted, and it goes on along its motion",
+    Reason.UNUSABLE: "the positions of its autopilot cannot be used",
 }
 
 

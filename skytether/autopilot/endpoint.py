@@ -69,6 +69,8 @@ class Peer:
         self.address, self.pinned = address, pinned
         self.codec = Codec(SYSTEM, COMPONENT)
         self.heard_ns = now_ns
+        self.is_station = False
+        """Whether a heartbeat of a ground station came from it."""
         self.listed: int | None = None
         """Number of parameters sent of a requested list; None without a request."""
         self.streams: dict[int, tuple[int, int]] = {}
@@ -265,7 +267,8 @@ class Autopilot(Endpoint):
             self._texts = self._texts % 65535 + 1
             for message in chunks(int(severity), text, self._texts):
                 for peer in self._peers.values():
-                    self._send(peer, message)
+                    if peer.is_station or not self._flavour.words_for_stations:
+                        self._send(peer, message)
         self.flight.said.clear()
 
     def _list(self, peer: Peer) -> None:
@@ -282,6 +285,7 @@ class Autopilot(Endpoint):
     # Incoming messages
 
     def _on_heartbeat(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        peer.is_station |= message.type == dialect.MAV_TYPE_GCS
         if self.flight.is_station(message.get_srcSystem(), message.type):
             self.flight.station_ns = self.flight.now_ns
 

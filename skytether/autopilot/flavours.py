@@ -51,6 +51,8 @@ class SimulatedFlavour:
     """Frame in the autopilot's own simulator, or the nearest one."""
     ready_s: float
     """Time from the start until it may be armed, in which position and filters settle [s]."""
+    words_for_stations: bool
+    """Whether its texts go to ground stations alone, as PX4's do."""
     spool_s: float
     """Time from the take-off command until it climbs [s]."""
     home: tuple[float, float, float]
@@ -84,6 +86,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         gains=ARDUPILOT,
         frame="1.5kg",
         ready_s=41.5,
+        words_for_stations=False,
         spool_s=3.4,
         home=(-35.363262, 149.165237, 584.0),
         modes={
@@ -143,6 +146,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         gains=PX4,
         frame="sih",
         ready_s=4.6,
+        words_for_stations=True,
         spool_s=1.0,
         home=(47.397742, 8.545594, 489.4),
         modes={

@@ -1,17 +1,24 @@
-"""PX4 1.17, as measured: it leaves OFFBOARD when set-points stop, and flies home."""
+"""PX4 1.17, as measured: it leaves OFFBOARD when set-points stop, and flies home.
+
+A failsafe covers the mode that was asked for: when set-points come again, PX4 is back in OFFBOARD
+by itself. After disarming it is in the newest mode asked for that may be armed, such as OFFBOARD
+after a landing.
+"""
 
 from math import hypot, isfinite, radians, tan
 
-from skytether.autopilot.flavours import FlightMode
+from skytether.autopilot.flavours import FlightMode, SimulatedFlavour
 from skytether.autopilot.flight import (
     CompanionSetpoint,
     OwnSpeeds,
     PilotedVehicle,
     Result,
     Severity,
+    Vector,
 )
 from skytether.mavlink.dialect import dialect
 from skytether.quadrotor.loops import Gains
+from skytether.quadrotor.quadrotor import Quadrotor
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
@@ -24,6 +31,8 @@ STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 """Modes by the value of NAV_DLL_ACT."""
 BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
 """Modes by the value of COM_LOW_BAT_ACT."""
+UNARMABLE = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN)
+"""Modes in which PX4 does not stay after disarming."""
 FENCE_ACTIONS = {2: FlightMode.HOLD, 3: FlightMode.RETURN, 5: FlightMode.LAND}
 """Modes by the value of GF_ACTION."""
 
@@ -35,10 +44,42 @@ class PX4(PilotedVehicle):
     arming_word = ""
     lifts_off_by_setpoint = True
 
-    def why_not_armed(self) -> str:
+    def __init__(self, flavour: SimulatedFlavour, quadrotor: Quadrotor, ready_s: float) -> None:
+        super().__init__(flavour, quadrotor, ready_s)
+        self._covered = False
+        """Whether a failsafe covers OFFBOARD until set-points come again."""
+        self._after_disarming = flavour.first
+        """Mode in which it is after disarming."""
+
+    def switch(self, number: int) -> Result:
         """See `PilotedVehicle`."""
-        if not self.ready:
-            return "Arming denied: Resolve system health failures first"
+        result = super().switch(number)
+        if result is Result.ACCEPTED:
+            self._covered = False
+            if self.flavour.modes[number][1] not in UNARMABLE:
+                self._after_disarming = number
+        return result
+
+    def disarm(self, *, force: bool = False) -> Result:
+        """See `PilotedVehicle`."""
+        result = super().disarm(force=force)
+        if result is Result.ACCEPTED:
+            self._covered = False
+            self.enter(self._after_disarming)
+        return result
+
+    def want(self, velocity: Vector, position: Vector | None) -> None:
+        """See `PilotedVehicle`."""
+        super().want(velocity, position)
+        if self._covered:
+            self._covered = False
+            self.enter(self.flavour.number(FlightMode.GUIDED))
+
+    def why_not_armed(self) -> str:
+        """See `PilotedVehicle`; PX4 ends its texts with a tabulator."""
+        unguided = self.mode is FlightMode.GUIDED and self.why_not_guided()
+        if unguided or not self.ready:
+            return "Arming denied: Resolve system health failures first\t"
         if self.quadrotor.battery().charge < self.parameters["BAT_LOW_THR"]:
             return "Arming denied: low battery"
         if self.mode is FlightMode.PILOT:
@@ -120,6 +161,7 @@ class PX4(PilotedVehicle):
         value = int(self.parameters["COM_OBL_RC_ACT"])
         mode = OFFBOARD_ACTIONS.get(value, FlightMode.RETURN)
         self.act(mode, "Failsafe activated: no offboard signal")
+        self._covered = True
         return True
 
     def watch(self) -> None:

@@ -1,14 +1,33 @@
-"""What actual autopilots were seen to do, shown by the scripted ones."""
+"""What actual autopilots were seen to do, shown by the scripted ones, and what the client says."""
+
+from collections.abc import Callable
 
 import pytest
 
 from airborne import Air, modes
-from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flavours import FlavourName, FlightMode
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.netem.proxy import Proxy
+from skytether.shared.core.aboard import (
+    AutopilotElsewhere,
+    AutopilotMoved,
+    AutopilotRefused,
+    AutopilotText,
+    AutopilotWaits,
+    NotTakenOff,
+    ParametersRead,
+    PositionsDropped,
+    TextsOmitted,
+)
+from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import ServerHeard, ServerSilent, Welcomed
+from skytether.shared.telemetry.record import Reason
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 
 
-# -- the clock --------------------------------------------------------------------------------
+# The clock
 
 
 @pytest.mark.parametrize("ppm", [-20_000.0, -8600.0, 20_000.0])
@@ -21,3 +40,228 @@ def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None
     assert sum(told["dropped"].values()) < 10, told
     assert told["drift_ppm"] == pytest.approx(-ppm, rel=0.03)
     assert not [mode for mode in modes(air) if mode[0] == "brake"]
+
+
+def test_a_simulator_that_runs_faster_than_time_is_not_flown_and_its_speed_is_told() -> None:
+    """Five times as fast: no clock of ours follows that."""
+    air = Air(autopilot_ppm=4e6, mavlink={"patience_s": 5.0})
+    air.run(20.0, lambda: bool(air.of(NotTakenOff)))
+    (failed,) = air.of(NotTakenOff)
+    assert "speed is 5" in failed.why
+    assert not air.flight.armed
+
+
+def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
+    """The autopilot's stamps jump into the future: it brakes, and says why."""
+    air = Air("px4", duration=30.0)
+    air.fly()
+
+    def ahead(message: Message) -> bytes | None:
+        if message.get_type() != "LOCAL_POSITION_NED":
+            return None
+        message.time_boot_ms += 60_000
+        return Codec(1, 1).encode(message)
+
+    air.run(3.0)
+    air.tap.alter = ahead
+    air.run(2.0)
+    assert ("brake", str(Reason.UNUSABLE)) in modes(air)
+    (dropped,) = air.of(PositionsDropped)
+    assert "future" in dropped.why
+    air.tap.alter = None
+    air.run(5.0)
+    assert modes(air)[-1][0] == "track"
+
+
+# Flights after another
+
+
+@pytest.mark.parametrize("flavour", BOTH)
+def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> None:
+    """After a landing PX4 is in OFFBOARD, in which it is not armed without set-points."""
+    air = Air(flavour, duration=5.0)
+    air.fly()
+    air.end()
+    for _ in range(2):
+        air.events.clear()
+        air.restart(remembers=False)
+        air.fly()
+        air.end()
+        assert not air.of(AutopilotRefused)
+
+
+def test_px4_says_why_it_is_not_armed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own words reach the log without their tabulator, and are the reason given at the end."""
+    air = Air("px4", mavlink={"patience_s": 4.0})
+    words = "Arming denied: Resolve system health failures first"
+    monkeypatch.setattr(air.flight, "why_not_armed", lambda: f"{words}\t")
+    air.run(30.0, lambda: bool(air.of(NotTakenOff)))
+    assert words in [each.text for each in air.of(AutopilotText)]
+    assert [each.why for each in air.of(NotTakenOff)] == [words]
+
+
+def test_the_altitude_of_take_off_is_above_the_ground_it_stands_on() -> None:
+    """PX4's estimate of the height had drifted by 1.3 m since home was set: it climbed to 3.7 m."""
+    air = Air("px4", duration=5.0)
+
+    def drifted(message: Message) -> bytes | None:
+        if message.get_type() != "HOME_POSITION":
+            return None
+        message.altitude -= 1300
+        message.z = 1.3
+        return Codec(1, 1).encode(message)
+
+    air.tap.alter = drifted
+    air.fly()
+    assert air.flight.position()[2] == pytest.approx(2.0, abs=0.3)
+
+
+def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keeps_it() -> None:
+    """The client stands still for 3 s. PX4 would be back in OFFBOARD on the first set-point."""
+    air = Air("px4", duration=60.0)
+    air.fly()
+    air.run(4.0)
+    air.world.freeze("client")
+    air.tap.dumb = True
+    air.run(3.0)
+    assert air.flight.mode is FlightMode.LAND
+    air.tap.dumb = False
+    thawed_ns = air.world.now_ns
+    air.world.thaw("client")
+    air.run(2.0)
+    assert not air.setpoints(thawed_ns)
+    assert air.flight.mode is FlightMode.LAND
+    assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
+
+
+# What a bench check says
+
+
+def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
+    """And that it waits for somebody to arm it."""
+    air = Air(armed=False)
+    air.run(8.0)
+    assert len(air.of(Welcomed)) == 1
+    assert air.of(AutopilotWaits)[-1].waits_for == "armed = true"
+    assert not air.of(ServerSilent)
+
+
+def test_a_link_that_is_cut_on_the_ground_is_told_and_that_it_is_back() -> None:
+    """Cut for 12 s while the vehicle waits to be armed."""
+    air = Air(armed=False)
+    air.run(8.0)
+    air.world.stop("netem")
+    air.run(12.0)
+    assert len(air.of(ServerSilent)) == 1
+    air.world.restart("netem", Proxy(air.scenario, server=("server", 0), flows=1))
+    air.run(3.0)
+    (heard,) = air.of(ServerHeard)
+    assert heard.silent_s == pytest.approx(12.0, abs=2.0)
+
+
+def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
+    """A fifth is lost each way, with half a second of delay, for two minutes."""
+    ways = {"delay": "constant", "minimum_s": 0.5, "loss": 0.2}
+    air = Air(armed=False, network={"uplink": ways, "downlink": ways})
+    air.run(120.0)
+    assert len(air.of(Welcomed)) == 1
+    assert not air.of(ServerSilent)
+
+
+def test_an_autopilot_that_does_not_answer_timesync_is_told_and_given_up() -> None:
+    """It would be waited for for ever, without a word."""
+    air = Air(mavlink={"patience_s": 5.0})
+    air.tap.alter = lambda message: b"" if message.get_type() == "TIMESYNC" else None
+    air.run(20.0, lambda: bool(air.of(NotTakenOff)))
+    assert "TIMESYNC" in air.of(AutopilotWaits)[-1].waits_for
+    (failed,) = air.of(NotTakenOff)
+    assert "TIMESYNC" in failed.why
+    assert air.client.finished
+
+
+def test_what_is_waited_for_is_the_autopilot_before_it_is_the_server() -> None:
+    """Nothing comes from the autopilot, and so no server is asked."""
+    air = Air()
+    air.tap.dumb = True
+    air.run(5.0)
+    (waits,) = air.of(AutopilotWaits)
+    assert "heartbeat" in waits.waits_for
+
+
+# Another address
+
+
+def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address() -> None:
+    """A `udp:` line: another source port after 4 s of silence, and all is set up again."""
+    air = Air(armed=False, vehicle={"address": "udp:0.0.0.0:14540"})
+    air.run(6.0)
+    assert len(air.of(ParametersRead)) == 1
+    beat = heartbeats(air, from_port=2)
+    beat()
+    assert not air.of(AutopilotMoved)
+    air.tap.dumb = True
+    air.run(4.0)
+    beat()
+    (told,) = air.of(AutopilotMoved)
+    assert told.after.endswith(":2")
+    assert air.client._port._peer[1] == 2
+    assert not air.client._flies.is_ready
+
+
+def test_in_flight_another_address_is_not_taken_and_what_comes_from_it_is_told() -> None:
+    """Nor on a line whose other end was given."""
+    air = Air(duration=60.0, vehicle={"address": "udp:0.0.0.0:14540"})
+    air.fly()
+    air.tap.dumb = True
+    air.run(4.0)
+    heartbeats(air, from_port=2)()
+    heartbeats(air, from_port=2)()
+    assert not air.of(AutopilotMoved)
+    (told,) = air.of(AutopilotElsewhere)
+    assert told.came_from.endswith(":2")
+    assert "HEARTBEAT of system 1" in told.content
+
+
+def heartbeats(air: Air, from_port: int) -> Callable[[], None]:
+    """Function that has the client hear a heartbeat of the autopilot from another port."""
+    codec = Codec(1, 1)
+
+    def beat() -> None:
+        message = dialect.MAVLink_heartbeat_message(2, 3, 1, 4, 3, 3)
+        datagram = Datagram(codec.encode(message), ("autopilot", from_port), 1)
+        air.client.receive(datagram, now_ns=air.client._port.now_ns)
+        air.events += [(air.world.now_ns, "client", event) for event in air.client.events()]
+
+    return beat
+
+
+# What it says
+
+
+def test_a_stream_that_is_being_set_is_not_refused() -> None:
+    """IN_PROGRESS is no refusal; DENIED is one, and named."""
+    air = Air()
+    codec = Codec(1, 1)
+    for result in (dialect.MAV_RESULT_IN_PROGRESS, dialect.MAV_RESULT_DENIED):
+        air.run(3.0)
+        air.tap.extra.append(codec.encode(dialect.MAVLink_command_ack_message(511, result)))
+    air.run(1.0)
+    assert [each.answer for each in air.of(AutopilotRefused)] == ["denied"]
+
+
+def test_texts_at_400_a_second_do_not_fill_the_log() -> None:
+    """Each is another; those that are left out are counted."""
+    air = Air(armed=False)
+    air.run(3.0)
+    codec = Codec(1, 1)
+    before = len(air.of(AutopilotText))
+    for k in range(4000):
+        message = dialect.MAVLink_statustext_message(6, f"text {k}".encode())
+        air.tap.extra.append(codec.encode(message))
+        if k % 40 == 0:
+            air.run(0.1)
+    air.run(3.0)
+    logged = len(air.of(AutopilotText)) - before
+    omitted = sum(each.count for each in air.of(TextsOmitted))
+    assert logged + omitted == 4000
+    assert logged + len(air.of(TextsOmitted)) < 40

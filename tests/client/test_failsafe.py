@@ -817,12 +817,13 @@ def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
     assert hand.mode is Mode.LAND
 
 
+@pytest.mark.parametrize("cause", [Reason.MUTE, Reason.UNUSABLE])
 def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(
-    monkeypatch: pytest.MonkeyPatch,
+    cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second after it is heard again, plans are flown."""
+    """A second after it is heard again, plans are flown; or after its positions can be used."""
     hand = tracking()
-    hindered(monkeypatch, hand, Reason.MUTE)
+    hindered(monkeypatch, hand, cause)
     hand.fly(0.02)
     assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
     hand.fly(9.0, plans=True)
@@ -980,7 +981,12 @@ ROWS: dict[Reason, Callable[[], None]] = {
     Reason.STRAYED: hindrance_test(
         test_a_vehicle_that_can_fly_no_further_brakes_and_lands, Reason.STRAYED
     ),
-    Reason.MUTE: hindrance_test(test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it),
+    Reason.MUTE: hindrance_test(
+        test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it, Reason.MUTE
+    ),
+    Reason.UNUSABLE: hindrance_test(
+        test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it, Reason.UNUSABLE
+    ),
 }
 """Scenario that needs the table's rows of a cause."""
 
