@@ -17,7 +17,7 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
 from skytether.server.sessions import Sessions
 from skytether.server.tick import Grid, Ticker
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
 from skytether.shared.core.events import ReferenceTooFast, SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
@@ -96,7 +96,7 @@ class Server(Endpoint):
             self._guided = Guided(references, goals)
             references = lru_cache(room)(self._guided.of)
         self.stopwatch = stopwatch or Stopwatch()
-        self._clock = ClockMap(room, terms.dt_ns)
+        self._clock = ClockMap(room, terms.dt_ns, seconds_to_ns(scenario.link.asymmetry_s))
         self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
         silence_ns = scenario.link.patience_ns
         self.sessions = Sessions(

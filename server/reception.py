@@ -6,7 +6,7 @@ CLOSE ends a session. All else is dropped and counted by its reason.
 
 from collections import Counter, deque
 
-from skytether.server.control.clock import ClockMap
+from skytether.server.control.clock import ClockMap, Contradiction
 from skytether.server.control.controller import Controller
 from skytether.server.gate import Call, Gate
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
@@ -16,6 +16,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     BegunAnew,
+    ClockContradicted,
     Event,
     NumberTaken,
     ServerFull,
@@ -52,6 +53,13 @@ IMPLAUSIBLE: dict[int, Drop] = {
     Belief.JUMP: Drop.IMPLAUSIBLE_JUMP,
 }
 """Why an observation is dropped that is not believed."""
+
+CONTRADICTED = {
+    Contradiction.CLOCK: "a clock was set, or runs wrong: it is measured anew",
+    Contradiction.ASYMMETRY: "link.asymmetry_s does not hold: not believed any more",
+    Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: all times count that may be",
+}
+"""What was contradicted that was known of a vehicle's clock, in words."""
 
 
 class Reception:
@@ -216,7 +224,8 @@ class Reception:
         session.hearing.hear(observation.number, observation.step)
         self.observations += 1
         heard = observation.heard
-        self._clock.observe(row, forward_ns, backward_ns, heard=heard, now_ns=now_ns)
+        found = self._clock.observe(row, forward_ns, backward_ns, heard=heard, now_ns=now_ns)
+        self._tell_of_clock(session.vehicle, found)
         if not self._controller.observe(row, observation):
             session.stale += 1
             return
@@ -225,6 +234,12 @@ class Reception:
         if call.moves:
             session.address, session.line = address, call.line
         self._grid.arm(now_ns)
+
+    def _tell_of_clock(self, vehicle: int, found: Contradiction) -> None:
+        """Tell the operator what was contradicted that was known of a vehicle's clock."""
+        if found is not Contradiction.NOTHING:
+            what = CONTRADICTED[found]
+            self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
     def _anew(self, row: int, life: int | None) -> None:
         """Forget all that is known of a vehicle but its session.

@@ -16,8 +16,13 @@ changes by no more than DRIFT of what has passed:
     max (-F - DRIFT age) ≤ O ≤ min (G + DRIFT age)
 
 over all samples, however old. They do not depend on the estimate, nor on what it is made of.
+
+What is known from elsewhere narrows these two: an operator's word that the smallest delays of both
+directions differ by no more than so much, and the time of day, where both ends know it. It is held
+against them, and against itself over time. What is contradicted is not believed any more.
 """
 
+from enum import IntEnum
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -54,6 +59,22 @@ UNSEEN = 2**61
 """Minimum of a half second in which nothing was seen."""
 
 
+class Contradiction(IntEnum):
+    """What a sample contradicts that was known of a vehicle's clock."""
+
+    NOTHING = 0
+    CLOCK = 1
+    """The bounds by delays: a clock was set, or runs wrong."""
+    ASYMMETRY = 2
+    """The operator's word on the difference of the delays."""
+    TIME_OF_DAY = 3
+    """The time of day of one end."""
+
+
+NOTHING, CLOCK, ASYMMETRY, TIME_OF_DAY = map(int, Contradiction)
+"""Members of `Contradiction` as plain numbers, for kernels."""
+
+
 class VehicleClock:
     """Record: the clock of one vehicle."""
 
@@ -73,6 +94,21 @@ class VehicleClock:
     """Time of our clock at which these two hold; they widen before and after it [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
+    other_low: int
+    """Least that the true offset can be at `other`, as it is known from elsewhere [ns], or
+    -UNSEEN."""
+    other_high: int
+    """Most that it can be then [ns], or UNSEEN."""
+    other: int
+    """Time of our clock at which these two hold [ns]."""
+    doubted: int
+    """1 if the time of day was contradicted; then all counts that anybody says."""
+    uneven: int
+    """1 if the operator's word on the delays was contradicted; then it does not count."""
+
+
+FORGOTTEN = ("newest", "heard", "echoes", "adopted")
+"""Fields of `VehicleClock` that are forgotten with each session."""
 
 
 class StepError(NamedTuple):
@@ -107,12 +143,15 @@ class Seen(NamedTuple):
 class ClockMap:
     """Offsets and steps of up to `capacity` vehicles.
 
+    The smallest delays of the two directions over 20 s differ by at most `asymmetry_ns`; 0: nobody
+    knows.
+
     It follows an estimate of the offset only when that has moved by more than half a step: a step
     index that went back and forth at a boundary would skip and repeat steps for nothing.
     """
 
-    def __init__(self, capacity: int, dt_ns: int) -> None:
-        self._dt_ns = dt_ns
+    def __init__(self, capacity: int, dt_ns: int, asymmetry_ns: int = 0) -> None:
+        self._dt_ns, self._asymmetry_ns = dt_ns, asymmetry_ns
         self.tick_ns = 0
         """Time of our clock that steps were counted for last [ns]."""
         self._lives: list[int | None] = [None] * capacity
@@ -136,21 +175,39 @@ class ClockMap:
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
-        kept, steps = (-UNSEEN, UNSEEN, 0), int(self.seen.vehicles[row]["steps"])
-        if life is not None and life == self._lives[row]:
-            kept = tuple(self.seen.vehicles[row][["low", "high", "bounded"]].tolist())
+        vehicle = self.seen.vehicles[row]
+        for name, value in zip(FORGOTTEN, (0, -1, 0, UNSEEN), strict=True):
+            vehicle[name] = value
+        if life is None or life != self._lives[row]:
+            for name in ("low", "other_low"):
+                vehicle[name] = -UNSEEN
+            for name in ("high", "other_high"):
+                vehicle[name] = UNSEEN
+            for name in ("bounded", "other", "doubted", "uneven"):
+                vehicle[name] = 0
         self._lives[row] = life
-        self.seen.vehicles[row] = (0, -1, 0, UNSEEN, *kept, steps)
 
     def observe(
         self, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
-    ) -> None:
-        """Take one F and one G of a vehicle, received at `now_ns`.
+    ) -> Contradiction:
+        """Take one F and one G of a vehicle, received at `now_ns`; what they contradict.
 
         Args:
             heard: another number for each packet of ours that G is of.
         """
-        _observe(self.seen, row, forward_ns, backward_ns, heard, now_ns)
+        sample = forward_ns, backward_ns, heard, self._asymmetry_ns, now_ns
+        return Contradiction(_observe(self.seen, row, *sample))
+
+    def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
+        """Take the offset of a vehicle's clock as it is known from elsewhere; what it contradicts.
+
+        Args:
+            offset_ns: the vehicle's clock minus ours [ns].
+            error_ns: largest error of that [ns].
+            now_ns: time of our clock [ns].
+        """
+        low, high = offset_ns - error_ns, offset_ns + error_ns
+        return Contradiction(_tell(self.seen, row, low, high, self._asymmetry_ns > 0, now_ns))
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
@@ -183,9 +240,10 @@ class ClockMap:
 
     def bound_ns(self, row: int) -> int:
         """Half of what the true offset of a vehicle's clock can lie apart, now [ns]."""
-        vehicle = self.seen.vehicles[row]
-        drift_ns = abs(self.tick_ns - int(vehicle["bounded"])) // DRIFT
-        return (int(vehicle["high"]) - int(vehicle["low"])) // 2 + drift_ns
+        found = np.empty(2, dtype=np.int64)
+        _bounds(self.seen, row, self.tick_ns, found)
+        low, high = found.tolist()
+        return (high - low) // 2
 
 
 @inline
@@ -213,23 +271,99 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
 
 @part
-def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Least and most that the offset of a vehicle's clock can be at a time of ours [ns]."""
+def _by_delays(seen: Seen, row: int, now: int) -> tuple[int, int]:
+    """Least and most that the offset of a vehicle's clock can be, by delays alone [ns]."""
     vehicle = seen.vehicles[row]
     apart = abs(now - vehicle.bounded) // DRIFT + 1
     return vehicle.low - apart, vehicle.high + apart
 
 
 @part
-def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> None:
-    """Narrow the bounds of a vehicle's clock offset by F and G [ns].
+def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
+    """Least and most that the offset of a vehicle's clock can be, as known from elsewhere [ns]."""
+    vehicle = seen.vehicles[row]
+    apart = abs(now - vehicle.other) // DRIFT + 1 if vehicle.other_high < UNSEEN else 0
+    return vehicle.other_low - apart, vehicle.other_high + apart
+
+
+@part
+def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
+    """Least and most that the offset of a vehicle's clock can be at a time of ours [ns]."""
+    low, high = _by_delays(seen, row, now)
+    other_low, other_high = _by_others(seen, row, now)
+    if seen.vehicles[row].doubted or max(low, other_low) > min(high, other_high):
+        # One of the two is false, and nobody knows which.
+        return min(low, other_low), max(high, other_high)
+    return max(low, other_low), min(high, other_high)
+
+
+@kernel
+def _bounds(seen: Seen, row: int, now: int, found: I1) -> None:
+    """Write down `bounds_ns`."""
+    found[0], found[1] = bounds_ns(seen, row, now)
+
+
+@part
+def _add(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
+    """Narrow what is known from elsewhere; whether that is possible. It is forgotten if not."""
+    vehicle = seen.vehicles[row]
+    other_low, other_high = _by_others(seen, row, now)
+    trip_low, trip_high = _by_delays(seen, row, now)
+    low, high = max(low, other_low), min(high, other_high)
+    possible = low <= high and max(low, trip_low) <= min(high, trip_high)
+    if not possible:
+        low, high = -UNSEEN, UNSEEN
+    vehicle.other_low, vehicle.other_high, vehicle.other = low, high, now
+    return possible
+
+
+@kernel
+def _tell(seen: Seen, row: int, low: int, high: int, asymmetric: bool, now: int) -> int:
+    """Take what the time of day says, see `ClockMap.tell`."""
+    vehicle = seen.vehicles[row]
+    if vehicle.doubted:
+        other_low, other_high = _by_others(seen, row, now)
+        vehicle.other_low, vehicle.other_high = min(low, other_low), max(high, other_high)
+        vehicle.other = now
+        return NOTHING
+    if _add(seen, row, low, high, now):
+        return NOTHING
+    if asymmetric and not vehicle.uneven:
+        vehicle.uneven = 1
+        if _add(seen, row, low, high, now):
+            return ASYMMETRY
+    vehicle.doubted = 1
+    vehicle.other_low, vehicle.other_high, vehicle.other = low, high, now
+    return TIME_OF_DAY
+
+
+@part
+def _believe_even(seen: Seen, row: int, asymmetry: int, now: int) -> int:
+    """Take the operator's word that delays differ by at most `asymmetry` [ns]; see `_observe`."""
+    vehicle, samples = seen.vehicles[row], 0
+    for slot in range(BUCKETS):
+        samples += seen.samples[row, slot]
+    if asymmetry == 0 or vehicle.uneven or vehicle.doubted or samples < STEP_SAMPLES:
+        return NOTHING
+    # The minima are up to 20 s old.
+    room = asymmetry // 2 + BUCKETS * BUCKET_NS // DRIFT
+    middle = (least(seen.minimum[row, 1]) - least(seen.minimum[row, 0])) // 2
+    if _add(seen, row, middle - room, middle + room, now):
+        return NOTHING
+    vehicle.uneven = 1
+    return ASYMMETRY
+
+
+@part
+def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> int:
+    """Narrow the bounds of a vehicle's clock offset by F and G [ns]; what these contradict.
 
     Args:
         is_new: whether G is of another echo than the one before.
         now: our time [ns].
     """
     vehicle = seen.vehicles[row]
-    low, high = bounds_ns(seen, row, now)
+    low, high = _by_delays(seen, row, now)
     # F is as old as the observation, which is no older than the round trip. Of an echo it is known
     # that the observation before did not tell of it yet, and that of the first one the session has
     # not ended since.
@@ -238,19 +372,26 @@ def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now:
     low = max(low, -forward - trip)
     if is_new:
         high = min(high, backward + trip + max(since, 0) // DRIFT)
-    if low > high:
+    found = CLOCK if low > high else NOTHING
+    if found == CLOCK:
         # Nothing earlier holds any more. By the round trip the newest sample may be one of less
         # than nothing, of a clock that was set in between.
         vehicle.steps += 1
         low, high = min(-forward, backward) - trip, max(-forward, backward) + trip
+        vehicle.other_low, vehicle.other_high = -UNSEEN, UNSEEN
     vehicle.low, vehicle.high, vehicle.bounded = low, high, now
+    return found
 
 
 @kernel
-def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, now: int) -> None:
-    """Take F and G [ns] of a vehicle, received at a time of our clock [ns]."""
+def _observe(
+    seen: Seen, row: int, forward: int, backward: int, heard: int, asymmetry: int, now: int
+) -> int:
+    """Take F and G [ns] of a vehicle, received at a time of our clock [ns]; what they
+    contradict.
+    """
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
-    _bound(seen, row, forward, backward, heard != vehicle.heard, now)
+    found = _bound(seen, row, forward, backward, heard != vehicle.heard, now)
     # The same echo told once more is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
@@ -266,6 +407,8 @@ def _observe(seen: Seen, row: int, forward: int, backward: int, heard: int, now:
     seen.minimum[row, 0, slot] = min(seen.minimum[row, 0, slot], forward)
     seen.minimum[row, 1, slot] = min(seen.minimum[row, 1, slot], backward)
     seen.samples[row, slot] += 1
+    uneven = _believe_even(seen, row, asymmetry, now)
+    return found if found != NOTHING else uneven
 
 
 @part
@@ -314,6 +457,8 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
         _drop_stepped(seen, row)
         estimate = (least(seen.minimum[row, 1]) - least(seen.minimum[row, 0])) // 2
         vehicle = seen.vehicles[row]
+        if not vehicle["doubted"]:
+            estimate = min(max(estimate, vehicle["other_low"]), vehicle["other_high"])
         if vehicle["adopted"] == UNSEEN or abs(estimate - vehicle["adopted"]) > dt // 2:
             vehicle["adopted"] = estimate
         steps[i] = (now + vehicle["adopted"]) // dt

@@ -509,6 +509,16 @@ class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: its {leap}: {what}{lands if self.land_after_s else ''}"
 
 
+class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
+    """The packets of a vehicle contradict what was known of its clock."""
+
+    what: str
+    """Knowledge that was contradicted, and what follows."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: {self.what}"
+
+
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
     """The fence lets less pass than the vehicle was told to fly."""
 
@@ -637,6 +647,7 @@ Event = (
     | PlanningStopped
     | StateDoubted
     | InZone
+    | ClockContradicted
     | LeftTube
     | StateLeapt
     | FenceHolds

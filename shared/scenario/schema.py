@@ -459,6 +459,9 @@ class LinkConfig(Section, frozen=True):
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Time after its first knot up to which the vehicle takes a trajectory [s]; 0: at any time. It
     tells the server for certain which one is flown."""
+    asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
+    """Largest difference of the smallest delays to a vehicle and from it over 20 s [s]; 0: not
+    known. It bounds the error of the vehicle's clock; the server watches whether it holds."""
     timeout_s: OfEach[Interval] = 1.5
     """Time of silence after which the vehicle takes the server for gone [s]: it brakes and says
     HELLO again. After the same time, or twice that with heartbeats "auto", the server lets

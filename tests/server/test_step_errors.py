@@ -18,7 +18,7 @@ from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
 from skytether.server.control import apart
 from skytether.server.control.apart import NEVER, FlownMotions
-from skytether.server.control.clock import DRIFT, EXACT, ClockMap, StepError
+from skytether.server.control.clock import DRIFT, EXACT, ClockMap, Contradiction, StepError
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 from skytether.shared.law.model import Array
@@ -31,7 +31,7 @@ from skytether.shared.telemetry.summary import least_separation
 from skytether.sim import flight
 
 DT_S, DT_NS = 0.05, 50 * MS
-SCALE = np.array([1.0, 0.7])
+SCALE, ROWS = np.array([1.0, 0.7]), np.array([0])
 
 errors = st.builds(
     lambda late, width: StepError(width - late, late), st.floats(-20.0, 20.0), st.floats(0.0, 30.0)
@@ -247,6 +247,72 @@ def test_a_clock_that_was_set_is_noticed_and_known_anew() -> None:
     early, late = np.zeros((2, 1))
     known.step_errors(rows, known.steps(rows, 19 * S), early, late)
     assert float(early[0] + late[0]) * DT_S == pytest.approx(0.2, abs=0.01)
+
+
+def width_s(known: ClockMap, now_ns: int) -> float:
+    """Time between the bounds of the offset of the clock in row 0 [s]."""
+    early, late = np.zeros((2, 1))
+    known.step_errors(ROWS, known.steps(ROWS, now_ns), early, late)
+    return float(early[0] + late[0]) * DT_S
+
+
+def listen(
+    known: ClockMap, begin_s: int, end_s: int, up_s: float, down_s: float
+) -> set[Contradiction]:
+    """What observations contradict, one a second over these delays; clocks show the same."""
+    found = set()
+    for at_s in range(begin_s, end_s):
+        sample = round(down_s * S), round(up_s * S)
+        found.add(known.observe(0, *sample, heard=at_s, now_ns=at_s * S))
+    return found
+
+
+def test_an_operator_s_word_on_the_delays_bounds_the_clock() -> None:
+    """Once there are enough packets for minima; the clocks' drift over 20 s is added."""
+    known = ClockMap(1, DT_NS, asymmetry_ns=100 * MS)
+    for end_s, expected_s in ((4, 0.85), (30, 0.14)):
+        assert listen(known, max(end_s - 26, 0), end_s, 0.43, 0.4) == {Contradiction.NOTHING}
+        assert width_s(known, end_s * S) == pytest.approx(expected_s, abs=0.04)
+
+
+def test_an_operator_s_word_is_dropped_when_delays_contradict_it() -> None:
+    """By the round trip: then the larger bound counts, for good."""
+    known = ClockMap(1, DT_NS, asymmetry_ns=100 * MS)
+    listen(known, 0, 30, 0.1, 0.1)
+    assert width_s(known, 30 * S) < 0.15
+    assert Contradiction.ASYMMETRY in listen(known, 30, 60, 0.1, 1.1)
+    assert width_s(known, 60 * S) == pytest.approx(0.2 + 2 * 30 / DRIFT, abs=0.03)
+    listen(known, 60, 120, 0.4, 0.4)
+    assert width_s(known, 120 * S) > 0.2
+
+
+def test_the_time_of_day_bounds_the_clock_and_the_step() -> None:
+    """Delays that differ by 0.8 s are seen then; the step that is counted is the true one."""
+    known = ClockMap(1, DT_NS)
+    for at_s in range(0, 20, 2):
+        assert listen(known, at_s, at_s + 2, 0.05, 0.85) == {Contradiction.NOTHING}
+        assert known.tell(0, 2 * MS, 5 * MS, now_ns=(at_s + 2) * S) is Contradiction.NOTHING
+    assert width_s(known, 20 * S) == pytest.approx(0.01, abs=0.001)
+    assert known.steps(ROWS, 20 * S + DT_NS // 2).tolist() == [20 * 20]
+
+
+def test_a_time_of_day_that_cannot_be_is_told_and_all_counts_that_may_be() -> None:
+    """Neither the smaller nor the other bound is believed alone; nor is it when it comes right."""
+    known = ClockMap(1, DT_NS)
+    listen(known, 0, 5, 0.1, 0.1)
+    assert known.tell(0, 400 * MS, 5 * MS, now_ns=5 * S) is Contradiction.TIME_OF_DAY
+    assert width_s(known, 5 * S) == pytest.approx(0.505, abs=0.02)
+    assert known.tell(0, 0, 5 * MS, now_ns=5 * S) is Contradiction.NOTHING
+    assert width_s(known, 5 * S) == pytest.approx(0.505, abs=0.02)
+
+
+def test_a_word_that_the_time_of_day_contradicts_is_dropped() -> None:
+    """The constant difference that no packet shows."""
+    known = ClockMap(1, DT_NS, asymmetry_ns=100 * MS)
+    listen(known, 0, 10, 0.05, 0.85)
+    assert width_s(known, 10 * S) < 0.15
+    assert known.tell(0, 0, 5 * MS, now_ns=10 * S) is Contradiction.ASYMMETRY
+    assert width_s(known, 10 * S) == pytest.approx(0.01, abs=0.001)
 
 
 def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,6 +47,7 @@ from skytether.shared.core.events import (
     HostFound,
     HostMissing,
     InZone,
+    ClockContradicted,
     LeftTube,
     Listening,
     Measured,
@@ -293,6 +294,10 @@ SENTENCES = [
     (
         LeftTube(vehicle=1, off_m=0.123),
         "vehicle 1 is 0.12 m outside its tube (mission.tube_m): the others keep further away",
+    ),
+    (
+        ClockContradicted(vehicle=1, what="link.asymmetry_s does not hold: not believed any more"),
+        "vehicle 1: link.asymmetry_s does not hold: not believed any more",
     ),
     (
         StateDoubted(vehicle=1),
