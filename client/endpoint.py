@@ -18,7 +18,7 @@ from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import AutopilotWaits
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
 from skytether.shared.core.events import (
@@ -35,13 +35,14 @@ from skytether.shared.core.events import (
     address_text,
     metres,
 )
+from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode
+from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
 
 VEHICLE_SOCKET = 1
 """Number of the socket through which the vehicle's own port talks; the server's is 0."""
@@ -59,6 +60,8 @@ HELD_AGAIN_NS = 5 * SECOND_NS
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
 """Key with which an operator says which frame counts after a leap."""
+TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
+"""Time after which the time of day is told again [ns], and the largest error that can be [µs]."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
 """Reasons that do not say why there is no newer horizon."""
 
@@ -143,6 +146,9 @@ class Client(Endpoint):
         """Time of the newest packet of a server that was said to be silent."""
         self._held_ns = 0
         """Time before which it is not said again that the fence holds the vehicle."""
+        self._time: TimeOfDay | None = None
+        """Time of day; None where the host does not know it."""
+        self._is_mission, self._time_due_ns = scenario.is_mission, 0
         self.horizons = 0
         """Number of horizons received."""
         self.dropped: Counter[Drop] = Counter()
@@ -351,6 +357,7 @@ class Client(Endpoint):
         observation = pilot.observation(session)
         if observation is not None:
             session.send(observation)
+            self._tell_time(now_ns)
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._leap_told = leap_m
@@ -382,6 +389,22 @@ class Client(Endpoint):
             expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
             return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
         return self._flies.objection(scenario, keys)
+
+    def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
+        """See `Endpoint`; the server of a mission is told."""
+        self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
+
+    def _tell_time(self, now_ns: int) -> None:
+        """Tell the server the time of day at which step 0 began, now and then."""
+        if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
+            return
+        error_ns = self._time.error_at(now_ns)
+        if error_ns is None:
+            return
+        self._time_due_ns = now_ns + TIME_NS
+        epoch_us = stamp_us(self._pilot.began_ns + self._time.ahead_ns)
+        error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
+        self._session.tell_time(self._pilot.flown, epoch_us, error_us)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         """See `Endpoint`."""

@@ -79,6 +79,11 @@ class Fleet(Endpoint):
             self._clients[n].wake(now_ns=now_ns)
             self._after(n)
 
+    def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for client in self._clients:
+            client.learn_time(utc_ns, error_ns, now_ns=now_ns)
+
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """See `Endpoint`; that of the first vehicle that has one."""
         said = (client.objection(scenario, keys) for client in self._clients)

@@ -28,6 +28,7 @@ from skytether.shared.wire.protocol import (
     Message,
     Observation,
     Refusal,
+    Time,
     Trajectory,
     Welcome,
     decode,
@@ -268,6 +269,12 @@ class ServerSession:
         """Send a message in the session."""
         self.said = (self.said + 1) % NUMBERS
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
+
+    def tell_time(self, step: int, epoch_us: int, error_us: int) -> None:
+        """Tell the time of day of step 0; it is no packet by which losses are counted."""
+        assert self.number is not None
+        said = Time(self._vehicle, self.number, step, epoch_us, error_us)
+        self._out.append(Datagram(self.link.seal(encode(said)), self._server))
 
     def close(self) -> None:
         """Close the session: only another WELCOME opens one again."""

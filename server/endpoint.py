@@ -21,6 +21,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
 from skytether.shared.core.events import ReferenceTooFast, SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.mission import Guided, given
@@ -163,6 +164,10 @@ class Server(Endpoint):
         for _ in range(CLOSES):
             for session in self.sessions:
                 self._out += session.sealed(encode(Close(session.vehicle, session.number)))
+
+    def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
+        """See `Endpoint`; with it the clocks of vehicles that tell theirs are known better."""
+        self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`; the terms of the flight stay as they were agreed upon."""

@@ -12,7 +12,7 @@ from skytether.server.gate import Call, Gate
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     BegunAnew,
@@ -28,6 +28,7 @@ from skytether.shared.core.events import (
     address_text,
 )
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -37,6 +38,7 @@ from skytether.shared.wire.protocol import (
     Idle,
     Observation,
     Refusal,
+    Time,
     Welcome,
     decode,
     encode,
@@ -109,6 +111,8 @@ class Reception:
         """Number of datagrams dropped, by reason."""
         self.refused: Counter[Refusal] = Counter()
         """Number of HELLOs of vehicles that were refused, by reason."""
+        self.time: TimeOfDay | None = None
+        """Time of day; None where the host does not know it."""
         self._told: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_TOLD_MAX)
         """Vehicle, boot id and refusal of the newest refusals that the operator was told."""
         self._strangers = 0
@@ -156,6 +160,8 @@ class Reception:
             case Close():
                 self._sessions.end(message.vehicle, message.session)
                 self._events.append(SessionEnded(vehicle=message.vehicle))
+            case Time():
+                self._hear_time(message, now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
@@ -234,6 +240,24 @@ class Reception:
         if call.moves:
             session.address, session.line = address, call.line
         self._grid.arm(now_ns)
+
+    def _hear_time(self, told: Time, now_ns: int) -> None:
+        """Take the time of day of a vehicle's step 0, where it is known here too."""
+        session = self._sessions.find(told)
+        if session is None:
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
+        error_ns = self.time and self.time.error_at(now_ns)
+        if error_ns is None or self.time is None:
+            return
+        # Of all times with the stamp that which the delays speak for; the clocks have drifted apart
+        # since it was told.
+        offset_ns, bound_ns = self._clock.middle_ns(session.row, now_ns)
+        ahead_ns = self.time.ahead_ns
+        epoch_ns = stamped_ns(told.epoch_us, near_ns=ahead_ns - offset_ns)
+        age_ns = max(now_ns + offset_ns + bound_ns - told.step * self._terms.dt_ns, 0)
+        error_ns += told.error_us * MICROSECOND_NS + age_ns // DRIFT + MICROSECOND_NS
+        found = self._clock.tell(session.row, ahead_ns - epoch_ns, error_ns, now_ns=now_ns)
+        self._tell_of_clock(session.vehicle, found)
 
     def _tell_of_clock(self, vehicle: int, found: Contradiction) -> None:
         """Tell the operator what was contradicted that was known of a vehicle's clock."""

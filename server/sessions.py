@@ -21,7 +21,7 @@ from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Hello, Observation
+from skytether.shared.wire.protocol import Hello, Observation, Time
 
 WELCOME_NS = 5 * SECOND_NS
 """Time after its last HELLO for which a welcomed vehicle keeps its place without coming [ns]."""
@@ -215,10 +215,10 @@ class Sessions:
         """Whether a vehicle in session has been heard of late."""
         return now_ns - live.heard_ns <= self._silence_ns
 
-    def find(self, observation: Observation) -> Session | None:
-        """The live session of an observation, if it has one."""
-        session = self._live.get(observation.vehicle)
-        return session if session and session.number == observation.session else None
+    def find(self, told: Observation | Time) -> Session | None:
+        """The live session of what a vehicle tells, if it has one."""
+        session = self._live.get(told.vehicle)
+        return session if session and session.number == told.session else None
 
     def begin(self, observation: Observation, now_ns: int) -> Session:
         """The welcomed session of a first observation, now live.

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.clock import DRIFT, EXACT, StepError
+from skytether.server.control.clock import EXACT, StepError
 from skytether.shared.base.kernel import (
     B1,
     F1,
@@ -32,6 +32,7 @@ from skytether.shared.base.kernel import (
     making_part,
     part,
 )
+from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SAMPLES, SPACING, Motion
 

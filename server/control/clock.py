@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.base.kernel import F1, I1, I2, I3, inline, kernel, part, record, records
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.model import Array, Indices
 
@@ -46,10 +47,6 @@ STEP_SAMPLES = 5
 """Samples that recent and old minima need each before a clock may be said to have stepped."""
 STEP_NS = 40 * MILLISECOND_NS
 """Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
-
-DRIFT = 1000
-"""Time in which two clocks may come apart by one unit of it: 0.1 %, of two hosts whose clocks are
-slewed by 500 ppm each."""
 
 ECHOES = 4
 """Number of newest echoes that are kept of a vehicle: how long packets to it take just now."""
@@ -240,10 +237,16 @@ class ClockMap:
 
     def bound_ns(self, row: int) -> int:
         """Half of what the true offset of a vehicle's clock can lie apart, now [ns]."""
+        return self.middle_ns(row, self.tick_ns)[1]
+
+    def middle_ns(self, row: int, now_ns: int) -> tuple[int, int]:
+        """Middle between the bounds of the offset of a vehicle's clock, and half of what is
+        between them [ns].
+        """
         found = np.empty(2, dtype=np.int64)
-        _bounds(self.seen, row, self.tick_ns, found)
+        _bounds(self.seen, row, now_ns, found)
         low, high = found.tolist()
-        return (high - low) // 2
+        return (high + low) // 2, (high - low) // 2
 
 
 @inline

@@ -152,6 +152,15 @@ class Endpoint(ABC):
         """
         assert not keys  # there are none that may change
 
+    def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:  # noqa: B027
+        """Learn the time of day, where the host knows it to within an error; most need it not.
+
+        Args:
+            utc_ns: the time since 1970 [ns].
+            error_ns: largest error of that [ns].
+            now_ns: the same time on the endpoint's own clock [ns].
+        """
+
     def send(self, payload: bytes, peer: Address, socket: int = 0) -> None:
         """Put a datagram into the outbox.
 

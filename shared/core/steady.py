@@ -85,6 +85,10 @@ class Steady(Endpoint):
         """See `Endpoint`."""
         self._inner.change(scenario, keys, now_ns=self._steady(now_ns))
 
+    def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        self._inner.learn_time(utc_ns, error_ns, now_ns=self._steady(now_ns))
+
     def keep(self, *, now_ns: int) -> bytes | None:
         """See `Endpoint`; what is kept names times by how long ago they were."""
         return self._inner.keep(now_ns=self._steady(now_ns))

@@ -462,6 +462,9 @@ class LinkConfig(Section, frozen=True):
     asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Largest difference of the smallest delays to a vehicle and from it over 20 s [s]; 0: not
     known. It bounds the error of the vehicle's clock; the server watches whether it holds."""
+    time_of_day: OfEach[Literal["none", "host"]] = "none"
+    """Source of the time of day on a mission: the host's clock, to within the error that its kernel
+    tells, as chrony sets it; where both ends have one, the vehicle's clock is known by that."""
     timeout_s: OfEach[Interval] = 1.5
     """Time of silence after which the vehicle takes the server for gone [s]: it brakes and says
     HELLO again. After the same time, or twice that with heartbeats "auto", the server lets
@@ -497,6 +500,9 @@ class SimulationConfig(Section, frozen=True):
     """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
     """Drift: how much faster the vehicle's clock runs than the server's [ppm]."""
+    time_error_s: OfVirtualTime[Duration] = 0.0
+    """Largest error of the time of day of each end of a mission [s]; 0: none knows it. It is as
+    wrong as it may be, at the server and at every second vehicle the other way."""
 
 
 class Scenario(Section, frozen=True):

@@ -1,4 +1,4 @@
-"""The wire: seven messages, each one msgpack array in one UDP datagram, sealed or plain.
+"""The wire: eight messages, each one msgpack array in one UDP datagram, sealed or plain.
 
     [version, type, vehicle, ...]
 
@@ -15,6 +15,7 @@
 | 6    | CLOSE       | both    | session                                                    |
 | 7    | TRAJECTORY  | server  | session, step, server_us, age, spacing, knots, number,     |
 |      |             |         | silence                                                    |
+| 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 
 With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
 
@@ -279,6 +280,19 @@ class Close(NamedTuple):
     session: int
 
 
+class Time(NamedTuple):
+    """Time of day of the begin of a vehicle's step 0, told where its host knows it."""
+
+    vehicle: int
+    session: int
+    step: int
+    """Step k in which it is told, on the vehicle's grid."""
+    epoch_us: int
+    """Stamp: the time since 1970 at which step 0 began."""
+    error_us: int
+    """Largest error of that [µs]."""
+
+
 # With a tenth of all packets lost, all three are lost once in a thousand times.
 CLOSES = 3
 """Number of times that CLOSE is said, for some of them may be lost."""
@@ -301,7 +315,7 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
-Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory
+Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time
 
 _Check = range | Callable[[object, Terms], object]
 """The integers a field may be, or what makes the field of what was sent, or refuses it."""
@@ -447,6 +461,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _NUMBER, _U16)),
     (Close, (_U16, _U32)),
     (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16)),
+    (Time, (_U16, _U32, _U32, _STAMP, _U32)),
 )
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
 

@@ -38,6 +38,7 @@ from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
 from skytether.shell.recording import RecordFile
+from skytether.shell.time_of_day import host_time
 from skytether.shell.udp import AddressError, is_loopback
 
 # for type checking alone: they are slow to import, and a process that flies does without
@@ -187,6 +188,7 @@ def drive(
                 if source and (news := source.news()):
                     out.say(news)
             out.each_second(last=last)
+            _learn_time(endpoint, options)
             if feed or served:
                 snapshot = figures()
                 if feed:
@@ -213,6 +215,12 @@ def drive(
             out.say(Counted(figures=last))
             if json:
                 write(json, msgspec.json.encode(last))
+
+
+def _learn_time(endpoint: Endpoint, options: Options) -> None:
+    """Tell an endpoint the time of day, where it is asked for and known."""
+    if options.config.link.time_of_day == "host" and (told := host_time()):
+        endpoint.learn_time(told.utc_ns, told.error_ns, now_ns=told.now_ns)
 
 
 @contextmanager

@@ -357,6 +357,15 @@ def _fly(
     plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
 
+    error_ns = seconds_to_ns(scenario.simulation.time_error_s)
+
+    def tell_time() -> None:
+        if not error_ns:
+            return
+        for number, (host, each) in enumerate({SERVER[0]: server, **runs[0].hosts}.items()):
+            wrong_ns = error_ns if number % 2 else -error_ns
+            world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))
+
     def over() -> bool:
         nonlocal ask_ns, second_ns
         if world.now_ns < ask_ns and flying[-1].flying:
@@ -366,6 +375,7 @@ def _fly(
             flown_s = world.now_ns // SECOND_NS
             second_ns = (flown_s + 1) * SECOND_NS
             on_second(flown_s)
+            tell_time()
         while flying and not flying[-1].flying:
             flying.pop()
         return not flying or stopped()

@@ -18,9 +18,11 @@ from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
 from skytether.server.control import apart
 from skytether.server.control.apart import NEVER, FlownMotions
-from skytether.server.control.clock import DRIFT, EXACT, ClockMap, Contradiction, StepError
+from skytether.server.control.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
+from skytether.shared.core.events import ClockContradicted
+from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario import reading
@@ -28,6 +30,7 @@ from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
+from skytether.shell.time_of_day import stated
 from skytether.sim import flight
 
 DT_S, DT_NS = 0.05, 50 * MS
@@ -402,6 +405,31 @@ def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
     flown = flight.fly(SWAP, vehicles=8)
     assert separation_m(flown) < 0.4
     assert "left_tube" not in flown.figures["server"]["counts"]
+
+
+def test_with_the_time_of_day_at_both_ends_clocks_are_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """To within what both tell, by delays that differ by 0.8 s; each is as wrong as it may be."""
+    delay(monkeypatch, turns(0.05, 0.85))
+    simulation = msgspec.structs.replace(SWAP.simulation, time_error_s=0.01)
+    flown = flight.fly(msgspec.structs.replace(SWAP, simulation=simulation), vehicles=8)
+    assert separation_m(flown) > 0.5
+    told = flown.figures["server"]["by_vehicle"]
+    assert max(each["clock_bound_ms"] for each in told.values()) < 25.0
+    assert not [each for each in flown.events if isinstance(each.event, ClockContradicted)]
+
+
+def test_a_host_s_clock_counts_where_its_kernel_tells_how_wrong_it_is() -> None:
+    """chrony sets both errors; a clock that nothing disciplines, or that is 0 wrong, is unknown."""
+    assert stated(0, 0x2001, 1500, 40) == 1_500_000
+    for answer, status, most_us, estimate_us in (
+        (5, 0x40, 16_000_000, 16_000_000),
+        (0, 0x40, 1500, 40),
+        (0, 0x2001, 500, 0),
+        (-1, 0, 1500, 40),
+    ):
+        assert stated(answer, status, most_us, estimate_us) is None
 
 
 @pytest.mark.long

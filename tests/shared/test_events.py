@@ -36,6 +36,7 @@ from skytether.shared.core.events import (
     BrowserRefused,
     Changed,
     ChangeRefused,
+    ClockContradicted,
     Counted,
     Degraded,
     Event,

@@ -34,6 +34,7 @@ from skytether.shared.wire.protocol import (
     Message,
     Mode,
     Observation,
+    Time,
     Trajectory,
     Welcome,
     decode,
@@ -138,6 +139,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     ),
     st.builds(Heartbeat, u16, u32, u32, st.sampled_from(Idle), st.integers(0, 1), number, u16),
     st.builds(Close, u16, u32),
+    st.builds(Time, u16, u32, u32, u32, u32),
 )
 trajectories = st.builds(
     Trajectory,
@@ -299,11 +301,13 @@ def test_documented_sizes_are_the_real_ones() -> None:
     assert len(encode(told_by(500, 10, splines=False))) == 49
     assert len(encode(Heartbeat(1, SESSION, 2**31, Idle.DELAY, 0, **USUAL))) == 18
     assert len(encode(Close(1, SESSION))) == 9
+    assert len(encode(Time(1, SESSION, 500, 2**31, 900))) == 20
     session, stamp, most = 2**32 - 1, 2**32 - 1, {"number": 127, "silence": 2**16 - 1}
     longest = Horizon(2**16 - 1, session, 2**32 - 1, stamp, 2**32 - 1, inputs, none, **most)
     assert len(encode(longest)) == 355
     assert len(encode(Heartbeat(2**16 - 1, session, stamp, Idle.DELAY, 0, **most))) == 22
     assert len(encode(Close(2**16 - 1, session))) == 11
+    assert len(encode(Time(2**16 - 1, session, 2**32 - 1, stamp, 2**32 - 1))) == 26
 
 
 @pytest.mark.parametrize("step", [60, 60 * 20, 72_000, 360_000])
@@ -368,7 +372,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 0, 1, "version"),
         (OBSERVATION, 0, True, "version"),
         (OBSERVATION, 1, 0, "type"),
-        (OBSERVATION, 1, 8, "type"),
+        (OBSERVATION, 1, 9, "type"),
         (OBSERVATION, 1, "3", "type"),
         (OBSERVATION, 2, 2**16, "field"),
         (OBSERVATION, 2, True, "field"),

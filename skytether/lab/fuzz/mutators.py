@@ -18,6 +18,7 @@ from skytether.shared.wire.protocol import (
     Horizon,
     Message,
     Observation,
+    Time,
     Trajectory,
     Welcome,
     encode,
@@ -89,6 +90,7 @@ def seeds(terms: Terms) -> list[bytes]:
             *plans,
             Heartbeat(1, 7, 10, 0, 0),
             Close(1, 7),
+            Time(1, 7, 5, 10, 1000),
         )
     ]
 

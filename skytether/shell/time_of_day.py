@@ -1,0 +1,69 @@
+"""Time of day of this host, to within the error that its kernel tells (`adjtimex`, Linux).
+
+What disciplines the clock sets that error: chrony and ntpd count half of the round trip to their
+source in it, so that no delay of theirs makes it false. systemd-timesyncd sets it to 0 and tells no
+estimate, which is no error at all; such a clock counts as unknown.
+"""
+
+import ctypes
+import time
+from functools import cache
+from typing import NamedTuple
+
+from skytether.shared.base.units import MICROSECOND_NS
+
+UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
+"""Status bit, and answer of the kernel, of a clock that nothing disciplines."""
+
+
+class _Timex(ctypes.Structure):
+    """Beginning of the kernel's `struct timex`, with room for the rest of it."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_byte * 256),
+    )
+
+
+class HostTime(NamedTuple):
+    """Time of day of the host."""
+
+    utc_ns: int
+    """Time since 1970 [ns]."""
+    error_ns: int
+    """Largest error of that [ns]."""
+    now_ns: int
+    """The same time on the clock that only runs [ns]."""
+
+
+@cache
+def _adjtimex() -> "ctypes._FuncPointer | None":
+    """Function of the C library; None where it has none."""
+    return getattr(ctypes.CDLL(None), "adjtimex", None)
+
+
+def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
+    """Largest error of the host's clock by what its kernel answers [ns]; None of none."""
+    if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
+        return None
+    return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None
+
+
+def host_time() -> HostTime | None:
+    """Time of day of this host; None where nothing says how wrong it may be."""
+    call, told = _adjtimex(), _Timex()
+    if call is None:
+        return None
+    answer = int(call(ctypes.byref(told)))
+    error_ns = stated(answer, told.status, told.maxerror, told.esterror)
+    if error_ns is None:
+        return None
+    # The process may lose its core between two clocks: the one that only runs is read on both
+    # sides, and what has passed is added to the error.
+    before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return HostTime(utc_ns, error_ns + after_ns - before_ns, after_ns)
