@@ -38,7 +38,7 @@ class HostTime(NamedTuple):
     error_ns: int
     """Largest error of that [ns]."""
     now_ns: int
-    """The same time on the clock that only runs [ns]."""
+    """Time on the clock that only runs, at the same moment [ns]."""
 
 
 @cache

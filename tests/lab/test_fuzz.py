@@ -123,7 +123,7 @@ def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
     )
     for scenario in SCENARIOS:
         with pytest.raises((TypeError, ValueError)):
-            attack(Decoder(scenario), 5_000)
+            attack(Decoder(scenario), 8_000)
 
 
 def test_a_gate_that_looks_at_no_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:

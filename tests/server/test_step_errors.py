@@ -421,7 +421,7 @@ def test_with_the_time_of_day_at_both_ends_clocks_are_known(
 
 
 def test_a_host_s_clock_counts_where_its_kernel_tells_how_wrong_it_is() -> None:
-    """chrony sets both errors; a clock that nothing disciplines, or that is 0 wrong, is unknown."""
+    """By chrony it tells both errors; a clock that nothing disciplines, or 0 wrong, is unknown."""
     assert stated(0, 0x2001, 1500, 40) == 1_500_000
     for answer, status, most_us, estimate_us in (
         (5, 0x40, 16_000_000, 16_000_000),
