@@ -48,7 +48,6 @@ from skytether.shared.core.events import (
     HostFound,
     HostMissing,
     InZone,
-    ClockContradicted,
     LeftTube,
     Listening,
     Measured,
