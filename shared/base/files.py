@@ -96,7 +96,9 @@ def claim(path: Path, *, is_input: bool = False) -> None:
     made = check(path, is_input=is_input) is None
     if made and is_input:
         return
-    if not os.access(path.absolute().parent, os.W_OK | os.X_OK):
+    folder = path.absolute().parent
+    if not os.access(folder, os.W_OK | os.X_OK):
+        folder.stat()  # raises where it is missing, which access does not tell apart
         raise OSError(EACCES, os.strerror(EACCES), str(path))
     with ExitStack() as stack:
         flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if made else 0)
