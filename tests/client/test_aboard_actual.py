@@ -138,7 +138,7 @@ def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keep
 
 
 def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
-    """And that it waits for somebody to arm it."""
+    """The log says too that it waits for somebody to arm it."""
     air = Air(armed=False)
     air.run(8.0)
     assert len(air.of(Welcomed)) == 1
