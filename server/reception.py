@@ -265,12 +265,12 @@ class Reception:
             what = CONTRADICTED[found]
             self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
-    def _anew(self, row: int, life: int | None) -> None:
+    def _anew(self, row: int, life: tuple[int, int] | None) -> None:
         """Forget all that is known of a vehicle but its session.
 
         Args:
             row: the vehicle.
-            life: number of its life, if its clock may be the one that is known.
+            life: its number and boot id, if its clock may be the one that is known.
         """
         self._clock.forget(row, life)
         self._controller.forget(row)
@@ -281,7 +281,7 @@ class Reception:
         session = self._sessions.begin(observation, now_ns)
         session.line = call.line
         self._plausibility.forget(session.row)
-        self._anew(session.row, session.boot_id)
+        self._anew(session.row, (session.vehicle, session.boot_id))
         self._controller.desired.assign(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))

@@ -151,8 +151,8 @@ class ClockMap:
         self._dt_ns, self._asymmetry_ns = dt_ns, asymmetry_ns
         self.tick_ns = 0
         """Time of our clock that steps were counted for last [ns]."""
-        self._lives: list[int | None] = [None] * capacity
-        """Number of the life of the vehicle in each row."""
+        self._lives: list[tuple[int, int] | None] = [None] * capacity
+        """Vehicle in each row, and the boot id of its life."""
         self.seen = Seen(
             vehicles=np.zeros(capacity, dtype=VEHICLE_CLOCK),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
@@ -162,13 +162,14 @@ class ClockMap:
         for row in range(capacity):
             self.forget(row)
 
-    def forget(self, row: int, life: int | None = None) -> None:
+    def forget(self, row: int, life: tuple[int, int] | None = None) -> None:
         """Begin anew with a vehicle, or with a new session of it.
 
         Args:
             row: the vehicle.
-            life: number of its life, in all of which its step 0 is the same: bounds that were found
-                earlier in the same life stay true. None where it is not known.
+            life: its number and the boot id of its life, in all of which its step 0 is the same:
+                bounds that were found earlier in the same life stay true. None where it is not
+                known.
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN

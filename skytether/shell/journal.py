@@ -6,10 +6,8 @@ that is damaged, of another scenario or of another day is refused, and the proce
 server that has lost a zone must not plan.
 """
 
-import os
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -117,15 +115,8 @@ class Journal:
             OSError: it cannot be written.
         """
         entry = _Entry(scenario=self._name, time_s=time.time(), values=dict(values)).sealed()
-        beside = self._path.with_name(self._path.name + ".new")
-        with suppress(FileNotFoundError):
-            beside.unlink()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        with os.fdopen(os.open(beside, flags, 0o600), "wb") as file:
+        with files.replacing(self._path, is_input=True, mode=0o600) as file:
             file.write(msgspec.json.encode(entry))
-            file.flush()
-            os.fsync(file.fileno())
-        beside.rename(self._path)
 
     def forget(self) -> None:
         """Remove it: a person begins a new flight.

@@ -16,7 +16,7 @@ import pytest
 import skytether.netem.proxy
 from skytether.client.compensator import Compensator
 from skytether.netem.fate import Fates
-from skytether.server.control.clock import ClockMap
+from skytether.server.control.clock import ClockMap, Contradiction
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import (
     Finished,
@@ -201,8 +201,8 @@ def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def deaf(
         self: ClockMap, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
-    ) -> None:
-        observe(self, row, forward_ns, backward_ns, heard=0 * heard, now_ns=now_ns)
+    ) -> Contradiction:
+        return observe(self, row, forward_ns, backward_ns, heard=0 * heard, now_ns=now_ns)
 
     monkeypatch.setattr(ClockMap, "observe", deaf)
 

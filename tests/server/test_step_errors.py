@@ -230,10 +230,10 @@ def test_a_bound_that_was_found_is_kept_but_for_the_drift_of_clocks() -> None:
 def test_another_life_of_a_vehicle_has_another_clock() -> None:
     """Another session of the same life has not."""
     known, rows = ClockMap(1, DT_NS), np.array([0])
-    known.forget(0, 1)
+    known.forget(0, (1, 1))
     known.observe(0, 10 * MS, 10 * MS, heard=0, now_ns=S)
-    for life, width_s in ((1, 0.02), (2, 0.8)):
-        known.forget(0, life)
+    for boot_id, width_s in ((1, 0.02), (2, 0.8)):
+        known.forget(0, (1, boot_id))
         known.observe(0, 400 * MS, 400 * MS, heard=1, now_ns=2 * S)
         early, late = np.zeros((2, 1))
         known.step_errors(rows, known.steps(rows, 2 * S), early, late)

@@ -16,18 +16,23 @@ from hypothesis import strategies as st
 
 from skytether.shared.core.aboard import (
     ArmingAwaited,
+    AutopilotElsewhere,
     AutopilotFound,
     AutopilotMode,
+    AutopilotMoved,
     AutopilotParameter,
     AutopilotRefused,
     AutopilotText,
+    AutopilotWaits,
     NotTakenOff,
     OriginAwaited,
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
+    PositionsDropped,
     SecondCommander,
     Strays,
+    TextsOmitted,
 )
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.core.events import (
@@ -69,6 +74,8 @@ from skytether.shared.core.events import (
     ReferenceTooFast,
     Returned,
     ServerFull,
+    ServerHeard,
+    ServerSilent,
     SessionEnded,
     SessionOpened,
     SessionRefused,
@@ -77,6 +84,7 @@ from skytether.shared.core.events import (
     StateLeapt,
     Unanswered,
     Unauthenticated,
+    Welcomed,
     address_text,
 )
 from skytether.shared.law.terms import Difference
@@ -333,6 +341,43 @@ SENTENCES = [
     (
         ParametersUnsafe(vehicle=1, parameters=(UNSAFE,)),
         "vehicle 1: GUID_TIMEOUT = 3: it flies on; expected 0.2 to 1 s: set 1",
+    ),
+    (
+        AutopilotElsewhere(
+            vehicle=1, came_from="a:2", expected="a:1", content="a heartbeat of system 1"
+        ),
+        (
+            "vehicle 1: nothing comes from its autopilot at a:1; "
+            "a heartbeat of system 1 from a:2 is dropped"
+        ),
+    ),
+    (
+        AutopilotMoved(vehicle=1, before="a:1", after="a:2"),
+        "vehicle 1: its autopilot is at a:2, it was at a:1",
+    ),
+    (
+        AutopilotWaits(vehicle=1, waits_for="its clock"),
+        "vehicle 1 waits for its clock",
+    ),
+    (
+        PositionsDropped(vehicle=1, why="they are too old"),
+        "vehicle 1: positions of its autopilot are dropped: they are too old",
+    ),
+    (
+        TextsOmitted(vehicle=1, count=40),
+        "vehicle 1: 40 more texts of its autopilot are not logged",
+    ),
+    (
+        ServerSilent(vehicle=1, silent_s=2.0),
+        "vehicle 1: the server has been silent for 2.0 s",
+    ),
+    (
+        ServerHeard(vehicle=1, silent_s=12.04),
+        "vehicle 1: the server is heard again, after 12.0 s",
+    ),
+    (
+        Welcomed(vehicle=1, host="server", port=47001),
+        "vehicle 1: session open with the server at server:47001",
     ),
     (
         AutopilotRefused(vehicle=1, asked="arm", answer="failed"),

@@ -85,6 +85,7 @@ terms = st.builds(
     table=text,
     feedback=st.booleans(),
     join_s=positive,
+    land_after_s=positive,
 )
 """Any terms that another end may have."""
 
@@ -320,7 +321,7 @@ def test_an_observation_is_small_for_an_hour(step: int, flown: int) -> None:
 
 def test_the_longest_silence_is_told_as_far_as_the_wire_has_numbers() -> None:
     """An hour in steps of a millisecond would be 7.2 million half steps."""
-    asked = Hearing(3600 * SECOND_NS, MILLISECOND_NS, 3600 * SECOND_NS)
+    asked = Hearing(SECOND_NS, MILLISECOND_NS, 3600 * SECOND_NS)
     beat = Heartbeat(1, 1, 0, 0, 0, 0, asked.silence)
     assert decode(encode(beat), TERMS) == beat
     with pytest.raises(ProtocolError) as refused:

@@ -61,6 +61,7 @@ OTHER: dict[str, Any] = {
     "mavlink.takeoff_m": 5.0,
     "mavlink.origin": "autopilot",
     "mavlink.second_commander": "yield",
+    "link.time_of_day": "host",
     "vehicle.exhausted": "hold",
     "vehicle.memory": "none",
     "vehicle.on_loss": "return",
