@@ -293,6 +293,18 @@ def test_a_horizon_that_is_over_when_it_comes_is_not_braked_along() -> None:
             assert refused.value.reason is Drop.TOO_LATE
 
 
+def test_a_horizon_that_is_cut_by_its_age_is_braked_along_its_last_flown_input() -> None:
+    """The inputs behind the age bound of 50 steps were never flown."""
+    rising = np.array([np.linspace(0.1, 1.0, H), np.zeros(H)])
+    compensator = Compensator(terms(exhausted="brake"))
+    compensator.offer(horizon(45, rising), 46, 0)  # five stages are young enough
+    flown = [chosen(compensator, step, HERE)[0] for step in range(46, 54)]
+    last = max(step for step in range(46, 54) if compensator.covers(step))
+    speeds = flown[last - 46 :]
+    assert speeds[0] == pytest.approx(rising[0][last - 45])
+    assert speeds[1] == pytest.approx(max(0.0, speeds[0] - 0.2), abs=1e-7)
+
+
 @pytest.mark.parametrize("after", ["dropped", "replaced"])
 def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> None:
     """The server repeats what it does not know to be in force; older ones are late."""

@@ -569,9 +569,13 @@ def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
     assert due == [104, 108]
     assert due[-1] - 100 < scenario(2).terms().join
     assert known.owed(104) == known.sent[-1]
-    for _ in range(2 * PROMPT):
+    for _ in range(3 * PROMPT):
         known.learn(prompt=True)
     assert known.copies == 1
+    known.learn(prompt=False)
+    for _ in range(PROMPT - 1):
+        known.learn(prompt=True)
+    assert known.copies == 2
     known.learn(prompt=False)
     known.sent.clear()
     assert known.owed(104) is None
@@ -598,6 +602,28 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
         known = made._roster.known[1].in_force
         assert known is not None
         assert known.motion.position[-1].tolist() == [taken_x, 0.0]
+
+
+def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
+    """It comes to rest v (τ + v / 2b) further on than where it was seen."""
+    made, terms = alone()._roster, scenario(2).terms()
+    made.absent.clear()
+    moving = observation(100, NO_HORIZON, (4.0, 0.0))
+    moving.state[0, 1] = 0.5
+    made.observe(0, moving)
+    expected = 0.5 * (max(terms.tau_s) + 0.5 / (2.0 * terms.brake_mps2))
+    assert made.known[0].off_m == pytest.approx(expected)
+
+
+def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
+    """One of them may still lead away from the place."""
+    made = alone()._roster
+    made.known[1] = known = Known()
+    known.in_force = Sent(-100, resting(-100, np.array([1.0, 0.0])))
+    assert len(made.rests(0)) == 1
+    places = np.array([[1.0, 0.0], [1.2, 0.0]])
+    known.sent.append(Sent(-4, Motion(-4, places, np.zeros((2, 2)))))
+    assert made.rests(0) == []
 
 
 def test_who_gets_a_motion_again_says_so_again() -> None:
