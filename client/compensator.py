@@ -150,7 +150,7 @@ class Compensator:
     def go_on_along(
         self, made_for: int, observed: int, spacing: int, knots: NDArray[np.float32]
     ) -> None:
-        """Fly along a spline from now on, be it one that an earlier life has accepted.
+        """Put a spline in force: a new one, or one that an earlier run of this client has accepted.
 
         Args:
             made_for: step of the first knot.

@@ -47,7 +47,7 @@ class Flow:
     uplink: Lane
     downlink: Lane
     used_ns: int
-    """Time of its newest packet, either way."""
+    """Time of the newest packet of the flow, in either direction [ns]."""
     host: str
     """Host of the client, see `shared.core.endpoint.host_of`."""
     order: "Order"

@@ -635,7 +635,9 @@ def _off(
 
 @part
 def _off_parallelogram(sides: F2) -> float:
-    """Distance of 0 from all p + t a + s b + t s c, t and s from -1/2 to 1/2, or a little less.
+    """Lower bound of the distance from the origin to the points p + t a + s b + t s c.
+
+    Both t and s go from -1/2 to 1/2. The bound is the distance to the parallelogram, less |c| / 4.
 
     Args:
         sides: p, a, b and c; shape (4, axes).

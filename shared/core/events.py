@@ -96,7 +96,7 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """The desired trajectory is faster than the vehicle can fly."""
 
     at_s: float
-    """Time in the flight from which on it is, for the first time [s]."""
+    """First time in the flight at which it is too fast [s]."""
     speed_mps: float
     """Desired speed along an axis then [m/s]."""
     most_mps: float

@@ -153,7 +153,7 @@ class MemoryFile:
     # -- in flight -----------------------------------------------------------------------------
 
     def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
-        """Keep from now on what an endpoint hands out, which is told when it is written."""
+        """Start the thread that writes what an endpoint wants kept, and says when it is done."""
         self._endpoint, self._loop = endpoint, loop
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()

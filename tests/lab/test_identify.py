@@ -389,7 +389,7 @@ def test_a_flight_that_is_broken_off_closes_the_line() -> None:
 
 
 def over_mavlink(asked: Scenario, flavour: FlavourName, plan: ExperimentPlan) -> Identifying:
-    """A complete identification of a simulated autopilot, in virtual time."""
+    """Identification of a simulated autopilot, flown to its end in virtual time."""
     within = fenced(asked, plan)
     autopilot = Autopilot(asked, flavour, ready_s=1.0)
     autopilot.flight.parameters |= SAFE[flavour]

@@ -201,7 +201,7 @@ ATTACKER = "192.0.2.66"
 
 
 class Siege:
-    """An attack on netem: its places are sought by somebody who repeats a packet from many ports.
+    """Attack on netem by an attacker who repeats one packet from many ports, to take all its flows.
 
     Args:
         proxy: the proxy; the server answers each packet at once, a step of 0.1 s after the other.

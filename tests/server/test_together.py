@@ -273,7 +273,7 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
 
 
 def test_the_box_of_a_motion_is_just_around_it() -> None:
-    """Out and back within an interval it reaches half of v T / 2, between its two knots."""
+    """A motion that turns between its two knots lies outside both: the box contains its turn."""
     out_and_back = Motion(0, np.array([[1.0, 5.0]] * 2), np.array([[0.8, 0.0], [-0.8, 0.0]]))
     flown = FlownMotions(np.array([1.0, 0.5]), DT_S)
     flown.add(1, out_and_back, 0, NEVER, 0.0)
