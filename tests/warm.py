@@ -74,8 +74,10 @@ class Command:
     def __enter__(self) -> "Command":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Wait until it has ended."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Wait until it has ended; where the test has failed, end it."""
+        if kind is not None:
+            self.kill()
         self._process.join()
         if hasattr(self, "stdout"):
             self.stdout.close()

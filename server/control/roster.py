@@ -155,6 +155,13 @@ class Roster:
         self._changed.add(row)
         return True
 
+    def brakes_m(self, known: Known) -> float:
+        """Distance by which a vehicle without a motion rests further on than where it was seen
+        [m].
+        """
+        brakes = known.in_force is not None and known.in_force.step < 0
+        return self._stopping_m(known) if brakes else 0.0
+
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of the grid in common."""
         return int(self.rows.ahead[row])
@@ -173,6 +180,16 @@ class Roster:
         known = self.known[row]
         known.sent.append(Sent(step, motion))
         self._note(row, known)
+
+    def unknown(self) -> int | None:
+        """Number of a vehicle of which it is not known where it may fly; None of none.
+
+        A server that begins anew has not heard it yet, or it flies a motion of the server before.
+        """
+        unheard = self.absent.difference(self.rows.number[list(self.known)].tolist())
+        if unheard:
+            return min(unheard)
+        return None if self.foreign is None else self.number_of(self.foreign)
 
     def begins_at(self, number: int) -> Array:
         """Place where a vehicle begins its mission [m]; shape (axes,)."""
@@ -209,6 +226,7 @@ class Roster:
                 found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
             known.in_force = found
         if k <= self.rows.unknown_until[row]:
+            self.foreign = row
             known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
         self._expect_landing(row, observation)
         newest, motion = known.in_force
@@ -247,8 +265,8 @@ class Roster:
         assert known.in_force is not None
         off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
         known.speed_mps = float(np.linalg.norm(state[:, 1]))
-        if known.in_force.step < 0:  # it brakes, and rests further on than where it was seen
-            off_m = max(off_m, self._stopping_m(known))
+        if known.in_force.step < 0:
+            off_m = max(off_m, self.brakes_m(known))
         elif off_m <= 0.0:
             self.absent.discard(number)
         elif number not in self.absent:

@@ -211,14 +211,13 @@ class Together:
             known.goal = None  # what was found out about ways to it holds no more
 
     def objection(self, zones: Zones) -> str:
-        """Why there cannot be these zones: where a vehicle may fly into one; empty: there can."""
-        room_m = self._clear.tube_m + self._clear.bend_m
-        for number in sorted(self._roster.absent):
-            first = self._roster.begins_at(number)
-            if touches(zones, np.stack([first, first]), self._clear.tube_m):
-                zone = zones.in_the_way(first[None], self._clear.tube_m)
-                return f"{zone}, in which vehicle {number} is to begin, tube included"
+        """Why there cannot be these zones: where a vehicle may fly into one, or is not known to
+        keep out; empty: there can.
+        """
+        if zones and (number := self._roster.unknown()) is not None:
+            return f"zones before it is known where vehicle {number} is"
         for row, known in self._roster.known.items():
+            room_m = self._clear.tube_m + self._clear.bend_m + self._roster.brakes_m(known)
             for motion in known.motions():
                 # The earliest step that the vehicle may be at.
                 k = self._roster.now + self._roster.ahead(row)

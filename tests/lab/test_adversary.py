@@ -214,6 +214,19 @@ def test_each_kind_of_move_finds_a_planted_fault(
     assert spare_m(flown, fly(flown, best.moves)) > 0.0
 
 
+def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Somebody rests there whom it has not heard; without the question who that is, inside."""
+    moves = (
+        move(Kind.SERVER, 0, "", 20.0, 0.5),
+        move(Kind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
+    )
+    assert spare_m(FOUR, fly(FOUR, moves)) > 0.0
+    monkeypatch.setattr(Roster, "unknown", lambda _: None)
+    assert spare_m(FOUR, fly(FOUR, moves)) < 0.0
+
+
 # -- what is found comes again -------------------------------------------------------------------
 
 DIES = move(Kind.CUTS, 0, "", 3.0, 2.0)

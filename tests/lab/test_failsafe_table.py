@@ -34,6 +34,8 @@ another: 0.1 m and 1.0 m, rounded."""
 
 COMMANDED_M = 2.5
 """Distance off its path to which a second commander may bring a vehicle before it brakes [m]."""
+COMMANDED_S = 1.6
+"""Time for which a second commander may have a vehicle before it brakes [s]."""
 
 
 def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
@@ -46,7 +48,7 @@ def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
     is_commanded = case == "second commander"
     assert outcome.off_path_m < (COMMANDED_M if is_commanded else OFF_PATH_M[flavour])
     if ending != "flies on":
-        assert outcome.still_s <= STANDS_S[flavour]
+        assert outcome.still_s <= STANDS_S[flavour] + is_commanded * COMMANDED_S
     assert math.isnan(outcome.down_s) == (ending != "has landed")
     return outcome
 

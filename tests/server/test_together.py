@@ -908,23 +908,26 @@ def test_the_least_distance_counts_heights_less() -> None:
 def test_a_zone_that_is_drawn_in_flight() -> None:
     """Vehicles go round it from then on; one that a vehicle may be in is refused, with its name."""
     swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
-    drawn = [(0.5, {"mission.zones": zone})]
+    drawn = [(3.0, {"mission.zones": zone})]
     flown = flight.fly(swaps, vehicles=2, changes=drawn)
     assert clear_m(flown, zones.parse(zone, 2)) > 0.0
     assert max(left_m(flown, 2)) < 0.3
     over = [
-        (1.0, {"mission.zones": "cylinder(4, 0, 1)"}),
+        (1.0, {"mission.zones": zone}),
+        (3.0, {"mission.zones": "cylinder(4, 0, 1)"}),
         (5.0, {"mission.zones": zone}),
         (29.0, {"mission.zones": "cylinder(-4, 0, 1)"}),
     ]
     flown = flight.fly(swaps, vehicles=2, changes=over)
     reasons = [each.event.reason for each in flown.events if isinstance(each.event, ChangeRefused)]
     got, whole = "mission.zones: got", "tube included; nothing was changed"
-    assert reasons[0] == f"{got} cylinder(4, 0, 1), in which vehicle 1 is to begin, {whole}"
+    unheard = "zones before it is known where vehicle 1 is; nothing was changed"
+    assert reasons[0] == f"{got} {unheard}"
+    assert reasons[1] == f"{got} cylinder(4, 0, 1), which vehicle 1 hovers in, {whole}"
     assert re.fullmatch(
-        rf"{got} {re.escape(zone)}, which vehicle . may fly into for .* s more, {whole}", reasons[1]
+        rf"{got} {re.escape(zone)}, which vehicle . may fly into for .* s more, {whole}", reasons[2]
     )
-    assert reasons[2] == f"{got} cylinder(-4, 0, 1), which vehicle 1 hovers in, {whole}"
+    assert reasons[3] == f"{got} cylinder(-4, 0, 1), which vehicle 1 hovers in, {whole}"
 
 
 def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
