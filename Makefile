@@ -21,9 +21,11 @@ INSTALL = install() { \
 # Tests start hundreds of processes; none shall compile anew what another has.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Kernels are compiled once, the server's beside the laboratory's, and not by each worker of pytest.
+# Kernels are compiled once, the server's beside the laboratory's, and so are the tests, whose asserts
+# pytest rewrites: not by each of its workers.
 LOAD = from skytether.shared.base import kernel; kernel.load()
 KERNELS = $(BIN)/python -c "import skytether.lab.loops, skytether.quadrotor.loops; $(LOAD)" & \
+	$(BIN)/pytest --collect-only -qq >/dev/null & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
 .PHONY: setup demo reproduce test long-test check format lock keys pictures equations docs docker-test page-test autopilot-test bench fuzz clean

@@ -95,11 +95,11 @@ def _at_first_call(dispatcher: Any) -> Any:
     def first(*arguments: Any) -> Any:
         _compile(dispatcher)
         answer = dispatcher(*arguments)
-        if not _CHECKED:
-            (compiled,) = dispatcher.overloads.values()
-            # A partial function of no arguments: its function can be changed, and calling it costs
-            # less than a method would.
-            call.__setstate__((compiled.entry_point, (), {}, call.__dict__))
+        (compiled,) = dispatcher.overloads.values()
+        # A partial function of no arguments: its function can be changed, and calling it costs less
+        # than a method would.
+        code = dispatcher if _CHECKED else compiled.entry_point
+        call.__setstate__((code, (), {}, call.__dict__))
         return answer
 
     call: Any = partial(first)

@@ -193,9 +193,9 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
     ("kinds", "first", "ablation"),
     [
         pytest.param("losses", 4, newest, marks=pytest.mark.long),
-        ("cuts", 2, newest),
+        pytest.param("cuts", 2, newest, marks=pytest.mark.long),
         ("delays", 0, certain),
-        ("client", 1, forgetful),
+        pytest.param("client", 1, forgetful, marks=pytest.mark.long),
         pytest.param("goals,losses", 5, newest, marks=pytest.mark.long),
         pytest.param("server,cuts", 1, hasty, marks=pytest.mark.long),
         ("zones", 0, heedless),

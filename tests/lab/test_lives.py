@@ -20,11 +20,11 @@ def swap() -> Scenario:
 
 def test_a_zone_set_in_flight_is_kept_clear_of_after_a_death_of_the_server() -> None:
     """It was set while nobody could fly into it; without the journal vehicles are inside it."""
-    setting = [(1.5, {"mission.zones": BOX})]
-    kept = Lives(swap(), deaths=[Death(2.0, 1.0)], settings=setting)
+    setting = [(3.0, {"mission.zones": BOX})]
+    kept = Lives(swap(), deaths=[Death(4.0, 1.0)], settings=setting)
     kept.fly(30.0)
     assert kept.inside_s(CENTRE) == 0.0
-    forgotten = Lives(swap(), deaths=[Death(2.0, 1.0, remembers=False)], settings=setting)
+    forgotten = Lives(swap(), deaths=[Death(4.0, 1.0, remembers=False)], settings=setting)
     forgotten.fly(30.0)
     assert forgotten.inside_s(CENTRE) > 1.0
 
