@@ -592,6 +592,48 @@ def _least_apart(
 
 
 @part
+def _seen_apart(
+    one: Motion,
+    other: Motion,
+    begin: int,
+    lands: int,
+    others_land: int,
+    error: StepError,
+    others: StepError,
+    scale: F1,
+    dt_s: float,
+    limit: float,
+) -> float:
+    """Bound from above of the distance of two motions from a step on, or `limit` if more [m]: the
+    least at some steps, and for some errors of these; see `_least_apart`.
+    """
+    one_last = one.first + (len(one.position) - 1) * SPACING
+    other_last = other.first + (len(other.position) - 1) * SPACING
+    least, most = shifts(error, others, 0.0)
+    piece = SPACING / SAMPLES
+    # At the last step both rest, and are down if they ever land.
+    pieces = max(int(np.ceil((max(one_last, other_last - least) - begin) / piece)), 0) + 1
+    nearest = limit
+    for i in range(pieces + 1):
+        step = begin + i * piece
+        first, last = sweep(other, step, step, least, most)
+        slices = int(np.ceil((last - first) / piece))
+        for j in range(slices + 1):
+            shift = first + (last - first) * j / max(slices, 1)
+            down, other_down = _is_down(lands, step), _is_down(others_land, step + shift)
+            if i == pieces:
+                down, other_down = lands < NEVER, others_land < NEVER
+            square = 0.0
+            for x in range(len(scale)):
+                away = _away(one, other, step, shift, x, scale, dt_s)
+                if x == ALTITUDE:
+                    away = _above(away, down, other_down)
+                square += away * away
+            nearest = min(nearest, np.sqrt(square))
+    return nearest
+
+
+@part
 def _off(
     one: Motion,
     other: Motion,
@@ -715,12 +757,14 @@ def is_hit(
     )
     if least >= keep_m:
         return False
+    seen = _seen_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m)
+    if seen >= keep_m - NEARER_M:
+        return True
+    # Nearer already: the bounds of both motions are compared, or they would come nearer by what
+    # these are off, again and again. Where a vehicle may land they may be off by more than bends.
     held = _least_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m, sides)
-    # One that keeps the distance may look nearer by what the bound allows for, which is another
-    # with pieces that begin elsewhere, and with the two exchanged. If that counted as nearer, they
-    # would come nearer by as much again and again.
     bend = _extent(base, scale, dt_s).bend + _extent(other, scale, dt_s).bend
-    return held >= keep_m - NEARER_M - 4.0 * bend or least < held - NEARER_M
+    return least < max(held, seen - 4.0 * bend) - NEARER_M
 
 
 @making_kernel

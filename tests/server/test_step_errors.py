@@ -170,6 +170,52 @@ def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> N
                 assert apart.too_near(nearer, base, begin, 0, NEVER, flown, low)[0]
 
 
+def above_ground(motion: Motion) -> Motion:
+    """The motion, so high that it does not pass the ground."""
+    return motion._replace(position=motion.position + np.array([0.0, 0.0, 20.0]))
+
+
+def landing_m(
+    one: Motion, other: Motion, begin: int, mine: StepError, its: StepError, lands: list[int]
+) -> float:
+    """Least distance as of `least_m`, of two of which each may be below its motion from a step of
+    its own on [m]; shape of places (3,).
+    """
+    steps = np.append(np.arange(begin, max(one.last, other.last) + 80.0, 0.5), 1e3)
+    here, nearest = one.at(steps, DT_S)[0], np.inf
+    for shift in np.arange(-its.late - mine.early, its.early + mine.late + 0.5, 0.5):
+        away = here - other.at(steps + shift, DT_S)[0]
+        above, below = away[:, 2] > 0.0, away[:, 2] < 0.0
+        passes = above & (steps >= lands[0]) | below & (steps + shift >= lands[1])
+        away[passes, 2] = 0.0
+        nearest = min(nearest, float(np.linalg.norm(away, axis=1).min()))
+    return nearest
+
+
+def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
+    """Whoever may land: only where a vehicle is too near already may it be as near as that."""
+    keep_m, accepted = 1.2, 0
+    for seed in range(1000, 1600):
+        rng = np.random.default_rng(seed)
+        motion, other = (above_ground(drawn(rng, 3)) for _ in range(2))
+        mine, its = (StepError(*rng.uniform(0.0, 8.0, 2)) for _ in range(2))
+        lands = [NEVER if rng.random() < 0.3 else int(rng.integers(250)) for _ in range(2)]
+        # At rest above the way of the other one, and from there to somewhere.
+        place = other.position[len(other.position) // 2] + rng.uniform([-1, -1, 1], [1, 1, 4])
+        base = resting(0, place)
+        motion = Motion(0, motion.position - motion.position[0] + place, motion.velocity)
+        flown = FlownMotions(np.ones(3), DT_S)
+        flown.add(1, other, 0, lands[1], 0.0, its)
+        if apart.too_near(motion, base, 0, 0, lands[0], flown, keep_m, mine)[0]:
+            continue
+        accepted += 1
+        # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.
+        least = landing_m(motion, other, 0, mine, its, lands) + 0.06
+        if least < keep_m:
+            assert least > landing_m(base, other, 0, mine, its, lands)
+    assert accepted > 300
+
+
 # -- what is known of a clock ----------------------------------------------------------------------
 
 
