@@ -757,14 +757,15 @@ def is_hit(
     )
     if least >= keep_m:
         return False
-    seen = _seen_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m)
-    if seen >= keep_m - NEARER_M:
-        return True
-    # Nearer already: the bounds of both motions are compared, or they would come nearer by what
-    # these are off, again and again. Where a vehicle may land they may be off by more than bends.
+    # The bounds of both motions are compared, or they would come nearer by what these are off, again
+    # and again. Where a vehicle may land a bound may be off by more than bends, so one that only
+    # looks nearer has to keep the distance.
     held = _least_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m, sides)
+    if least < held - NEARER_M:
+        return True
+    seen = _seen_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m)
     bend = _extent(base, scale, dt_s).bend + _extent(other, scale, dt_s).bend
-    return least < max(held, seen - 4.0 * bend) - NEARER_M
+    return seen >= keep_m - NEARER_M or least < seen - 4.0 * bend - NEARER_M
 
 
 @making_kernel
