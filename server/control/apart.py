@@ -757,9 +757,9 @@ def is_hit(
     )
     if least >= keep_m:
         return False
-    # The bounds of both motions are compared, or they would come nearer by what these are off, again
-    # and again. Where a vehicle may land a bound may be off by more than bends, so one that only
-    # looks nearer has to keep the distance.
+    # The bounds of both motions are compared, or they would come nearer by what these are off,
+    # again and again. Where a vehicle may land a bound may be off by more than bends, so one that
+    # only looks nearer has to keep the distance.
     held = _least_apart(base, other, begin, lands, down, error, steps, scale, dt_s, keep_m, sides)
     if least < held - NEARER_M:
         return True
