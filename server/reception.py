@@ -242,7 +242,10 @@ class Reception:
         self._grid.arm(now_ns)
 
     def _hear_time(self, told: Time, now_ns: int) -> None:
-        """Take the time of day of a vehicle's step 0, where it is known here too."""
+        """Narrow the bounds of a vehicle's clock by the time of day that it has sent.
+
+        Without a time of day at this host as well it says nothing.
+        """
         session = self._sessions.find(told)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)

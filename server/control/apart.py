@@ -275,6 +275,12 @@ def state(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, f
 
 
 @part
+def _last(motion: Motion) -> int:
+    """Step at which a motion has come to rest, see `Motion.last`."""
+    return motion.first + (len(motion.position) - 1) * SPACING
+
+
+@part
 def _place(motion: Motion, axis: int, step: float, dt_s: float) -> float:
     """Position of a motion on an axis at a step."""
     return state(motion, axis, step, dt_s)[0]
@@ -456,7 +462,7 @@ def sweep(
         step, until: between these it is looked at.
         least, most: steps by which it may be further on.
     """
-    last = other.first + (len(other.position) - 1) * SPACING
+    last = _last(other)
     return min(max(least, other.first - until), most), max(min(most, last - step), least)
 
 
@@ -512,7 +518,7 @@ def _span(
     lasts, then all the time until the other rests too, and then the time when both have landed that
     ever do.
     """
-    last = other.first + (len(other.position) - 1) * SPACING
+    last = _last(other)
     step = begin + i * (SPACING / SAMPLES)
     if i < pieces:
         end = step + SPACING / SAMPLES
@@ -566,8 +572,8 @@ def _least_apart(
         sides: scratch; shape (4, axes).
     """
     piece_s = SPACING / SAMPLES * dt_s
-    one_last = one.first + (len(one.position) - 1) * SPACING
-    other_last = other.first + (len(other.position) - 1) * SPACING
+    one_last = _last(one)
+    other_last = _last(other)
     drift = 2.0 * max(max(one_last, other_last) - begin, 0) / DRIFT
     least, most = shifts(error, others, drift)
     pieces = max(int(np.ceil((one_last - begin) * SAMPLES / SPACING)), 0)
@@ -604,11 +610,13 @@ def _seen_apart(
     dt_s: float,
     limit: float,
 ) -> float:
-    """Bound from above of the distance of two motions from a step on, or `limit` if more [m]: the
-    least at some steps, and for some errors of these; see `_least_apart`.
+    """Bound from above of the distance of two motions from a step on, or `limit` if more [m].
+
+    It is the least distance at some steps, a piece apart, and for some errors of these: each is one
+    that the two may come to. Arguments are those of `_least_apart`.
     """
-    one_last = one.first + (len(one.position) - 1) * SPACING
-    other_last = other.first + (len(other.position) - 1) * SPACING
+    one_last = _last(one)
+    other_last = _last(other)
     least, most = shifts(error, others, 0.0)
     piece = SPACING / SAMPLES
     # At the last step both rest, and are down if they ever land.

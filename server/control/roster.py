@@ -156,8 +156,8 @@ class Roster:
         return True
 
     def brakes_m(self, known: Known) -> float:
-        """Distance by which a vehicle without a motion rests further on than where it was seen
-        [m].
+        """Distance that a vehicle without a motion, which brakes, still flies from where it was
+        observed until it is at rest [m]; 0 of one with a motion.
         """
         brakes = known.in_force is not None and known.in_force.step < 0
         return self._stopping_m(known) if brakes else 0.0
@@ -182,7 +182,7 @@ class Roster:
         self._note(row, known)
 
     def unknown(self) -> int | None:
-        """Number of a vehicle of which it is not known where it may fly; None of none.
+        """Number of a vehicle that may fly where the server does not know; None if there is none.
 
         A server that begins anew has not heard it yet, or it flies a motion of the server before.
         """

@@ -17,7 +17,7 @@ class TimeOfDay(NamedTuple):
     ahead_ns: int
     """Time since 1970, less the time on the endpoint's own clock [ns]."""
     error_ns: int
-    """Largest error of that when it was learned [ns]."""
+    """Largest error of `ahead_ns` at the time `learned_ns` [ns]."""
     learned_ns: int
     """Time on the endpoint's own clock when it was learned [ns]."""
 

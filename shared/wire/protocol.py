@@ -281,7 +281,7 @@ class Close(NamedTuple):
 
 
 class Time(NamedTuple):
-    """Time of day of the begin of a vehicle's step 0, told where its host knows it."""
+    """Time of day at which a vehicle's step 0 began; sent where the vehicle's host knows it."""
 
     vehicle: int
     session: int

@@ -48,7 +48,7 @@ def _adjtimex() -> "ctypes._FuncPointer | None":
 
 
 def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
-    """Largest error of the host's clock by what its kernel answers [ns]; None of none."""
+    """Largest error of the host's clock as the kernel answers [ns]; None where that is unknown."""
     if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
         return None
     return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None

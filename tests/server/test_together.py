@@ -616,7 +616,7 @@ def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
 
 
 def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
-    """One of them may still lead away from the place."""
+    """A motion that was sent and may still be taken leads away from where it is."""
     made = alone()._roster
     made.known[1] = known = Known()
     known.in_force = Sent(-100, resting(-100, np.array([1.0, 0.0])))
