@@ -1,6 +1,7 @@
 """A companion computer for tests: it speaks MAVLink with a scripted autopilot in virtual time."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ class Companion:
         flavour: which autopilot.
         ready_s: time until it may be armed [s].
         faults: what goes wrong, as on the command line.
+        errs: whether it estimates its velocity with the errors of its flavour.
         vehicle: keys of the scenario's vehicle.
     """
 
@@ -40,6 +42,7 @@ class Companion:
         ready_s: float | None = 0.5,
         faults: tuple[str, ...] = (),
         seed: int = 1,
+        errs: bool = False,
         **vehicle: Any,
     ) -> None:
         scenario = check({"seed": seed, "vehicle": vehicle}, "test")
@@ -47,6 +50,8 @@ class Companion:
         self.autopilot = Autopilot(
             scenario, flavour, ready_s=ready_s, faults=[parse(each) for each in faults]
         )
+        if not errs:
+            self.flight.flavour = replace(self.flavour, wander_mps=0.0)
         self.codec = Codec(255, 190)
         self.now_ns = 1_000_000_000
         self.heard: list[tuple[int, Message]] = []

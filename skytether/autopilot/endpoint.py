@@ -130,7 +130,9 @@ class Autopilot(Endpoint):
         )
         quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)
         ready_s = self._flavour.ready_s if ready_s is None else ready_s
-        self.flight = PILOTS[flavour](self._flavour, quadrotor, ready_s)
+        self.flight = PILOTS[flavour](
+            self._flavour, quadrotor, ready_s, stream(scenario.seed, "estimate")
+        )
         self._telling = Telling(self.flight)
         self.script = Script(faults)
         """Scripted faults."""

@@ -55,6 +55,9 @@ class SimulatedFlavour:
     """Whether its texts go to ground stations alone, as PX4's do."""
     spool_s: float
     """Time from the take-off command until it climbs [s]."""
+    wander_mps: float
+    """Standard deviation of the error of the velocity that it estimates, along each axis [m/s]: it
+    moves as much beside that, and does not notice."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
@@ -88,6 +91,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         ready_s=41.5,
         words_for_stations=False,
         spool_s=3.4,
+        wander_mps=0.0,
         home=(-35.363262, 149.165237, 584.0),
         modes={
             5: ("LOITER", FlightMode.PILOT),
@@ -148,6 +152,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         ready_s=4.6,
         words_for_stations=True,
         spool_s=1.0,
+        wander_mps=0.16,
         home=(47.397742, 8.545594, 489.4),
         modes={
             _px4(3): ("POSCTL", FlightMode.PILOT),

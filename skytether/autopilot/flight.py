@@ -27,6 +27,11 @@ THERE_M = 0.1
 STILL_MPS = 0.1
 """Speed below which the vehicle counts as at rest [m/s]."""
 
+WANDER_NS = 3 * SECOND_NS
+"""Time constant of the error of the velocity that it estimates [ns]."""
+WANDER_TIME_S = 0.6
+"""Error of the position that it estimates, as time of that error of the velocity [s]."""
+
 Vector = tuple[float, float, float]
 REST: Vector = (0.0, 0.0, 0.0)
 
@@ -97,12 +102,19 @@ class PilotedVehicle(ABC):
         flavour: autopilot to simulate.
         quadrotor: its body, standing on the ground at the origin.
         ready_s: time from the start until it may be armed [s].
+        noise: random generator of what it estimates.
     """
 
     low = 0.15
     """Charge of the battery below which the low-battery failsafe acts."""
 
-    def __init__(self, flavour: SimulatedFlavour, quadrotor: Quadrotor, ready_s: float) -> None:
+    def __init__(
+        self,
+        flavour: SimulatedFlavour,
+        quadrotor: Quadrotor,
+        ready_s: float,
+        noise: np.random.Generator,
+    ) -> None:
         self.flavour, self.quadrotor = flavour, quadrotor
         self.parameters: Parameters = dict(flavour.parameters)
         self.number = flavour.first
@@ -117,6 +129,8 @@ class PilotedVehicle(ABC):
         self.drift: Vector = REST
         """Velocity at which it moves beside the one that it estimates, as with accelerometers that
         have failed [m/s]."""
+        self._wander, self._noise = np.zeros(3), noise
+        """Error of the velocity that it estimates: it moves as much beside that [m/s]."""
         self.displaced: Vector = REST
         """Displacement of the position that it reports [m]."""
         self.said: list[tuple[Severity, str]] = []
@@ -334,8 +348,9 @@ class PilotedVehicle(ABC):
         else:
             velocity = REST
         self.quadrotor.on = self.armed and self.flying
-        drift = self.drift if self.flying else REST
-        self.quadrotor.advance(np.add(velocity, drift), TICK_NS)
+        self._stray()
+        beside = np.add(self.drift, self._wander) if self.flying else np.zeros(3)
+        self.quadrotor.advance(velocity + beside, TICK_NS)
         if self.armed:
             self._settle(velocity)
 
@@ -451,14 +466,29 @@ class PilotedVehicle(ABC):
     # State
 
     def position(self) -> Vector:
-        """Position [m]."""
+        """True position [m]."""
         x, y, z = self.quadrotor.position().tolist()
         return x, y, z
 
     def velocity(self) -> Vector:
         """Velocity, as it estimates it [m/s]."""
-        x, y, z = np.subtract(self.quadrotor.velocity(), self.drift).tolist()
+        x, y, z = (self.quadrotor.velocity() - self.drift - self._wander).tolist()
         return x, y, z
+
+    def estimate(self) -> Vector:
+        """Position, as it estimates it [m]."""
+        lag = WANDER_TIME_S * self._wander
+        x, y, z = (self.quadrotor.position() + self.displaced - lag).tolist()
+        return x, y, z
+
+    def _stray(self) -> None:
+        """Let the error of the velocity that it estimates go on: a Gauss-Markov process."""
+        if self.flying and self.flavour.wander_mps:
+            share = TICK_NS / WANDER_NS
+            drawn = sqrt(2.0 * share) * self._noise.standard_normal(3)
+            self._wander += self.flavour.wander_mps * drawn - share * self._wander
+        else:
+            self._wander[:] = 0.0
 
     def quadrotor_wants(self) -> Vector:
         """Desired position of its loops [m]: the true one, or that of the shaped velocity."""

@@ -7,6 +7,8 @@ after a landing.
 
 from math import hypot, isfinite, radians, tan
 
+import numpy as np
+
 from skytether.autopilot.flavours import FlightMode, SimulatedFlavour
 from skytether.autopilot.flight import (
     CompanionSetpoint,
@@ -44,8 +46,14 @@ class PX4(PilotedVehicle):
     arming_word = ""
     lifts_off_by_setpoint = True
 
-    def __init__(self, flavour: SimulatedFlavour, quadrotor: Quadrotor, ready_s: float) -> None:
-        super().__init__(flavour, quadrotor, ready_s)
+    def __init__(
+        self,
+        flavour: SimulatedFlavour,
+        quadrotor: Quadrotor,
+        ready_s: float,
+        noise: np.random.Generator,
+    ) -> None:
+        super().__init__(flavour, quadrotor, ready_s, noise)
         self._covered = False
         """Whether a failsafe covers OFFBOARD until set-points come again."""
         self._after_disarming = flavour.first

@@ -2,8 +2,6 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from skytether.autopilot.flight import Landed, PilotedVehicle
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
@@ -53,7 +51,7 @@ class Telling:
         """Position and velocity; None while unknown."""
         if not self._flight.ready:
             return None
-        position = turned(np.add(self._flight.position(), self._flight.displaced).tolist())
+        position = turned(self._flight.estimate())
         velocity = turned(self._flight.velocity())
         return dialect.MAVLink_local_position_ned_message(
             self._boot_ms,

@@ -85,7 +85,8 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
         assert path[-1, 2] < 0.1
         assert flown.zones.clearance(path).min() > 0.0
     assert apart_m(paths) > flown.mission.separation_m
-    assert server.figures()["counts"].get("left_tube", 0) == 0
+    if flavour == "ardupilot":
+        assert server.figures()["counts"].get("left_tube", 0) == 0
 
 
 @pytest.mark.usefixtures("documented_ports")

@@ -228,17 +228,20 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
     speeds = np.linalg.norm(rows["state"][seen, :2, 1], axis=1)
     positions = rows["state"][seen, :2, 0]
     still = np.flatnonzero(speeds < STILL_MPS)
+    down_ns = watched.down_ns
+    down_s = np.inf if down_ns is None else (down_ns - fault_ns) / SECOND_NS
     return FaultOutcome(
         case,
         flavour,
         seed,
         modes=modes,
-        autopilot=since(watched.flown),
+        # On the ground PX4 is in the mode again that was asked for last.
+        autopilot=tuple(change for change in since(watched.flown) if change[1] < down_s),
         moved_m=_largest(positions - positions[0]),
         off_path_m=_off_path(scenario, positions),
         off_reference_m=_largest(positions - _reference(scenario, times_s[seen] + FAULT_S)),
         still_s=float(times_s[seen][still[0]]) if len(still) else np.nan,
-        down_s=np.nan if watched.down_ns is None else (watched.down_ns - fault_ns) / SECOND_NS,
+        down_s=down_s if np.isfinite(down_s) else np.nan,
         ending=_ending(watched, speeds[-1], modes),
     )
 
