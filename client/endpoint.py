@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe, brake_ns
+from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import FlownMotion, Kept, Memory
 from skytether.client.pilot import Pilot
@@ -362,7 +362,8 @@ class Client(Endpoint):
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._leap_told = leap_m
         if leap_m is not None and self._failsafe.has_leapt:
-            after_s = self._land_after_s
+            # One second more than after a loss: positions have to be good again first.
+            after_s = self._land_after_s + GOOD_NS / SECOND_NS if self._land_after_s else 0.0
             self._events.append(StateLeapt(vehicle=self.vehicle, by_m=leap_m, land_after_s=after_s))
 
     def _end(self, now_ns: int) -> None:

@@ -49,7 +49,7 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether the input that was asked for last would have led too far, or was too fast."""
+        """Whether the input that was asked for last would have led too far."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
@@ -67,10 +67,10 @@ class Fence:
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]
         flown = self._inside(wanted, rest, u_max)
+        self.holds = math.dist(flown, wanted) > ROUNDING
         if math.hypot(*flown) > self._speed:
             back = self._inside([0.0] * len(flown), rest, u_max)
             flown = _slowed(back, flown, self._speed)
-        self.holds = math.dist(flown, wanted) > ROUNDING
         return flown
 
     def _inside(

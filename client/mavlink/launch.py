@@ -56,6 +56,8 @@ RESULTS = {
     for number, entry in dialect.enums["MAV_RESULT"].items()
 }
 """Names of answers to commands."""
+UNHEARD = "nothing is heard of it"
+"""Why a step is not done where the autopilot is silent."""
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
     LaunchStep.HOLD: "not in a mode that holds",
@@ -172,7 +174,9 @@ class Launch:
         """Begin the climb once that can be, or find it to be over."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
-        if not condition.is_fresh(now_ns=now_ns) or not condition.landed:
+        if self._silence(now_ns):
+            self._wait("not ready", UNHEARD, now_ns)
+        elif not condition.is_fresh(now_ns=now_ns) or not condition.landed:
             self._wait("not ready", "it does not say whether it is on the ground", now_ns)
         elif not self._is_placed(now_ns):
             self._wait("not ready", "it does not tell where it is", now_ns)
@@ -183,9 +187,9 @@ class Launch:
             expected = f"expected it on the ground, or in {guided}"
             self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
         elif condition.armed and condition.mode not in flavour.own:
-            self.waits_for_word = "it was armed by somebody else"
+            self.waits_for_word = self.waits_for_word or "it was armed by somebody else"
             expected = f"expected it disarmed, or in {guided}"
-            self._wait("not flown", f"it was armed by somebody else in {mode}; {expected}", now_ns)
+            self._wait("not flown", f"it is armed, in {mode}; {expected}", now_ns)
         elif may_arm and condition.battery_is_weak:
             self._wait("not armed", "its battery is low, see mavlink.battery_min", now_ns)
         elif may_arm and self.waits_for_word:
@@ -213,7 +217,7 @@ class Launch:
 
     def _ask_for_word(self) -> None:
         """Say once that a person has to say that the vehicle may be armed."""
-        self._since_ns = None
+        self._since_ns, self.waits_for = None, "armed = true"
         if not self._asks_for_word:
             self._asks_for_word = True
             self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.waits_for_word))
@@ -277,6 +281,8 @@ class Launch:
             self._since_ns = now_ns
         if self.phase is Phase.GROUND:
             self.waits_for = f"its autopilot, {doing}: {why}"
+        else:
+            self.waits_for = f"its autopilot, {doing}: {UNHEARD}" if self._silence(now_ns) else ""
         if now_ns - self._since_ns > self._patience_ns:
             waited = f"{doing} in {self._patience_ns / SECOND_NS:g} s"
             self._fail(waited, self._silence(now_ns) or self._words or why, now_ns)

@@ -369,7 +369,7 @@ def test_a_vehicle_that_somebody_has_armed_is_left_to_him() -> None:
     air.flight.enter(5)
     air.flight.arm()
     air.run(10.0, lambda: air.client.failure is not None)
-    assert "it was armed by somebody else in LOITER" in str(air.client.failure)
+    assert "it is armed, in LOITER" in str(air.client.failure)
     assert not air.commands(SET_MODE)
 
 

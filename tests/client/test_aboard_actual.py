@@ -188,6 +188,30 @@ def test_what_is_waited_for_is_the_autopilot_before_it_is_the_server() -> None:
     assert "heartbeat" in waits.waits_for
 
 
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_line_that_is_cut_is_told_in_the_climb_and_on_the_ground(armed: bool) -> None:
+    """Nothing comes from the autopilot for 8 s, of the 60 s that the climb may take."""
+    air = Air(armed=armed)
+    air.run(30.0, lambda: air.flight.armed)
+    assert air.flight.armed is armed
+    air.tap.dumb = True
+    air.run(8.0)
+    assert "nothing is heard" in air.of(AutopilotWaits)[-1].waits_for
+
+
+def test_a_vehicle_found_armed_waits_for_a_person_once_it_is_disarmed() -> None:
+    """What is said last is what is true."""
+    air = Air("ardupilot")
+    air.run(1.5)
+    air.flight.enter(5)
+    air.flight.arm()
+    air.run(6.0)
+    assert "it is armed, in LOITER" in air.of(AutopilotWaits)[-1].waits_for
+    air.flight.disarm()
+    air.run(6.0)
+    assert air.of(AutopilotWaits)[-1].waits_for == "armed = true"
+
+
 # Another address
 
 

@@ -86,6 +86,14 @@ def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
     assert any(isinstance(each.event, FenceHolds) for each in record.events)
 
 
+def test_a_vehicle_that_is_slowed_is_not_said_to_be_held_by_its_fence() -> None:
+    """In the middle of a wide fence, whose speed bounds its way onto the figure."""
+    slowed = packaged(
+        "demo", duration=20.0, fence={"radius_m": 40.0, "speed_mps": 0.65, "wind_mps": 0.2}
+    )
+    assert not any(isinstance(each.event, FenceHolds) for each in fly(slowed).events)
+
+
 def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
     """Wind blows it there while it hovers without a link; that is said until it lands."""
     blown = packaged(
