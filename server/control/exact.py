@@ -343,7 +343,7 @@ class ExactSolver:
         settled = np.ones(gradient.shape[:2], dtype=np.bool_)
         mpc, which = self._problem.mpc, self._problem.which
         _solve(mpc, which, self.work, gradient, guess, inputs, settled.reshape(-1))
-        solved: Flags = np.isfinite(gradient).reshape(len(gradient), -1).all(axis=1)
+        solved: Flags = np.all(np.isfinite(gradient), axis=(1, 2))
         for vehicle, axis in np.argwhere(~settled & solved[:, None]):
             self.fallbacks += 1
             try:
