@@ -20,9 +20,17 @@ import daqp
 import numpy as np
 
 from skytether.server.control.law import advance, axis_at
-from skytether.server.control.mpc import MPC, Inputs, Problem, shifted
+from skytether.server.control.mpc import (
+    MPC,
+    Problem,
+    SimdBatch,
+    column,
+    set_previous,
+    simd_batch,
+    simd_memory,
+)
 from skytether.server.control.solver import NEAR, SolverFailed
-from skytether.shared.base.kernel import F1, F2, F3, F5, I2, inline, kernel, part
+from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lanes, part
 from skytether.shared.law.model import Array, Axis, Flags
 
 ROUNDS_MAX = 8
@@ -33,27 +41,21 @@ SNAP = 1e-12
 """Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
-CYCLED, NOT_FINITE = -1, -2
-"""Number of rounds where the active set went in a circle, and where a number was not finite."""
 
-# One stage of a backward pass: what depends on the active set alone. The cost to go from the stage
-# is ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
-FREE, OWN = 0, 1
-"""Sets whose stages are kept: every input free, and the set of the problem under way."""
-S0, S1, K0, K1, INVERSE, F00, F01, F10, F11, P00, P01, P11 = range(12)
-"""Columns of `stages`: s, k = s / c, 1 / c, F = A - B k where the input is free, and P."""
+# A stage of a backward pass: what depends on the active set alone. The cost to go from the stage is
+# ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
+K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
+"""Columns of `Workspace.free`: k = s / c, 1 / c and F = A - B k."""
 
 
 class Workspace(NamedTuple):
-    """Scratch memory that a solve reuses from round to round and from problem to problem."""
+    """What a solver has from problem to problem."""
 
-    stages: F5
-    """Backward passes for FIRST and LATER weights, each axis, FREE and OWN; shape
-    (2, axes, 2, H, 12)."""
-    side: F1
-    """-1 or 1 where the input is at that bound, 0 where it is free; shape (H,)."""
-    own: F1
-    """Input that each stage would choose for itself at x = 0 [m/s]; shape (H,)."""
+    free: F4
+    """Backward passes with every input free, for FIRST and LATER weights and each axis; shape
+    (2, axes, H, 7)."""
+    memory: F3
+    """Scratch of a single vehicle, see `mpc.simd_memory`."""
 
 
 Three = tuple[float, float, float]
@@ -92,153 +94,233 @@ def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> fl
     return -(model.b0 * q0 + model.b1 * q1 + g) * inverse
 
 
-@part
-def _backward(
-    after: tuple[float, float, float], stages: F2, side: F1, last: int, mpc: MPC, axis: int, rho: F1
-) -> None:
-    """Fill in the rows of `stages` from `last` to 0, for an active set.
+@lanes
+def _first_set(bound: float, simd: SimdBatch) -> None:
+    """Fill in the first active set: that of the horizon before. Sum up the gradient."""
+    near, L = NEAR * bound, len(simd.p)
+    side, held, total = simd.side, simd.held, simd.total
+    g, previous = simd.gradient, simd.previous
+    for lane in range(L):
+        held[lane], total[lane] = 0.0, 0.0
+    for i in range(len(g)):
+        for lane in range(L):
+            before = previous[i, lane]
+            at = 1.0 if before >= near else -1.0 if before <= -near else 0.0
+            side[i, lane] = at
+            held[lane] += abs(at)
+            total[lane] += g[i, lane]
+
+
+@lanes
+def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
+    """Make a round in which every input of every vehicle is free.
 
     Args:
-        after: P of the stage after `last`, as (P00, P01, P11).
-        stages: shape (H, 12).
-        side: -1 or 1 where the input is at that bound, 0 where it is free; shape (H,).
-        last: the last stage whose side is another than the one its row was made for.
-        rho: weights of the inputs; shape (H,).
+        stages: the backward pass of that; shape (H, 7).
     """
-    model, W, P = axis_at(mpc.model, axis), mpc.weights.states, after
-    for i in range(last, -1, -1):
-        found, P = stage_of(model, rho[i], P, side[i] == 0.0)
-        if i > 0:
-            P = (P[0] + W[i - 1, 0], P[1], P[2] + W[i - 1, 1])
-        stages[i, S0], stages[i, S1] = found[0], found[1]
-        stages[i, K0], stages[i, K1], stages[i, INVERSE] = found[2], found[3], found[4]
-        stages[i, F00], stages[i, F01] = found[5], found[6]
-        stages[i, F10], stages[i, F11] = found[7], found[8]
-        stages[i, P00], stages[i, P01], stages[i, P11] = P
+    model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
+    b0, b1 = model.b0, model.b1
+    q0, q1, x0, x1 = simd.p, simd.v, simd.leader_p, simd.leader_v
+    g, u, side, own = simd.gradient, simd.inputs, simd.side, simd.own
+    changed, held = simd.changed, simd.held
+    for lane in range(L):
+        q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
+        changed[lane], held[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        k0, k1, inverse = stages[i, K0], stages[i, K1], stages[i, INVERSE]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(L):
+            g_, p_, v_ = g[i, lane], q0[lane], q1[lane]
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            q0[lane] = f00 * p_ + f10 * v_ - k0 * g_
+            q1[lane] = f01 * p_ + f11 * v_ - k1 * g_
+    for i in range(len(g)):
+        k0, k1 = stages[i, K0], stages[i, K1]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(L):
+            own_, p_, v_ = own[i, lane], x0[lane], x1[lane]
+            chosen = own_ - (k0 * p_ + k1 * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            free = verdict == 0.0
+            value = chosen if free else verdict * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            x0[lane] = f00 * p_ + f01 * v_ + b0 * own_ if free else then_p
+            x1[lane] = f10 * p_ + f11 * v_ + b1 * own_ if free else then_v
+            u[i, lane], side[i, lane] = value, verdict
+            changed[lane] += abs(verdict)
+            held[lane] += abs(verdict)
+
+
+@lanes
+def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
+    """Make the backward pass of a round with an active set of each vehicle's own.
+
+    The passes for the matrices and for the vectors go together: what only the latter needs of a
+    stage is then never stored.
+    """
+    model, bound, W, L = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(simd.p)
+    a01, a11 = model.a01, model.a11
+    p00, p01, p11, q0, q1 = simd.p00, simd.p01, simd.p11, simd.p, simd.v
+    g, side, own = simd.gradient, simd.side, simd.own
+    k0, k1, f00, f01, f10, f11 = simd.k0, simd.k1, simd.f00, simd.f01, simd.f10, simd.f11
+    H = len(g)
+    for lane in range(L):
+        p00[lane], p01[lane], p11[lane] = W[H - 1, 0], 0.0, W[H - 1, 1]
+        q0[lane], q1[lane] = 0.0, 0.0
+    for i in range(H - 1, -1, -1):
+        weight = mpc.weights.inputs[which, i]
+        add_p, add_v = (W[i - 1, 0], W[i - 1, 1]) if i > 0 else (0.0, 0.0)
+        for lane in range(L):
+            g_, p_, v_, at = g[i, lane], q0[lane], q1[lane], side[i, lane]
+            matrix = (p00[lane], p01[lane], p11[lane])
+            stage, after = stage_of(model, weight, matrix, at == 0.0)
+            s0, s1, k0_, k1_, inverse, f00_, f01_, f10_, f11_ = stage
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            free_p = f00_ * p_ + f10_ * v_ - k0_ * g_
+            free_v = f01_ * p_ + f11_ * v_ - k1_ * g_
+            held_p = p_ + s0 * (at * bound)
+            held_v = a01 * p_ + a11 * v_ + s1 * (at * bound)
+            q0[lane] = free_p if at == 0.0 else held_p
+            q1[lane] = free_v if at == 0.0 else held_v
+            k0[i, lane], k1[i, lane] = k0_, k1_
+            f00[i, lane], f01[i, lane], f10[i, lane], f11[i, lane] = f00_, f01_, f10_, f11_
+            p00[lane], p01[lane], p11[lane] = after[0] + add_p, after[1], after[2] + add_v
+
+
+@lanes
+def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
+    """Make the forward pass of a round: what each stage would choose is its verdict on the set.
+
+    Args:
+        singly: whether only the input that is furthest on the wrong side may change the set.
+    """
+    model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
+    b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
+    u, side, own, changed, held = simd.inputs, simd.side, simd.own, simd.changed, simd.held
+    k0, k1, f00, f01, f10, f11 = simd.k0, simd.k1, simd.f00, simd.f01, simd.f10, simd.f11
+    worst, worst_at = simd.worst, simd.worst_at
+    for lane in range(L):
+        x0[lane], x1[lane], changed[lane], held[lane] = 0.0, 0.0, 0.0, 0.0
+        worst[lane], worst_at[lane] = 0.0, -1.0
+    for i in range(len(u)):
+        for lane in range(L):
+            own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
+            chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            # An input that would leave its bound stays at it for this round.
+            stays = at if at != 0.0 or singly else verdict
+            value = chosen if stays == 0.0 else stays * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            free_p = f00[i, lane] * p_ + f01[i, lane] * v_ + b0 * own_
+            free_v = f10[i, lane] * p_ + f11[i, lane] * v_ + b1 * own_
+            # Closed loop, x ← F x + B own: the chain of stages does not wait for `chosen`.
+            x0[lane] = free_p if stays == 0.0 else then_p
+            x1[lane] = free_v if stays == 0.0 else then_v
+            u[i, lane] = value
+            changed[lane] += 0.0 if verdict == at else 1.0
+            if singly:
+                wrong = abs(chosen) - bound if at == 0.0 else bound - chosen * at
+                if verdict != at and wrong > worst[lane]:
+                    worst[lane], worst_at[lane] = wrong, i
+            else:
+                side[i, lane] = verdict
+                held[lane] += abs(verdict)
+
+
+@lanes
+def _change_worst(simd: SimdBatch) -> None:
+    """Let the input that is furthest on the wrong side enter or leave each vehicle's active set."""
+    for lane in range(len(simd.p)):
+        i = int(simd.worst_at[lane])
+        if i >= 0:
+            at = simd.side[i, lane]
+            simd.side[i, lane] = 0.0 if at != 0.0 else np.sign(simd.inputs[i, lane])
+
+
+@lanes
+def _any(number: F1) -> bool:
+    """Whether a number is above 0 for any vehicle."""
+    found = False
+    for lane in range(len(number)):
+        found |= number[lane] > 0.0
+    return found
 
 
 @part
-def active_set(  # noqa: PLR0912, PLR0915 - two passes along the horizon, and what they share
-    mpc: MPC,
-    axis: int,
-    which: int,
-    work: Workspace,
-    g: F1,
-    previous: Inputs,
-    gap: int,
-    fresh: bool,
-    u: F1,
-) -> int:
-    """Fill in the optimal inputs U(k) of one axis; rounds taken, or CYCLED or NOT_FINITE.
+def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, settled: B1) -> int:
+    """Fill in the optimal inputs of one axis.
 
     Args:
-        which: FIRST or LATER weights. work: of `workspace`; what it has of OWN sets is written to.
-        g: gradient; shape (H,). previous, gap, fresh: see `server.control.mpc.shifted`; what that
-        is at its bound is the first set. u: what is filled in [m/s]; shape (H,).
+        mpc, axis: the problem.
+        which: FIRST or LATER weights.
+        simd: gradient and previous are read, whose active set is the first; inputs are filled in
+            [m/s].
+        free: of `Workspace`.
+        settled: set to False for a vehicle without an answer; shape (L,).
+
+    Returns:
+        number of rounds.
 
     Source: eqs. (6), (8), (10).
     """
-    model, bound, W, H = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(g)
-    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
-    stages, side, own = work.stages[which, axis], work.side, work.own
-    rho = mpc.weights.inputs[which]
-    last, changed, total = -1, -1, 0.0
-    for i in range(H):
-        v = shifted(previous, gap, fresh, i)
-        side[i] = 1.0 if v >= NEAR * bound else -1.0 if v <= -NEAR * bound else 0.0
-        if side[i] != 0.0:
-            last = i
-        # A sum that is finite has finite terms: one check in place of H.
-        total += g[i]
-    for count in range(1, ROUNDS_MAX + PIVOTS_MAX + 1):
-        singly = count > ROUNDS_MAX
-        # Stages behind the last change are as before: of the last round, or of the table of FREE
-        # sets.
-        if last >= 0:
-            after = (W[H - 1, 0], 0.0, W[H - 1, 1])
-            if last < H - 1:
-                i, row = last + 1, OWN if last < changed else FREE
-                after = (stages[row, i, P00], stages[row, i, P01], stages[row, i, P11])
-            _backward(after, stages[OWN], side, last, mpc, axis, rho)
-            changed = max(changed, last)
-        # Backward: own is what the stage would choose for itself at x = 0.
-        q0, q1 = 0.0, 0.0
-        for i in range(H - 1, -1, -1):
-            row = OWN if i <= changed else FREE
-            own[i] = own_input(model, q0, q1, g[i], stages[row, i, INVERSE])
-            if side[i] == 0.0:
-                q0, q1 = (
-                    stages[row, i, F00] * q0 + stages[row, i, F10] * q1 - stages[row, i, K0] * g[i],
-                    stages[row, i, F01] * q0 + stages[row, i, F11] * q1 - stages[row, i, K1] * g[i],
-                )
-            else:
-                held = side[i] * bound
-                q0, q1 = (
-                    q0 + stages[row, i, S0] * held,
-                    a01 * q0 + a11 * q1 + stages[row, i, S1] * held,
-                )
-        # Forward: what each stage would choose for itself is its verdict on the set. Those
-        # that must leave the box are held back, unless only the worst may change.
-        x0, x1, last, most = 0.0, 0.0, -1, 0.0
-        for i in range(H):
-            row = OWN if i <= changed else FREE
-            v = own[i] - (stages[row, i, K0] * x0 + stages[row, i, K1] * x1)
-            if side[i] == 0.0 and -bound <= v <= bound:
-                # Closed loop, x ← F x + B own: the chain from stage to stage does not wait for v.
-                u[i] = v
-                x0, x1 = (
-                    stages[row, i, F00] * x0 + stages[row, i, F01] * x1 + b0 * own[i],
-                    stages[row, i, F10] * x0 + stages[row, i, F11] * x1 + b1 * own[i],
-                )
-                continue
-            verdict = 1.0 if v > bound else -1.0 if v < -bound else 0.0
-            held = side[i]
-            if verdict != side[i]:
-                if singly:
-                    wrong = abs(v) - bound if held == 0.0 else bound - v * held
-                    if wrong > most:
-                        most, last = wrong, i
-                else:
-                    last, side[i] = i, verdict
-                    held = held if held != 0.0 else verdict
-            if held != 0.0:
-                v = held * bound
-            u[i] = v
-            x0, x1 = advance(model, x0, x1, v)
-        if last < 0:
-            return count if np.isfinite(total + x0 + x1) else NOT_FINITE
+    changed, total, x0, x1 = simd.changed, simd.total, simd.leader_p, simd.leader_v
+    _first_set(mpc.bounds[axis], simd)
+    rounds = 0
+    while rounds < ROUNDS_MAX + PIVOTS_MAX:
+        singly = rounds >= ROUNDS_MAX
+        rounds += 1
+        # Where no vehicle has an input at its bound, one table of stages serves all of them.
+        if singly or _any(simd.held):
+            _backward(mpc, axis, which, simd)
+            _forward(mpc, axis, simd, singly)
+        else:
+            _round_free(mpc, axis, simd, free[which, axis])
+        # A vehicle whose set is right finds the same again, to the last bit.
+        if not _any(changed):
+            break
         if singly:
-            side[last] = 0.0 if side[last] != 0.0 else np.sign(u[last])
-    return CYCLED if np.isfinite(total + x0 + x1) else NOT_FINITE
+            _change_worst(simd)
+    for lane in range(len(settled)):
+        finite = np.isfinite(total[lane] + x0[lane] + x1[lane])
+        settled[lane] = settled[lane] and changed[lane] == 0.0 and finite
+    return rounds
 
 
 @kernel
 def _table(mpc: MPC, work: Workspace) -> None:
-    """Fill in the stages of FREE sets, with `side` as it is at first: 0."""
+    """Fill in the backward passes with every input free."""
     W = mpc.weights.states
-    end, free = (W[-1, 0], 0.0, W[-1, 1]), work.side
     for which in range(2):
         for axis in range(len(mpc.model)):
-            stages, rho = work.stages[which, axis, FREE], mpc.weights.inputs[which]
-            _backward(end, stages, free, len(W) - 1, mpc, axis, rho)
+            model, P = axis_at(mpc.model, axis), (W[-1, 0], 0.0, W[-1, 1])
+            for i in range(len(W) - 1, -1, -1):
+                stage, P = stage_of(model, mpc.weights.inputs[which, i], P, True)
+                if i > 0:
+                    P = (P[0] + W[i - 1, 0], P[1], P[2] + W[i - 1, 1])
+                for at in range(7):
+                    work.free[which, axis, i, at] = stage[2 + at]
 
 
 @kernel
 def _solve(
-    mpc: MPC, which: int, work: Workspace, gradient: F3, guess: F3, inputs: F3, rounds: I2
+    mpc: MPC, which: int, work: Workspace, gradient: F3, guess: F3, inputs: F3, settled: B1
 ) -> None:
-    """Fill in inputs (n, axes, H) and rounds (n, axes) of n vehicles, see `active_set`."""
+    """Fill in inputs (n, axes, H) of n vehicles, and which are right, (n axes,); `active_sets`."""
+    simd, axes = simd_batch(work.memory), len(mpc.model)
     for vehicle in range(len(gradient)):
         for axis in range(len(mpc.model)):
-            g, first = gradient[vehicle, axis], guess[vehicle, axis]
-            u = inputs[vehicle, axis]
-            rounds[vehicle, axis] = active_set(mpc, axis, which, work, g, first, 0, False, u)
+            at = vehicle * axes + axis
+            set_previous(guess[vehicle, axis], 0, False, simd, 0)
+            for stage in range(gradient.shape[2]):
+                simd.gradient[stage, 0] = gradient[vehicle, axis, stage]
+            active_sets(mpc, axis, which, simd, work.free, settled[at : at + 1])
+            column(simd.inputs, 0, inputs[vehicle, axis])
 
 
 def workspace(mpc: MPC) -> Workspace:
     """A workspace for the problems of an MPC."""
     axes, H = len(mpc.model), len(mpc.weights.states)
-    work = Workspace(np.empty((2, axes, 2, H, 12)), np.zeros(H), np.empty(H))
+    work = Workspace(np.empty((2, axes, H, 7)), simd_memory(H, 1))
     _table(mpc, work)
     return work
 
@@ -258,13 +340,11 @@ class ExactSolver:
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
         inputs = np.empty_like(gradient)
-        rounds = np.empty(gradient.shape[:2], dtype=np.int64)
+        settled = np.ones(gradient.shape[:2], dtype=np.bool_)
         mpc, which = self._problem.mpc, self._problem.which
-        _solve(mpc, which, self.work, gradient, guess, inputs, rounds)
-        if rounds.min() > 0:
-            return inputs, np.ones(len(gradient), dtype=np.bool_)
-        solved: Flags = (rounds != NOT_FINITE).all(axis=1)
-        for vehicle, axis in np.argwhere((rounds == CYCLED) & solved[:, None]):
+        _solve(mpc, which, self.work, gradient, guess, inputs, settled.reshape(-1))
+        solved: Flags = np.all(np.isfinite(gradient), axis=(1, 2))
+        for vehicle, axis in np.argwhere(~settled & solved[:, None]):
             self.fallbacks += 1
             try:
                 inputs[vehicle, axis] = self._dual(int(axis), gradient[vehicle, axis])

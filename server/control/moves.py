@@ -1,32 +1,17 @@
-"""Moves of a plan: pose the generator's problem, pose the tracker's, appraise what came of both.
-
-Between the moves somebody solves: the compiled pass of `server.control.planner`, or another solver.
-A move works on one vehicle of a block, and reads and fills the draft of its plan.
-"""
+"""Begin of a plan, and its appraisal once it is solved; `server.control.planner` calls both."""
 
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.control.desired import Window
 from skytether.server.control.law import advance, axis_at
-from skytether.server.control.mpc import (
-    FIRST,
-    LATER,
-    MPC,
-    Inputs,
-    add_cost,
-    follow,
-    gradient,
-    lead,
-    slope,
-)
+from skytether.server.control.mpc import MPC, Inputs, add_cost
 from skytether.server.control.scheme import Foresight
-from skytether.shared.base.kernel import B1, F1, F2, F3, I1, S4, inline, lanes, record, records
+from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes, record, records
 
-GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
-"""Moves of a plan; GENERATOR and TRACKER are also the first index of what both MPCs have."""
+GENERATOR, TRACKER = 0, 1
+"""First index of what both MPCs have."""
 
 
 class PlanFigures:
@@ -72,7 +57,7 @@ class PlanMemory(NamedTuple):
     step: I1
     """Step that they were computed for, or -1; shape (capacity,)."""
     bounded: B1
-    """Whether an input was at its bound, of plans made side by side; shape (capacity,)."""
+    """Whether an input was at its bound; shape (capacity,)."""
 
 
 class Draft(NamedTuple):
@@ -81,18 +66,13 @@ class Draft(NamedTuple):
     planned: F3
     """Planned state x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
     gradient: F3
-    """Gradient g of the problem to be solved; shape (block, axes, H)."""
+    """Gradient g of the problem to be solved, and then the slope at its answer; shape (block, axes,
+    H)."""
     guess: F3
     """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
-    answer: F1
-    """Scratch: U(k) of one problem, not rounded yet [m/s]; shape (H,)."""
     inputs: S4
     """U(k) of both MPCs, rounded: planning goes on with what the vehicle will really be told
     [m/s]; shape (2, block, axes, H)."""
-    states: F2
-    """Scratch: X(k) of the generator on one axis [m, m/s]; shape (H + 1, 2)."""
-    drift: F2
-    """Scratch of `gradient`; shape (H, 2)."""
     distance: F1
     """Scratch: squares of distances [m²]; shape (H + 1,)."""
 
@@ -120,61 +100,6 @@ def planned_state(
     for stage in range(plan.gap):
         p, v = advance(model, p, v, u[stage])
     return p, v
-
-
-@inline
-def pose_generator(
-    mpc: MPC,
-    memory: PlanMemory,
-    draft: Draft,
-    desired: Window,
-    found: Foresight,
-    plan: PlanFigures,
-    i: int,
-    at: int,
-    axis: int,
-) -> None:
-    """Pose the generator's problem on one axis of vehicle `i` of the block, at draft `at`.
-
-    Source: eq. (14).
-    """
-    row, gap, fresh, H = plan.row, plan.gap, plan.fresh, memory.inputs.shape[3]
-    if fresh:
-        x = (found.start[i, axis, 0], found.start[i, axis, 1])
-    else:
-        x = planned_state(mpc, memory, plan, axis)
-    draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-    place, first = desired.place[i], desired.first[i]
-    target = desired.states[place, axis, first : first + H + 1]
-    previous, g = memory.inputs[GENERATOR, row, axis], draft.gradient[at, axis]
-    # The generator plans for no vehicle in particular, and so for no disturbance.
-    lead(mpc, axis, x, 0.0, target, draft.drift)
-    which = FIRST if fresh else LATER
-    gradient(mpc, axis, which, 0.0, target, previous, gap, fresh, draft.drift, g)
-
-
-@inline
-def pose_tracker(
-    mpc: MPC,
-    memory: PlanMemory,
-    draft: Draft,
-    found: Foresight,
-    plan: PlanFigures,
-    i: int,
-    at: int,
-    axis: int,
-) -> None:
-    """Pose the tracker's problem on one axis, behind the generator's answer in the draft.
-
-    Source: eq. (15).
-    """
-    u, states = draft.inputs[GENERATOR, at, axis], draft.states
-    x = (found.start[i, axis, 0], found.start[i, axis, 1])
-    planned = (draft.planned[i, axis, 0], draft.planned[i, axis, 1])
-    previous, g = memory.inputs[TRACKER, plan.row, axis], draft.gradient[at, axis]
-    which, w, gap = FIRST if plan.fresh else LATER, found.disturbance[i, axis], plan.gap
-    follow(mpc, axis, x, w, planned, u, states, draft.drift)
-    gradient(mpc, axis, which, w, states, previous, gap, plan.fresh, draft.drift, g)
 
 
 @inline
@@ -237,14 +162,6 @@ def _add_gap(
     return add_cost(mpc, axis, x, change, cost)
 
 
-@inline
-def finish(mpc: MPC, draft: Draft, plan: PlanFigures, compares: bool, at: int, axis: int) -> None:
-    """Find the slope at the tracker's answer on one axis, where plans are compared."""
-    if compares:
-        u, which = draft.inputs[TRACKER, at, axis], FIRST if plan.fresh else LATER
-        slope(mpc, axis, which, u, draft.gradient[at, axis], draft.drift)
-
-
 @lanes
 def copy(numbers: Inputs, to: Inputs) -> None:
     """Put numbers into the beginning of an array."""
@@ -262,7 +179,6 @@ def conclude(
     found: Foresight,
     plan: PlanFigures,
     i: int,
-    at: int,
 ) -> None:
     """Appraise the plan of vehicle `i`, with V(k) among its figures, and remember it.
 
@@ -271,19 +187,19 @@ def conclude(
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
     row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
     # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
-    change = draft.guess[at, 0, : found.flown[i]]
+    change = draft.guess[i, 0, : found.flown[i]]
     distance, furthest = draft.distance, 0.0
     sure, doubted = 1.0, 0.0
     if compares:
         for stage in range(H + 1):
             distance[stage] = 0.0
     for axis in range(axes):
-        u = draft.inputs[TRACKER, at, axis]
+        u = draft.inputs[TRACKER, i, axis]
         off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
         off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
         state_gap += off_p * off_p * P[0] + off_v * off_v * P[1]
         if compares:
-            steep = draft.gradient[at, axis]
+            steep = draft.gradient[i, axis]
             x = (0.0, 0.0)
             cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
             for j in range(found.doubt.shape[1]):
@@ -309,7 +225,7 @@ def conclude(
     plan.expected_gap = sure * cost + doubted
     for axis in range(axes):
         for which in (GENERATOR, TRACKER):
-            copy(draft.inputs[which, at, axis], memory.inputs[which, row, axis])
+            copy(draft.inputs[which, i, axis], memory.inputs[which, row, axis])
         memory.start[row, axis, 0] = draft.planned[i, axis, 0]
         memory.start[row, axis, 1] = draft.planned[i, axis, 1]
     # A first plan that failed is no plan to go on from.

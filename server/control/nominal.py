@@ -11,10 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.exact import Workspace, active_set, workspace
+from skytether.server.control.exact import Workspace, active_sets, workspace
 from skytether.server.control.law import advance, axis_at
-from skytether.server.control.mpc import FIRST, MPC, gradient, lead, make_mpc
-from skytether.shared.base.kernel import F1, F2, F3, I1, part
+from skytether.server.control.mpc import (
+    FIRST,
+    MPC,
+    column,
+    gradient,
+    lead,
+    make_mpc,
+    set_previous,
+    set_target,
+    simd_batch,
+)
+from skytether.shared.base.kernel import B1, F3, I1, part
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
@@ -30,12 +40,8 @@ class Nominal(NamedTuple):
     """Inputs planned last [m/s]; shape (capacity, axes, H)."""
     step: I1
     """Step that they were planned at, or -1; shape (capacity,)."""
-    gradient: F1
-    """Scratch; shape (H,)."""
-    drift: F2
-    """Scratch; shape (H, 2)."""
-    found: F1
-    """Scratch: inputs in the making [m/s]; shape (H,)."""
+    settled: B1
+    """Scratch: whether a plan is found; shape (1,)."""
 
 
 def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal:
@@ -46,9 +52,7 @@ def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal
         work=workspace(mpc),
         inputs=np.zeros((capacity, terms.axes, H)),
         step=np.full(capacity, -1, dtype=np.int64),
-        gradient=np.zeros(H),
-        drift=np.zeros((H, 2)),
-        found=np.zeros(H),
+        settled=np.zeros(1, dtype=np.bool_),
     )
 
 
@@ -62,20 +66,22 @@ def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) ->
         states: what is filled in, behind the first stage, which is where the vehicle is led at k
             [m, m/s]; shape (axes, H + 1 or fewer, 2).
     """
-    mpc, drift, g, u = nominal.mpc, nominal.drift, nominal.gradient, nominal.found
-    gap, H = k - nominal.step[row], len(u)
+    mpc, settled, simd = nominal.mpc, nominal.settled, simd_batch(nominal.work.memory)
+    gap, H = k - nominal.step[row], nominal.inputs.shape[2]
     fresh = nominal.step[row] < 0 or not 0 <= gap <= H
-    nominal.step[row] = -1
+    nominal.step[row], settled[0] = -1, True
     for axis in range(len(states)):
-        model, before = axis_at(mpc.model, axis), nominal.inputs[row, axis]
+        model, u = axis_at(mpc.model, axis), nominal.inputs[row, axis]
         p, v = states[axis, 0, 0], states[axis, 0, 1]
-        target = desired[axis, : H + 1]
-        lead(mpc, axis, (p, v), 0.0, target, drift)
-        gradient(mpc, axis, FIRST, 0.0, target, before, gap, fresh, drift, g)
-        if active_set(mpc, axis, FIRST, nominal.work, g, before, gap, fresh, u) <= 0:
+        simd.p[0], simd.v[0], simd.w[0] = p, v, 0.0
+        set_target(desired[axis, : H + 1], simd, 0)
+        set_previous(u, gap, fresh, simd, 0)
+        lead(mpc, axis, simd)
+        gradient(mpc, axis, FIRST, simd, simd.target_v)
+        active_sets(mpc, axis, FIRST, simd, nominal.work.free, settled)
+        if not settled[0]:
             return False
-        for stage in range(H):
-            before[stage] = u[stage]
+        column(simd.inputs, 0, u)
         for stage in range(states.shape[1] - 1):
             p, v = advance(model, p, v, u[stage])
             states[axis, stage + 1, 0], states[axis, stage + 1, 1] = p, v

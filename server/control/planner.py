@@ -5,41 +5,51 @@ before. The generator plans from its own last prediction and never looks at the 
 tracker leads the UAV's estimated state along the generator's plan. On the way the new plan is
 compared with what was sent: V of eq. (16), and the cost and the deviation of flying on with that.
 
-With the exact solver, all of that is one compiled pass over a vehicle, which touches no more memory
-than a horizon takes, or over several side by side (`server.control.lanes`). Another solver, or one
-that has to help out, takes the same moves (`server.control.moves`) in turn with it: pose the
-generator's problem, solve; pose the tracker's, solve; conclude.
+With the exact solver, all of that is one compiled pass over several vehicles side by side, or over
+one (`server.control.mpc`). Another solver, or one that has to help out, is asked in between: pose
+the generator's problem, solve; pose the tracker's, solve; conclude.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control import lanes as side_by_side
 from skytether.server.control.desired import Desired, Window
-from skytether.server.control.exact import FREE, ExactSolver, Workspace, active_set
-from skytether.server.control.lanes import LANES, Lanes, lanes_in, make_room
+from skytether.server.control.exact import ExactSolver, Workspace, active_sets
 from skytether.server.control.moves import (
-    CONCLUDE,
     FIGURES,
     GENERATOR,
     TRACKER,
     Draft,
     Figures,
-    PlanFigures,
     PlanMemory,
     begin,
     conclude,
-    copy,
-    finish,
     planned_state,
-    pose_generator,
-    pose_tracker,
 )
-from skytether.server.control.mpc import FIRST, LATER, MPC, Inputs, Problem, make_mpc, pose, shifted
+from skytether.server.control.mpc import (
+    FIRST,
+    LATER,
+    MPC,
+    WIDTH,
+    Problem,
+    SimdBatch,
+    column,
+    follow,
+    gradient,
+    lead,
+    make_mpc,
+    pose,
+    set_inputs,
+    set_previous,
+    set_target,
+    simd_batch,
+    simd_memory,
+    slope,
+)
 from skytether.server.control.scheme import Foresight
 from skytether.server.control.solver import Solver
-from skytether.shared.base.kernel import B1, F1, F2, F3, I1, inline, kernel, part
+from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Indices
 from skytether.shared.law.terms import Terms
@@ -65,13 +75,17 @@ class Batch(NamedTuple):
     """Predicted states of the vehicles."""
     figures: Figures
     """Costs of their plans."""
-    room: F3
-    """Scratch of vehicles side by side, see `lanes.make_room`."""
+    together: F3
+    """Scratch of WIDTH vehicles side by side, see `mpc.simd_memory`."""
+    alone: F3
+    """Scratch of one vehicle."""
+    single: I1
+    """Scratch: one vehicle by its place in the block; shape (1,)."""
     picked: I1
     """Scratch: vehicles by their places in the block, in the order in which they are planned for;
     shape (block,)."""
     settled: B1
-    """Scratch: whether the plan of each lane is found; shape (LANES,)."""
+    """Scratch: whether the plan of each is found; shape (WIDTH,)."""
 
 
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
@@ -117,15 +131,13 @@ class Planner:
             planned=np.zeros((block, axes, 2)),
             gradient=np.zeros((block, axes, H)),
             guess=np.zeros((block, axes, H)),
-            answer=np.zeros(H),
             inputs=np.zeros((2, block, axes, H), dtype=np.float32),
-            states=np.zeros((H + 1, 2)),
-            drift=np.zeros((H, 2)),
             distance=np.zeros(H + 1),
         )
-        self._room = make_room(H)
+        self._together, self._alone = simd_memory(H, WIDTH), simd_memory(H, 1)
+        self._single = np.zeros(1, dtype=np.int64)
         self._picked = np.zeros(block, dtype=np.int64)
-        self._settled = np.zeros(LANES, dtype=np.bool_)
+        self._settled = np.zeros(WIDTH, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         """Costs of the last plans; those of a block come first."""
         self.planned = self._draft.planned
@@ -161,7 +173,7 @@ class Planner:
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
         if undone:
-            self._plan_by_moves(batch, rows, step, undone)
+            self._plan_with_solvers(batch, rows, step, undone)
         took_ns = self._stopwatch.lap("plan")
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
@@ -176,148 +188,142 @@ class Planner:
             desired=window,
             found=found,
             figures=self.figures,
-            room=self._room,
+            together=self._together,
+            alone=self._alone,
+            single=self._single,
             picked=self._picked,
             settled=self._settled,
         )
 
-    def _plan_by_moves(self, batch: Batch, rows: Indices, step: Indices, undone: int) -> None:
-        """Plan move by move for all vehicles, or for those `undone` that the pass has left."""
+    def _plan_with_solvers(self, batch: Batch, rows: Indices, step: Indices, undone: int) -> None:
+        """Plan with the solvers for all vehicles, or for those `undone` that the pass has left."""
         left = np.arange(len(rows))
         if undone < len(rows):
             left = np.flatnonzero(~self.figures["solved"][: len(rows)])
-        for which in (GENERATOR, TRACKER):
-            _move(batch, rows, step, left, which)
-            self._solve(which, left)
-        _move(batch, rows, step, left, CONCLUDE)
+        for tier in (GENERATOR, TRACKER):
+            _pose(batch, rows, step, left, tier)
+            self._solve(tier, left)
+        _conclude_all(batch, left)
 
-    def _solve(self, which: int, left: Indices) -> None:
+    def _solve(self, tier: int, left: Indices) -> None:
         """Solve the problems posed in the draft for some vehicles of the block, by index."""
         draft = self._draft
         fresh = self.figures["fresh"][left]
         for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
             if len(some):
                 inputs, solved = solver.solve(draft.gradient[some], draft.guess[some])
-                draft.inputs[which, some] = inputs
+                draft.inputs[tier, some] = inputs
                 self.figures["solved"][some] &= solved
 
 
-@inline
-def _solve_exactly(
-    mpc: MPC,
-    memory: PlanMemory,
-    draft: Draft,
-    plan: PlanFigures,
-    which: int,
-    axis: int,
-    work: Workspace,
-) -> bool:
-    """Solve a problem posed at draft 0; whether that came to an end."""
-    previous, u = memory.inputs[which, plan.row, axis], draft.answer
-    weights, gap, fresh = FIRST if plan.fresh else LATER, plan.gap, plan.fresh
-    g = draft.gradient[0, axis]
-    solved = active_set(mpc, axis, weights, work, g, previous, gap, fresh, u) > 0
-    copy(u, draft.inputs[which, 0, axis])
-    return solved
+@part
+def _pose_generator(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+    """Pose the generator's problem on one axis for some vehicles, by their places in the block.
+
+    Source: eq. (14).
+    """
+    mpc, memory, draft, desired, found = (
+        batch.mpc,
+        batch.memory,
+        batch.draft,
+        batch.desired,
+        batch.found,
+    )
+    H = memory.inputs.shape[3]
+    for lane in range(len(some)):
+        i = some[lane]
+        plan, page, first = batch.figures[i], desired.place[i], desired.first[i]
+        x = (found.start[i, axis, 0], found.start[i, axis, 1])
+        if not plan.fresh:
+            x = planned_state(mpc, memory, plan, axis)
+        draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
+        # The generator plans for no vehicle in particular, and so for no disturbance.
+        simd.p[lane], simd.v[lane], simd.w[lane] = x[0], x[1], 0.0
+        set_target(desired.states[page, axis, first : first + H + 1], simd, lane)
+        before = memory.inputs[GENERATOR, plan.row, axis]
+        set_previous(before, plan.gap, plan.fresh, simd, lane)
+    lead(mpc, axis, simd)
+    gradient(mpc, axis, which, simd, simd.target_v)
 
 
 @part
-def _plan_one(batch: Batch, i: int, work: Workspace) -> bool:
-    """Plan for vehicle `i` of the block, which has begun; whether it is solved."""
-    mpc, terminal_weight, compares, memory = batch[:4]
-    draft, desired, found, figures = batch[4:8]
-    plan = figures[i]
-    plan.solved = True
-    for axis in range(len(mpc.model)):
-        pose_generator(mpc, memory, draft, desired, found, plan, i, 0, axis)
-        if not _solve_exactly(mpc, memory, draft, plan, GENERATOR, axis, work):
-            plan.solved = False
-            break
-        pose_tracker(mpc, memory, draft, found, plan, i, 0, axis)
-        if not _solve_exactly(mpc, memory, draft, plan, TRACKER, axis, work):
-            plan.solved = False
-            break
-        finish(mpc, draft, plan, compares, 0, axis)
-    if plan.solved:
-        conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, 0)
-    return plan.solved
+def _pose_tracker(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+    """Pose the tracker's problem on one axis, with the generator's answer in `simd.inputs`.
+
+    Source: eq. (15).
+    """
+    mpc, memory, draft, found = batch.mpc, batch.memory, batch.draft, batch.found
+    for lane in range(len(some)):
+        i = some[lane]
+        plan = batch.figures[i]
+        simd.p[lane], simd.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
+        planned = draft.planned[i, axis]
+        simd.leader_p[lane], simd.leader_v[lane] = planned[0], planned[1]
+        simd.w[lane] = found.disturbance[i, axis]
+        before = memory.inputs[TRACKER, plan.row, axis]
+        set_previous(before, plan.gap, plan.fresh, simd, lane)
+    follow(mpc, axis, simd)
+    gradient(mpc, axis, which, simd, simd.leader_speed)
 
 
 @part
-def _put_in(
-    memory: PlanMemory, to: Lanes, plan: PlanFigures, which: int, axis: int, lane: int
-) -> None:
-    """Put the horizon of the step before into a lane."""
-    previous, gap = memory.inputs[which, plan.row, axis], plan.gap
-    # As `shifted` does, without asking at each stage where the horizon ends.
-    H = len(previous)
-    for stage in range(H - gap):
-        to.previous[stage, lane] = previous[stage + gap]
-    for stage in range(H - gap, H):
-        to.previous[stage, lane] = previous[H - 1]
+def _keep(batch: Batch, simd: SimdBatch, some: I1, tier: int, axis: int) -> None:
+    """Keep the answers of generator or tracker on one axis, as they are sent."""
+    for lane in range(len(some)):
+        i = some[lane]
+        batch.memory.bounded[batch.figures[i].row] |= simd.held[lane] > 0.0
+        column(simd.inputs, lane, batch.draft.inputs[tier, i, axis])
 
 
 @part
-def _take_out(numbers: F2, lane: int, to: Inputs) -> None:
-    """Take one number for each stage out of a lane."""
-    for stage in range(len(to)):
-        to[stage] = numbers[stage, lane]
-
-
-@part
-def _plan_lanes(batch: Batch, picked: I1, work: Workspace) -> None:
-    """Plan for as many vehicles as there are lanes, none of them at its first plan.
+def _plan_some(batch: Batch, memory: F3, some: I1, which: int, work: Workspace) -> int:
+    """Plan for some vehicles, side by side, which have begun; how many are not solved.
 
     Args:
-        batch: the block; `settled` is filled in.
-        picked: vehicle in each lane, by its place in the block; shape (LANES,).
+        batch: the block.
+        memory: of a `SimdBatch` of as many vehicles.
+        some: the vehicles, by their places in the block; shape (L,).
+        which: weights of all of them, FIRST or LATER.
         work: of the exact solver.
     """
-    mpc, terminal_weight, compares, memory = batch[:4]
-    draft, desired, found, figures, room, _, settled = batch[4:]
-    to, H = lanes_in(room), memory.inputs.shape[3]
-    for lane in range(LANES):
-        settled[lane], memory.bounded[figures[picked[lane]].row] = True, False
+    mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
+    simd, settled, undone = simd_batch(memory), batch.settled[: len(some)], 0
+    for lane in range(len(some)):
+        settled[lane], batch.memory.bounded[figures[some[lane]].row] = True, False
     for axis in range(len(mpc.model)):
-        free = work.stages[LATER, axis, FREE]
-        for lane in range(LANES):
-            i = picked[lane]
-            plan, place, first = figures[i], desired.place[i], desired.first[i]
-            x = planned_state(mpc, memory, plan, axis)
-            draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x[0], x[1]
-            to.p[lane], to.v[lane], to.w[lane] = x[0], x[1], 0.0
-            for stage in range(H + 1):
-                to.target_p[stage, lane] = desired.states[place, axis, first + stage, 0]
-                to.target_v[stage, lane] = desired.states[place, axis, first + stage, 1]
-            _put_in(memory, to, plan, GENERATOR, axis, lane)
-        side_by_side.lead(mpc, axis, to)
-        side_by_side.gradient(mpc, axis, to, to.target_v)
-        side_by_side.active_sets(mpc, axis, to, free, settled)
-        for lane in range(LANES):
-            i = picked[lane]
-            to.p[lane], to.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
-            planned = draft.planned[i, axis]
-            to.led_p[lane], to.led_v[lane] = planned[0], planned[1]
-            to.w[lane] = found.disturbance[i, axis]
-            memory.bounded[figures[i].row] |= to.held[lane] > 0.0
-            _take_out(to.inputs, lane, draft.inputs[GENERATOR, i, axis])
-            _put_in(memory, to, figures[i], TRACKER, axis, lane)
-        side_by_side.follow(mpc, axis, to)
-        side_by_side.gradient(mpc, axis, to, to.states_v)
-        side_by_side.active_sets(mpc, axis, to, free, settled)
+        _pose_generator(batch, simd, some, which, axis)
+        active_sets(mpc, axis, which, simd, work.free, settled)
+        _keep(batch, simd, some, GENERATOR, axis)
+        _pose_tracker(batch, simd, some, which, axis)
+        active_sets(mpc, axis, which, simd, work.free, settled)
+        _keep(batch, simd, some, TRACKER, axis)
         if compares:
-            side_by_side.slope(mpc, axis, to)
-        for lane in range(LANES):
-            i = picked[lane]
-            memory.bounded[figures[i].row] |= to.held[lane] > 0.0
-            _take_out(to.inputs, lane, draft.inputs[TRACKER, i, axis])
-            if compares:
-                _take_out(to.gradient, lane, draft.gradient[i, axis])
-    for lane in range(LANES):
-        i = picked[lane]
+            slope(mpc, axis, which, simd)
+            for lane in range(len(some)):
+                column(simd.gradient, lane, draft.gradient[some[lane], axis])
+    for lane in range(len(some)):
+        i = some[lane]
+        figures[i].solved = settled[lane]
         if settled[lane]:
-            plan = figures[i]
-            conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
+            _conclude(batch, i)
+        else:
+            undone += 1
+    return undone
+
+
+@part
+def _conclude(batch: Batch, i: int) -> None:
+    """Appraise the plan of a vehicle, and remember it."""
+    conclude(
+        batch.mpc,
+        batch.terminal_weight,
+        batch.compares,
+        batch.memory,
+        batch.draft,
+        batch.found,
+        batch.figures[i],
+        i,
+    )
 
 
 @kernel
@@ -327,16 +333,17 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     Those have no `solved` in their figures, and are as they were.
     """
     memory, found, figures = batch.memory, batch.found, batch.figures
-    picked, settled, undone = batch.picked, batch.settled, 0
-    # A round of lanes without a bound takes a third of the time of one with a bound in any lane, so
+    picked, undone = batch.picked, 0
+    # A round without a bound takes a third of the time of one with a bound for any vehicle, so
     # those that were at a bound share theirs: the others are picked from the front, these from the
     # back.
     waiting, last = 0, len(rows)
     for i in range(len(rows)):
         begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
-            # Lanes have the LATER weights in common; a first plan has others (E8), and is rare.
-            undone += not _plan_one(batch, i, work)
+            # All in a batch have the same weights; a first plan has others (E8), and is rare.
+            batch.single[0] = i
+            undone += _plan_some(batch, batch.alone, batch.single, FIRST, work)
         elif memory.bounded[rows[i]]:
             last -= 1
             picked[last] = i
@@ -347,46 +354,46 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
         picked[waiting] = picked[at]
         waiting += 1
     first = 0
-    while waiting - first >= LANES:
-        group = picked[first : first + LANES]
-        _plan_lanes(batch, group, work)
-        for lane in range(LANES):
-            if not settled[lane]:
-                undone += not _plan_one(batch, group[lane], work)
-        first += LANES
-    # Too few are left for a group of lanes; alone each gets the same bits
+    while waiting - first >= WIDTH:
+        undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
+        first += WIDTH
+    # Too few are left for a whole batch; alone each gets the same bits
     # (tests/server/test_planner.py).
     for at in range(first, waiting):
-        undone += not _plan_one(batch, picked[at], work)
+        undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
     return undone
 
 
-@part
-def _guess(memory: PlanMemory, plan: PlanFigures, which: int, guess: F2) -> None:
-    """Fill in the guess of a solver that is no part of the pass: the horizon before, shifted."""
-    for axis in range(len(guess)):
-        previous = memory.inputs[which, plan.row, axis]
-        for stage in range(guess.shape[1]):
-            guess[axis, stage] = shifted(previous, plan.gap, plan.fresh, stage)
+@kernel
+def _pose(batch: Batch, rows: I1, steps: I1, left: I1, tier: int) -> None:
+    """Pose the generator's or the tracker's problems of those `left` for another solver."""
+    draft, simd, single = batch.draft, simd_batch(batch.alone), batch.single
+    for i in left:
+        plan, single[0] = batch.figures[i], i
+        if tier == GENERATOR:
+            begin(batch.memory, batch.found.ahead[i], plan, rows[i], steps[i])
+        which = FIRST if plan.fresh else LATER
+        for axis in range(len(batch.mpc.model)):
+            if tier == GENERATOR:
+                _pose_generator(batch, simd, single, which, axis)
+            else:
+                set_inputs(draft.inputs[GENERATOR, i, axis], simd, 0)
+                _pose_tracker(batch, simd, single, which, axis)
+            column(simd.gradient, 0, draft.gradient[i, axis])
+            column(simd.previous, 0, draft.guess[i, axis])
 
 
 @kernel
-def _move(batch: Batch, rows: I1, steps: I1, left: I1, move: int) -> None:
-    """Make one move for those `left` in a block, by index: pose for an MPC, or CONCLUDE."""
-    mpc, terminal_weight, compares, memory = batch[:4]
-    draft, desired, found, figures = batch[4:8]
+def _conclude_all(batch: Batch, left: I1) -> None:
+    """Appraise and remember the plans of those `left`, which another solver has solved."""
+    draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
-        plan = figures[i]
-        if move == CONCLUDE:
-            for axis in range(len(mpc.model)):
-                finish(mpc, draft, plan, compares, i, axis)
-            conclude(mpc, terminal_weight, compares, memory, draft, found, plan, i, i)
-            continue
-        if move == GENERATOR:
-            begin(memory, found.ahead[i], plan, rows[i], steps[i])
-        _guess(memory, plan, move, draft.guess[i])
-        for axis in range(len(mpc.model)):
-            if move == GENERATOR:
-                pose_generator(mpc, memory, draft, desired, found, plan, i, i, axis)
-            else:
-                pose_tracker(mpc, memory, draft, found, plan, i, i, axis)
+        which = FIRST if batch.figures[i].fresh else LATER
+        for axis in range(len(batch.mpc.model)):
+            if batch.compares:
+                set_inputs(draft.inputs[TRACKER, i, axis], simd, 0)
+                for stage in range(len(simd.gradient)):
+                    simd.gradient[stage, 0] = draft.gradient[i, axis, stage]
+                slope(batch.mpc, axis, which, simd)
+                column(simd.gradient, 0, draft.gradient[i, axis])
+        _conclude(batch, i)

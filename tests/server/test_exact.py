@@ -14,8 +14,15 @@ from scipy.optimize import lsq_linear
 
 from skytether.lab.benchmarks.problems import gradients
 from skytether.server.control import exact
-from skytether.server.control.exact import ExactSolver, active_set, workspace
-from skytether.server.control.mpc import LATER, Problem, make_mpc, pose
+from skytether.server.control.exact import ExactSolver, active_sets, workspace
+from skytether.server.control.mpc import (
+    LATER,
+    Problem,
+    make_mpc,
+    pose,
+    set_previous,
+    simd_batch,
+)
 from skytether.server.control.osqp_solver import OsqpSolver
 from skytether.server.control.planner import make_solver
 from skytether.shared.base.kernel import part
@@ -44,16 +51,17 @@ ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 
 
 
 @cache
-def active_set_with(**constants: float) -> Callable[..., int]:
-    """`active_set` compiled with other constants than those of its module."""
-    code = exact.active_set.py_func.__code__
-    return part(FunctionType(code, {**vars(exact), **constants}))
+def active_sets_with(**constants: float) -> Callable[..., int]:
+    """`active_sets` compiled with other constants than those of its module."""
+    names = {**vars(exact), **constants}
+    first = exact.lanes(FunctionType(exact._first_set.py_func.__code__, names))
+    return part(FunctionType(exact.active_sets.py_func.__code__, {**names, "_first_set": first}))
 
 
 @pytest.fixture
 def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sets that wander are given up at once."""
-    changed = {**vars(exact), "active_set": active_set_with(PIVOTS_MAX=0)}
+    changed = {**vars(exact), "active_sets": active_sets_with(PIVOTS_MAX=0)}
     monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
 
 
@@ -209,16 +217,18 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     assert (np.abs(inputs) == 1.8).mean() > 0.5
     rounded = inputs.astype(np.float32).astype(np.float64)
     assert np.abs(rounded).max() < 1.8
-    work, again = workspace(problem.mpc), np.empty(problem.hessian.shape[1])
+    work, settled = workspace(problem.mpc), np.ones(1, dtype=np.bool_)
+    simd = simd_batch(work.memory)
 
     def rounds(solve: Callable[..., int], at: tuple[int, ...]) -> int:
-        g, guessed = gradient[at], rounded[at]
-        return solve(problem.mpc, at[1], LATER, work, g, guessed, 0, False, again)
+        set_previous(rounded[at], 0, False, simd, 0)
+        simd.gradient[:, 0] = gradient[at]
+        return solve(problem.mpc, at[1], LATER, simd, work.free, settled)
 
     for at in np.ndindex(20, 2):
-        assert rounds(active_set, at) == 1
-        np.testing.assert_array_equal(again, inputs[at])
-    strict = active_set_with(NEAR=1.0)
+        assert rounds(active_sets, at) == 1
+        np.testing.assert_array_equal(simd.inputs[:, 0], inputs[at])
+    strict = active_sets_with(NEAR=1.0)
     assert max(rounds(strict, at) for at in np.ndindex(20, 2)) > 1
 
 

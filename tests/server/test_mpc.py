@@ -20,7 +20,11 @@ from skytether.server.control.mpc import (
     lead,
     make_mpc,
     pose,
-    shifted,
+    set_inputs,
+    set_previous,
+    set_target,
+    simd_batch,
+    simd_memory,
 )
 from skytether.server.control.osqp_solver import OsqpSolver
 from skytether.shared.law.model import Array, discretise
@@ -188,19 +192,22 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
     rng = np.random.default_rng(seed)
     problem = make(control(H), tau_s=tuple(rng.uniform(0.1, 3.0, axes).tolist()))
     x, _, u = situation(seed, H, axes)
-    follower, wind = rng.normal(size=2), 0.3
-    states, drift, toward = np.empty((axes, H + 1, 2)), np.empty((H, 2)), np.empty((H, 2))
-    for axis in range(axes):
-        start = tuple(follower.tolist())
-        follow(
-            problem.mpc, axis, start, wind, tuple(x[axis].tolist()), u[axis], states[axis], drift
-        )
-        lead(problem.mpc, axis, start, wind, states[axis], toward)
-        np.testing.assert_array_equal(drift, toward)
-    np.testing.assert_array_equal(states[:, 0], x)
+    states = [x]
     for stage in range(H):
-        x = problem.model.step(x, u[:, stage])
-        np.testing.assert_allclose(states[:, stage + 1], x, rtol=0, atol=1e-11)
+        states.append(problem.model.step(states[-1], u[:, stage].astype(np.float32)))
+    flown, follower = np.stack(states, axis=1), rng.normal(size=2)
+    simd = simd_batch(simd_memory(H, 1))
+    simd.w[0] = 0.3
+    for axis in range(axes):
+        (simd.p[0], simd.v[0]), (simd.leader_p[0], simd.leader_v[0]) = follower, x[axis]
+        set_inputs(u[axis], simd, 0)
+        follow(problem.mpc, axis, simd)
+        speeds, drift = simd.leader_speed[:, 0].copy(), simd.drift_p[:, 0].copy()
+        np.testing.assert_allclose(speeds, flown[axis, :, 1], rtol=0, atol=1e-11)
+        simd.p[0], simd.v[0] = follower
+        set_target(flown[axis], simd, 0)
+        lead(problem.mpc, axis, simd)
+        np.testing.assert_allclose(drift, simd.drift_p[:, 0], rtol=0, atol=1e-8)
 
 
 CASES = [
@@ -257,7 +264,9 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
 
 def carried(inputs: Array, gap: int, *, fresh: bool = False) -> Array:
     """A whole horizon, shifted."""
-    return np.array([shifted(inputs, gap, fresh, i) for i in range(len(inputs))])
+    simd = simd_batch(simd_memory(len(inputs), 1))
+    set_previous(inputs, gap, fresh, simd, 0)
+    return simd.previous[:, 0]
 
 
 def test_shifted_horizon_repeats_its_last_input() -> None:

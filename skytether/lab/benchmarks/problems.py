@@ -11,7 +11,16 @@ import numpy as np
 from skytether.server.control import planner
 from skytether.server.control.exact import ExactSolver
 from skytether.server.control.moves import GENERATOR, TRACKER
-from skytether.server.control.mpc import FIRST, Problem, gradient, lead
+from skytether.server.control.mpc import (
+    FIRST,
+    Problem,
+    gradient,
+    lead,
+    set_previous,
+    set_target,
+    simd_batch,
+    simd_memory,
+)
 from skytether.server.control.solver import Solver
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
@@ -40,11 +49,14 @@ def gradients(
         disturbance: disturbance that is added to every input [m/s]; shape (n, axes).
     """
     mpc, which, found = problem.mpc, problem.which, np.empty(previous.shape)
-    drift, fresh = np.empty((previous.shape[2], 2)), problem.which == FIRST
+    simd = simd_batch(simd_memory(previous.shape[2], 1))
     for at in np.ndindex(*previous.shape[:2]):
-        start, w, axis = (float(x[at][0]), float(x[at][1])), float(disturbance[at]), at[1]
-        lead(mpc, axis, start, w, target[at], drift)
-        gradient(mpc, axis, which, w, target[at], previous[at], 0, fresh, drift, found[at])
+        (simd.p[0], simd.v[0]), simd.w[0], axis = x[at], disturbance[at], at[1]
+        set_target(target[at], simd, 0)
+        set_previous(previous[at], 0, which == FIRST, simd, 0)
+        lead(mpc, axis, simd)
+        gradient(mpc, axis, which, simd, simd.target_v)
+        found[at] = simd.gradient[:, 0]
     return found
 
 
