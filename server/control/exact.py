@@ -22,6 +22,7 @@ import numpy as np
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import (
     MPC,
+    WIDTH,
     Problem,
     SimdBatch,
     column,
@@ -56,6 +57,8 @@ class Workspace(NamedTuple):
     (2, axes, H, 7)."""
     memory: F3
     """Scratch of a single vehicle, see `mpc.simd_memory`."""
+    together: F3
+    """Scratch of WIDTH vehicles."""
 
 
 Three = tuple[float, float, float]
@@ -305,22 +308,27 @@ def _table(mpc: MPC, work: Workspace) -> None:
 def _solve(
     mpc: MPC, which: int, work: Workspace, gradient: F3, guess: F3, inputs: F3, settled: B1
 ) -> None:
-    """Fill in inputs (n, axes, H) of n vehicles, and which are right, (n axes,); `active_sets`."""
-    simd, axes = simd_batch(work.memory), len(mpc.model)
-    for vehicle in range(len(gradient)):
-        for axis in range(len(mpc.model)):
-            at = vehicle * axes + axis
-            set_previous(guess[vehicle, axis], 0, False, simd, 0)
-            for stage in range(gradient.shape[2]):
-                simd.gradient[stage, 0] = gradient[vehicle, axis, stage]
-            active_sets(mpc, axis, which, simd, work.free, settled[at : at + 1])
-            column(simd.inputs, 0, inputs[vehicle, axis])
+    """Fill in inputs (n, axes, H) of n vehicles, and which are right, (axes n,); `active_sets`."""
+    alone, together, n = simd_batch(work.memory), simd_batch(work.together), len(gradient)
+    for axis in range(len(mpc.model)):
+        first = 0
+        while first < n:
+            simd = together if n - first >= WIDTH else alone
+            L, at = len(simd.p), axis * n + first
+            for lane in range(L):
+                set_previous(guess[first + lane, axis], 0, False, simd, lane)
+                for stage in range(gradient.shape[2]):
+                    simd.gradient[stage, lane] = gradient[first + lane, axis, stage]
+            active_sets(mpc, axis, which, simd, work.free, settled[at : at + L])
+            for lane in range(L):
+                column(simd.inputs, lane, inputs[first + lane, axis])
+            first += L
 
 
 def workspace(mpc: MPC) -> Workspace:
     """A workspace for the problems of an MPC."""
     axes, H = len(mpc.model), len(mpc.weights.states)
-    work = Workspace(np.empty((2, axes, H, 7)), simd_memory(H, 1))
+    work = Workspace(np.empty((2, axes, H, 7)), simd_memory(H, 1), simd_memory(H, WIDTH))
     _table(mpc, work)
     return work
 
@@ -340,11 +348,12 @@ class ExactSolver:
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
         """See `Solver`."""
         inputs = np.empty_like(gradient)
-        settled = np.ones(gradient.shape[:2], dtype=np.bool_)
+        n, axes, _ = gradient.shape
+        settled = np.ones((axes, n), dtype=np.bool_)
         mpc, which = self._problem.mpc, self._problem.which
         _solve(mpc, which, self.work, gradient, guess, inputs, settled.reshape(-1))
         solved: Flags = np.all(np.isfinite(gradient), axis=(1, 2))
-        for vehicle, axis in np.argwhere(~settled & solved[:, None]):
+        for vehicle, axis in np.argwhere(~settled.T & solved[:, None]):
             self.fallbacks += 1
             try:
                 inputs[vehicle, axis] = self._dual(int(axis), gradient[vehicle, axis])
