@@ -100,7 +100,7 @@ autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= nam
 	$(BIN)/pytest -q -rs -m autopilot
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
-	$(BIN)/python -m skytether.lab.benchmarks
+	$(BIN)/python -m bench
 
 $(BENCH_STAMP): $(STAMP) locks/bench.lock
 	$(INSTALL) --require-hashes -r locks/bench.lock
@@ -108,7 +108,7 @@ $(BENCH_STAMP): $(STAMP) locks/bench.lock
 
 SECONDS ?= 60
 fuzz: $(FUZZ_STAMP)  ## hostile inputs of every kind, guided by what they reach, for SECONDS=60
-	$(BIN)/python -m skytether.lab.fuzz --seconds $(SECONDS)
+	$(BIN)/python -m fuzz --seconds $(SECONDS)
 
 $(FUZZ_STAMP): $(STAMP) locks/fuzz.lock
 	$(INSTALL) --require-hashes -r locks/fuzz.lock || \

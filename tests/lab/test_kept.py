@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.lab.benchmarks.kept import flights
+from bench.kept import flights
 from skytether.shared.base.errors import ConfigError
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import missions
-from skytether.lab.benchmarks.missions import MissionsOptions
+from bench import missions
+from bench.missions import MissionsOptions
 from skytether.server.control import aside
 from skytether.server.control.aims import Aims
 

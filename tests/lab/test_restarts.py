@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import restarts
-from skytether.lab.benchmarks.restarts import (
+from bench import restarts
+from bench.restarts import (
     CLOSED,
     KILLED,
     STOPPED,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import motions, together
-from skytether.lab.benchmarks.motions import MotionsOptions
-from skytether.lab.benchmarks.together import ALL, BRAKING, SWAP, TogetherOptions
+from bench import motions, together
+from bench.motions import MotionsOptions
+from bench.together import ALL, BRAKING, SWAP, TogetherOptions
 from skytether.server.control.together import Together
 from skytether.shared.law.motion import SPACING, Motion
 

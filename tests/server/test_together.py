@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
+from bench import published
+from bench.together import MortalServer
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
-from skytether.lab.benchmarks import published
-from skytether.lab.benchmarks.together import MortalServer
 from skytether.server import sessions
 from skytether.server.control import aims, apart, aside, motionplan
 from skytether.server.control import known as known_vehicles
