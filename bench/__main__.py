@@ -103,13 +103,10 @@ def write(
     """
     if "tick" in results:
         tick.draw(results["tick"], folder / tick.FIGURE.name)
-    if "restarts" in results:
-        restarts.draw(results["restarts"], folder / restarts.FIGURE.name)
-        traced = results["restarts"]
-        results = {**results, "restarts": {k: v for k, v in traced.items() if k != "traces"}}
     known = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
     merged: dict[Section, Any] = {name: known[name] for name in SECTIONS if name in known}
-    files.write(file, (json.dumps(merged, indent=1) + "\n").encode())
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in merged.items())
+    files.write(file, f"{{{lines}}}\n".encode())
     tables = {"machine": machines(merged), "packages": packages(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)

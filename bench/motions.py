@@ -1,4 +1,4 @@
-"""Cost of keeping vehicles apart: a motion's QP beside other solvers, and whole ticks.
+"""Cost of keeping vehicles apart: a motion's QP beside other solvers, and the planning of a tick.
 
     python -m bench.motions
 
@@ -8,13 +8,12 @@ given what changes, with tolerances of 1e-4, which leave a millimetre, and no po
 alike, with its own tolerances. quadprog is given the Hessian's factor, DAQP and PIQP the dense
 problem; those that are installed take part. HPIPM takes none: it wants the problem in stages, each
 with its own half-planes, of which there is another number in each problem.
-Ticks are of swaps in virtual time: all vehicles are heard and planned for by one thread.
 
-The last table has ticks of fleets of which a share is near others: pairs that change places again
-and again, 20 m from the next pair, beside vehicles that fly to and fro alone. The planning of each
-tick (everything, from the motions that may be flown to the one that is sent) is compared with OSQP
-on one QP for each vehicle planned for in that tick, the last of its rounds. Both are CPU time. This
-table is the section `motions` of `make bench`.
+The section `motions` of `make bench` has ticks of fleets of which a share is near others: pairs
+that change places again and again, 20 m from the next pair, beside vehicles that fly to and fro
+alone. The planning of each tick (everything, from the motions that may be flown to the one that is
+sent) is compared with OSQP on one QP for each vehicle planned for in that tick, the last of its
+rounds. Both are CPU time.
 """
 
 import itertools
@@ -37,20 +36,18 @@ import tyro
 from scipy import sparse
 
 from bench.harness import TextTable, progress
+from bench.problems import derive
 from skytether.server.control.apart import HalfPlanes
 from skytether.server.control.direct import Direct
 from skytether.server.control.dual import DualSolver
 from skytether.server.control.motionplan import MotionPlan
 from skytether.server.control.together import Together
 from skytether.shared.base import files
-from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 
-SWAPS = ((16, 4.0), (16, 40.0), (64, 16.0), (64, 160.0), (200, 50.0), (200, 500.0))
-"""Numbers of vehicles, and the radius of their circle [m]: in each other's way, and far apart."""
 ROWS = 64
 """OSQP's problems are filled up to a multiple of this number of constraints with ones that always
 hold: it stays set up for a few sizes instead of one for every number."""
@@ -73,8 +70,6 @@ class MotionsOptions:
     problems: int = 2000
     duration: float = 30.0
     """Length of a flight [s]."""
-    markdown: Path | None = None
-    """File for the tables as Markdown."""
 
 
 @dataclass(frozen=True)
@@ -238,20 +233,11 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
     return found
 
 
-def swap(vehicles: int, radius_m: float, duration: float) -> Scenario:
-    """Scenario of vehicles that swap places on a circle."""
-    made = reading.load("swap")
-    reference = msgspec.structs.replace(
-        made.reference, shape=f"swap({vehicles})", radius_m=radius_m
-    )
-    return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
-
-
 def solvers(options: MotionsOptions) -> TextTable:
     """All solvers on the QPs of a flight."""
     problems: list[MotionProblem] = []
     with kept(problems):
-        flight.fly(swap(16, 4.0, options.duration), vehicles=16)
+        flight.fly(derive("swap", duration=options.duration, settle=1.0), vehicles=16)
     step = max(1, len(problems) // options.problems)
     problems = problems[::step][: options.problems]
     root = problems[0].solver.root
@@ -286,31 +272,6 @@ def solvers(options: MotionsOptions) -> TextTable:
     constraints = np.median([len(problem.least) for problem in problems])
     title = f"solver; {len(problems)} QPs, 24 variables, {constraints:.0f} constraints (median)"
     headings = [title, "p50, p99 [µs]", "OSQP over it", "largest difference\n[m/s²]"]
-    return TextTable(headings, rows)
-
-
-def ticks(options: MotionsOptions) -> TextTable:
-    """Whole ticks, with vehicles in each other's way and without."""
-    rows = []
-    for vehicles, radius_m in progress(SWAPS, "swaps"):
-        flown = swap(vehicles, radius_m, options.duration)
-        stopwatch = Stopwatch(time.perf_counter_ns)
-        record = flight.fly(flown, vehicles=vehicles, stopwatch=stopwatch)
-        told = record.figures["server"]
-        rows.append(
-            [
-                str(vehicles),
-                f"{radius_m:g}",
-                f"{told['tick_ms_p50']:.1f}, {told['tick_ms_p99']:.1f}",
-                f"{told['counts']['events'] / (vehicles * options.duration):.2f}",
-            ]
-        )
-    headings = [
-        "vehicles",
-        "radius of the circle\n[m]",
-        "tick p50, p99 [ms]",
-        "motions/s\na vehicle",
-    ]
     return TextTable(headings, rows)
 
 
@@ -449,15 +410,8 @@ def _quantiles(numbers: list[float]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measure, and print tables."""
-    options = tyro.cli(MotionsOptions, description=__doc__)
-    titles = ("one QP", f"swaps of {options.duration:g} s", "planning of a tick by share near")
-    measured = measure(MotionsCounts(duration=options.duration))
-    found = [solvers(options), ticks(options), tables(measured)["motions"]]
-    for each, title in zip(found, titles, strict=True):
-        each.show(title)
-    if options.markdown:
-        files.write(options.markdown, "\n".join(each.markdown() for each in found).encode())
+    """Measure the solvers as the command line says, and print a table."""
+    solvers(tyro.cli(MotionsOptions, description=__doc__)).show("one QP")
     return 0
 
 

@@ -13,16 +13,14 @@ The sender sends in batches, four a millisecond: no process can sleep for 50 µs
 
 import contextlib
 import gc
-import json
 import multiprocessing
-import os
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
@@ -32,19 +30,15 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from bench.harness import (
-    CONSOLE,
     TextTable,
-    machine,
     median,
     progress,
     quantile_ms,
     sleep_until,
 )
-from skytether.shared.base import files
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import Counted, Listening
 from skytether.shared.telemetry.record import DOWNLINK, read
@@ -60,8 +54,6 @@ QUIET_S = 2
 """Silence after which no packet is under way [s]: the paper's delays are far shorter."""
 PATIENCE_S = 90.0
 """Longest wait for an answer [s]; the longest run takes 60 s."""
-TARGET_MS = 1.0
-"""Target of the median over all runs of the error's p99 [ms]."""
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -78,21 +70,11 @@ class NetemBenchmarkOptions:
     """Number of packets per second."""
     size: int = 600
     """UDP payload of each [B]."""
-    realtime: bool = False
-    """Whether to run with real-time priority (needs the permission), so that other programs do not
-    disturb."""
-    json: Path | None = None
-    """File for the figures."""
 
     @property
     def packets(self) -> int:
         """Number of packets in a run."""
         return self.rate * self.seconds
-
-    def is_bounded(self) -> bool:
-        """Whether all numbers are small enough for one machine."""
-        few = 1 <= self.runs <= 100 and 1 <= self.seconds <= 60 and 1 <= self.rate <= 100_000
-        return few and HEAD.size <= self.size <= 65_507
 
 
 FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1)
@@ -253,17 +235,13 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
 
 
 def start_netem(
-    stack: ExitStack,
-    server_port: int,
-    seed: int,
-    record: Path,
-    network: Sequence[str] = ("--network.downlink.loss=0",),
+    stack: ExitStack, server_port: int, seed: int, record: Path
 ) -> tuple[subprocess.Popen[str], int]:
-    """Run netem, by default with the paper's delays and without loss; returns process and port."""
+    """Run netem with the paper's delays and without loss; returns process and port."""
     # -P: without it, a folder `netem` in the working directory would be run.
     command = [sys.executable, "-P", "-m", "skytether.netem", "paper", f"--seed={seed}"]
     command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
-    command += [*network, f"--record={record}"]
+    command += ["--network.downlink.loss=0", f"--record={record}"]
     netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     stack.callback(netem.wait)
     stack.callback(netem.kill)
@@ -305,7 +283,7 @@ def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
     seeds = range(1, options.runs + 1)
     runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
     return {
-        "options": {name: value for name, value in asdict(options).items() if name != "json"},
+        "options": asdict(options),
         "median": {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])},
         "runs": [asdict(run) for run in runs],
         "wake": {
@@ -344,62 +322,6 @@ def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
     return [NetemRun(**run) for run in result["runs"]]
 
 
-def show(result: Mapping[str, Any], options: NetemBenchmarkOptions) -> None:
-    """Print a table with a row per run, and whether the target is met."""
-    runs = runs_of(result)
-    tables(result)["netem"].show(f"netem, {options.rate} packets/s of {options.size} B")
-    for number, run in enumerate(runs, start=1):
-        if lost(run):
-            CONSOLE.print(f"Run {number}: {where(run)}.")
-    own = sum(lost(run) - run.dropped_after for run in runs)
-    p99_ms, wake_ms = result["median"]["error_ms_p99"], result["median"]["wake_ms_p99"]
-    met = own == 0 and p99_ms < TARGET_MS
-    CONSOLE.print(
-        f"Median p99: {p99_ms:.2f} ms; the machine's own: {wake_ms:.2f} ms. "
-        f"Lost by netem: {own}.\n"
-        f"Target, under {TARGET_MS:g} ms and none lost: {'met' if met else 'missed'}."
-    )
-
-
 def lost(run: NetemRun) -> int:
     """Number of packets that never arrived; netem was configured to lose none."""
     return run.sent - run.received
-
-
-def where(run: NetemRun) -> str:
-    """Sentence on where packets were lost."""
-    places = {
-        "unread by netem": run.dropped_before,
-        "dropped by netem": run.dropped_within,
-        "unread by the receiver": run.dropped_after,
-    }
-    places["lost elsewhere"] = lost(run) - sum(places.values())
-    return ", ".join(f"{count} {place}" for place, count in places.items() if count)
-
-
-def main() -> int:
-    """Measure as the command line says, and return the exit code."""
-    options = tyro.cli(NetemBenchmarkOptions, description=__doc__)
-    if not options.is_bounded():
-        CONSOLE.print("expected 1 to 100 runs, 1 to 60 s, up to 100000 packets/s of 16 to 65507 B")
-        return 2
-    try:
-        if options.realtime:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        result = measure(options)
-    except PermissionError:
-        CONSOLE.print("--realtime: this user may not")
-        return 2
-    except (EOFError, OSError) as error:
-        CONSOLE.print(f"netem, or a process of this benchmark, ended before its time: {error}")
-        return 1
-    show(result, options)
-    if options.json is not None:
-        files.write(
-            options.json, (json.dumps({**result, "machine": machine()}, indent=2) + "\n").encode()
-        )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

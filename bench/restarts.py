@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 from bench.children import HOST, ChildProcess, Lab
 from bench.harness import Lateness, TextTable, progress
 from bench.problems import derive
-from skytether.figures.flights import save
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying, ModeChanged
 from skytether.shared.law.model import Array
@@ -45,7 +44,6 @@ from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.wire.protocol import Mode
 
-FIGURE = Path(__file__).parents[1] / "docs" / "restarts.png"
 DOWN_S = 3.0
 """Length of an outage with a closed port, or of a stop [s]."""
 BRAKES_S = 1.2
@@ -340,27 +338,8 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
     flown = scenario()
     return {
         "verdicts": [asdict(judge(outage, lives, flown)) for outage in outages],
-        "traces": [trace(outage, lives) for outage in outages if outage.way in (KILLED, CLOSED)],
         "wake": lateness.figures(),
     }
-
-
-AROUND_S = (-1.0, 8.0)
-"""Time around an outage that is drawn [s]."""
-
-
-def trace(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> dict[str, Any]:
-    """Speeds around an outage, rounded, for the figure."""
-    begin_ns, end_ns = (outage.began_ns + round(at_s * SECOND_NS) for at_s in AROUND_S)
-    runs = []
-    for life in lives:
-        here = (life.time_ns >= begin_ns) & (life.time_ns < end_ns)
-        if here.any():
-            time_s = (life.time_ns[here] - outage.began_ns) / SECOND_NS
-            shown = (time_s, life.commanded[here], life.speed[here])
-            runs.append([np.round(each, 3).tolist() for each in shown])
-    down_s = (outage.back_ns - outage.began_ns) / SECOND_NS
-    return {"subject": outage.subject, "way": outage.way, "down_s": down_s, "runs": runs}
 
 
 def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
@@ -407,50 +386,3 @@ def _both(values: Iterable[float | None]) -> list[str]:
 def _worst(values: Iterable[float | None], spec: str) -> str:
     known = [each for each in values if each is not None]
     return format(max(known), spec) if known else "–"
-
-
-def draw(result: Mapping[str, Any], path: Path = FIGURE) -> None:
-    """Draw the speeds around all kills superimposed, one panel per process."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
-    panels, flown = figure.subplots(len(SUBJECTS), 1, sharex=True, sharey=True), scenario()
-    colours: dict[str, str] = {KILLED: "#0072b2", CLOSED: "#c1272d"}
-    for subject, panel in zip(SUBJECTS, panels, strict=True):
-        those = [each for each in result["traces"] if each["subject"] == subject]
-        fastest = np.zeros(2)
-        for each in those:
-            style: Any = {"color": colours[each["way"]], "alpha": 0.35}
-            for time_s, commanded, speed in each["runs"]:
-                panel.step(time_s, commanded, where="post", linewidth=0.4, linestyle=":", **style)
-                panel.plot(time_s, speed, linewidth=0.7, **style)
-                flies = slice(*np.searchsorted(time_s, (0.0, BRAKES_S)).tolist())
-                for i, speeds in enumerate((commanded, speed)):
-                    fastest[i] = max(fastest[i], *speeds[flies], 0.0)
-            panel.plot(each["down_s"], 0.0, "|", color=colours[each["way"]], markersize=12)
-        if subject != "client":  # its new process begins at rest
-            since_s = np.arange(0.0, AROUND_S[1] - BRAKES_S, flown.control.dt)
-            for curve, line in zip(
-                curves(fastest[0], fastest[1], since_s, flown), ("k--", "k-"), strict=True
-            ):
-                panel.plot(BRAKES_S + since_s, curve, line, linewidth=1.4)
-        panel.axvline(0.0, color="0.4", linewidth=0.8)
-        panel.set_title(f"{subject}, killed {len(those)} times", fontsize=10)
-        panel.set_ylabel("speed [m/s]")
-        panel.grid(alpha=0.3)
-    panels[-1].set_xlabel("time since the kill [s]; a tick at the bottom: it listens again")
-    panels[-1].set_xlim(*AROUND_S)
-    panels[0].legend(handles=_legend(colours), loc="upper right", fontsize=8, ncols=2)
-    save(figure, path, dpi=90)
-
-
-def _legend(colours: Mapping[str, str]) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    names = {KILLED: "true speed, restarted at once", CLOSED: "true speed, restarted after 3 s"}
-    return [
-        *(Line2D([], [], color=colours[way], label=name) for way, name in names.items()),
-        Line2D([], [], color="0.4", linestyle=":", label="commanded speed"),
-        Line2D([], [], color="k", linestyle="--", label="braking curve of the fastest, commanded"),
-        Line2D([], [], color="k", label="and true"),
-    ]
