@@ -219,10 +219,7 @@ def judged(
         for flown in (whole, cut)
     )
     return FlownCell(
-        **cell._asdict(),
-        whole=whole_summary,
-        cut=cut_summary,
-        largest_m=float(errors.max()),
+        **cell._asdict(), whole=whole_summary, cut=cut_summary, largest_m=float(errors.max())
     )
 
 

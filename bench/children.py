@@ -33,15 +33,12 @@ class ChildProcess:
         stack: kills the process when the stack closes.
         name: module to run: server, netem or client.
         arguments: its arguments, besides `--log json`.
-        python: Python interpreter that runs it.
     """
 
-    def __init__(
-        self, stack: ExitStack, name: str, *arguments: str, python: str = sys.executable
-    ) -> None:
+    def __init__(self, stack: ExitStack, name: str, *arguments: str) -> None:
         self.name = name
         # -P: a folder in the user's working directory must not shadow our package.
-        command = [python, "-P", "-m", f"skytether.{name}", *arguments, "--log", "json"]
+        command = [sys.executable, "-P", "-m", f"skytether.{name}", *arguments, "--log", "json"]
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
@@ -132,11 +129,6 @@ class ChildProcess:
             ended_ns = time.monotonic_ns()
             self.process.send_signal(signal.SIGCONT)
         return began_ns, ended_ns
-
-    def cpu_s(self) -> float:
-        """CPU time of the process so far [s]."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def resident_bytes(self) -> int:
         """Resident memory of the process [B]."""

@@ -142,11 +142,7 @@ class Watched:
         """Time at which the motors were switched off [ns]."""
         self.netem = Proxy(scenario, server=("server", 0), flows=1)
         client = Client(
-            scenario,
-            vehicles.make(scenario, 1),
-            server=("netem", 0),
-            vehicle=1,
-            boot_id=BOOT_ID,
+            scenario, vehicles.make(scenario, 1), server=("netem", 0), vehicle=1, boot_id=BOOT_ID
         )
         entropy = stream(scenario.seed, "entropy").bytes
         self.world = world = World(self._hear)

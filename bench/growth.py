@@ -13,15 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.airspace import Airspace
-from bench.harness import (
-    HOT,
-    Lateness,
-    Pace,
-    TextTable,
-    figures_us,
-    interleave,
-    us,
-)
+from bench.harness import HOT, Lateness, Pace, TextTable, figures_us, interleave, us
 from bench.problems import derive
 from bench.tick import waker
 from skytether.shared.scenario.schema import Scenario

@@ -16,16 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bench.harness import (
-    HOT,
-    Lateness,
-    TextTable,
-    figures_us,
-    interleave,
-    median,
-    progress,
-    us,
-)
+from bench.harness import HOT, Lateness, TextTable, figures_us, interleave, median, progress, us
 from bench.problems import derive
 from bench.wire import NOTHING, messages
 from skytether.client import secure as client

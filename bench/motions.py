@@ -4,10 +4,9 @@
 
 The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. All
 solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
-given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing; Clarabel
-alike, with its own tolerances. quadprog is given the Hessian's factor, DAQP and PIQP the dense
-problem; those that are installed take part. HPIPM takes none: it wants the problem in stages, each
-with its own half-planes, of which there is another number in each problem.
+given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog,
+where it is installed, is given the Hessian's factor, DAQP the dense problem. HPIPM takes no part:
+it wants the problem in stages, each with its own half-planes, whose number differs in each problem.
 
 The section `motions` of `make bench` has ticks of fleets of which a share is near others: pairs
 that change places again and again, 20 m from the next pair, beside vehicles that fly to and fro
@@ -164,32 +163,6 @@ class MotionOsqp:
         return found
 
 
-class MotionClarabel:
-    """Clarabel for problems with one Hessian."""
-
-    def __init__(self, hessian: Array) -> None:
-        self._hessian = sparse.csc_matrix(np.triu(hessian))
-        self._made: dict[tuple[int, int], Any] = {}
-
-    def solve(self, problem: MotionProblem) -> Array:
-        """The minimum, at its tolerance."""
-        import clarabel
-
-        dense, least = filled_up(problem)
-        kind, changed = (len(least), problem.equal), (-problem.linear, -dense, -least)
-        solver = self._made.get(kind)
-        if solver is None:
-            settings = clarabel.DefaultSettings()
-            settings.verbose = settings.presolve_enable = settings.input_sparse_dropzeros = False
-            bounded = clarabel.NonnegativeConeT(len(least) - problem.equal)
-            cones = [clarabel.ZeroConeT(problem.equal), bounded]
-            solver = clarabel.DefaultSolver(self._hessian, *changed, cones, settings)
-            self._made[kind] = solver
-        else:
-            solver.update(q=changed[0], A=changed[1], b=changed[2])
-        return np.asarray(solver.solve().x)
-
-
 def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
     """Solvers by name, each of problems with this Hessian."""
     found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": MotionOsqp(hessian).solve}
@@ -214,22 +187,6 @@ def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
             return result
 
         found["quadprog"] = of_quadprog
-    if find_spec("clarabel"):
-        found["Clarabel"] = MotionClarabel(hessian).solve
-    if find_spec("piqp"):
-        import piqp
-
-        def of_piqp(problem: MotionProblem) -> Array:
-            solver, rows = piqp.DenseSolver(), np.ascontiguousarray(problem.columns.T)
-            solver.settings.compute_timings = False
-            n = problem.equal
-            solver.setup(
-                hessian, -problem.linear, rows[:n], problem.least[:n], rows[n:], problem.least[n:]
-            )
-            solver.solve()
-            return np.asarray(solver.result.x)
-
-        found["PIQP"] = of_piqp
     return found
 
 

@@ -32,13 +32,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.harness import (
-    TextTable,
-    median,
-    progress,
-    quantile_ms,
-    sleep_until,
-)
+from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import Counted, Listening
 from skytether.shared.telemetry.record import DOWNLINK, read

@@ -17,14 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness import (
-    Lateness,
-    TextTable,
-    figures_us,
-    progress,
-    us,
-    without_gc,
-)
+from bench.harness import Lateness, TextTable, figures_us, progress, us, without_gc
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shell.batch import Batch

@@ -7,16 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contestants import (
-    NOTHING,
-    OURS,
-    TUNED,
-    TUNINGS,
-    Factory,
-    Tuning,
-    by_axis,
-    contestants,
-)
+from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Factory, Tuning, by_axis, contestants
 from bench.harness import (
     HOT,
     PACED,

@@ -6,8 +6,8 @@ from contextlib import suppress
 from random import Random
 from types import ModuleType
 
-from fuzz.flown import SCENARIO, flown
 from fuzz.mutators import bytes_changed
+from fuzz.target import SCENARIO, flown
 from fuzz.texts import Text
 from skytether.shared.telemetry import feed
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Reader

@@ -23,8 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from fuzz.flown import SCENARIO, flown
-from fuzz.target import Target
+from fuzz.target import SCENARIO, Target, flown
 from skytether.cli import recorder
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.telemetry import feed

@@ -1,12 +1,27 @@
 """Base of all fuzzing targets: it takes bytes from outside, and checks the guarantees."""
 
 from collections.abc import Sequence
+from functools import cache
 from inspect import isclass, isfunction
 from random import Random
 from types import FunctionType, ModuleType
 from typing import Any
 
+import msgspec
+
 from fuzz.mutators import bytes_changed
+from skytether.shared.scenario import reading
+from skytether.shared.telemetry.record import Record
+from skytether.sim.flight import fly
+
+SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
+"""Scenario that is flown."""
+
+
+@cache
+def flown() -> Record:
+    """Record of the flight."""
+    return fly(SCENARIO)
 
 
 class Target:

@@ -10,9 +10,8 @@ import msgspec
 import numpy as np
 
 from fuzz.datagrams import SCENARIOS, EndpointInFlight
-from fuzz.flown import flown
 from fuzz.mutators import text_changed, words_of
-from fuzz.target import Target
+from fuzz.target import Target, flown
 from skytether.netem.proxy import Proxy
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
