@@ -13,36 +13,36 @@ RUN python3 -m venv /build && python3 -m venv --without-pip /opt/skytether
 
 # What makes the wheel stays behind.
 FROM tools AS wheel
-COPY requirements-setup.lock ./
-RUN /build/bin/pip install --quiet --only-binary :all: --require-hashes -r requirements-setup.lock
+COPY locks/setup.lock ./
+RUN /build/bin/pip install --quiet --only-binary :all: --require-hashes -r setup.lock
 COPY . ./
 RUN /build/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /wheel .
 
 
 FROM tools AS client-packages
-COPY requirements-client.lock ./
-RUN $INSTALL --require-hashes -r requirements-client.lock && $TRIM
+COPY locks/client.lock ./
+RUN $INSTALL --require-hashes -r client.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 
 
 FROM tools AS aboard-packages
-COPY requirements-mavlink.lock ./
-RUN $INSTALL --require-hashes -r requirements-mavlink.lock && $TRIM
+COPY locks/mavlink.lock ./
+RUN $INSTALL --require-hashes -r mavlink.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 
 
 FROM tools AS page-packages
-COPY requirements-page.lock ./
-RUN $INSTALL --require-hashes -r requirements-page.lock && $TRIM
+COPY locks/page.lock ./
+RUN $INSTALL --require-hashes -r page.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 
 
 FROM tools AS server-packages
-COPY requirements-server.lock ./
-RUN $INSTALL --require-hashes -r requirements-server.lock && $TRIM
+COPY locks/server.lock ./
+RUN $INSTALL --require-hashes -r server.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 # The server's kernels; a machine of another kind compiles it anew when it starts.

@@ -32,18 +32,18 @@ KERNELS = $(BIN)/python -c "import skytether.lab.loops, skytether.quadrotor.loop
 
 setup: $(STAMP)  ## the environment alone
 
-$(UV): requirements-setup.lock
+$(UV): locks/setup.lock
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r $<
 	touch $@
 
-$(FLY): $(UV) requirements.lock pyproject.toml
-	$(INSTALL) --require-hashes -r requirements.lock
+$(FLY): $(UV) locks/fly.lock pyproject.toml
+	$(INSTALL) --require-hashes -r locks/fly.lock
 	$(INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
 
-$(STAMP): $(FLY) requirements-dev.lock
-	$(INSTALL) --require-hashes -r requirements-dev.lock
+$(STAMP): $(FLY) locks/dev.lock
+	$(INSTALL) --require-hashes -r locks/dev.lock
 	touch $@
 
 demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play with
@@ -84,8 +84,8 @@ equations: setup  ## the table of docs/paper.md, from the equations that docstri
 docs: $(DOCS_STAMP)  ## a site of docs/ in site/, offline; a link that leads nowhere fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
-$(DOCS_STAMP): $(STAMP) requirements-docs.lock
-	$(INSTALL) --require-hashes -r requirements-docs.lock
+$(DOCS_STAMP): $(STAMP) locks/docs.lock
+	$(INSTALL) --require-hashes -r locks/docs.lock
 	touch $@
 
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
@@ -100,32 +100,32 @@ autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= nam
 	$(BIN)/pytest -q -rs -m autopilot
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
-	$(BIN)/python -m skytether.lab.benchmarks
+	$(BIN)/python -m bench
 
-$(BENCH_STAMP): $(STAMP) requirements-bench.lock
-	$(INSTALL) --require-hashes -r requirements-bench.lock
+$(BENCH_STAMP): $(STAMP) locks/bench.lock
+	$(INSTALL) --require-hashes -r locks/bench.lock
 	touch $@
 
 SECONDS ?= 60
 fuzz: $(FUZZ_STAMP)  ## hostile inputs of every kind, guided by what they reach, for SECONDS=60
-	$(BIN)/python -m skytether.lab.fuzz --seconds $(SECONDS)
+	$(BIN)/python -m fuzz --seconds $(SECONDS)
 
-$(FUZZ_STAMP): $(STAMP) requirements-fuzz.lock
-	$(INSTALL) --require-hashes -r requirements-fuzz.lock || \
+$(FUZZ_STAMP): $(STAMP) locks/fuzz.lock
+	$(INSTALL) --require-hashes -r locks/fuzz.lock || \
 		echo "atheris cannot be installed here: inputs are random, and not guided"
 	touch $@
 
 lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, whoever needs it
-	$(COMPILE) --extra dev pyproject.toml -o requirements-dev.lock
-	$(COMPILE) --group setup -o requirements-setup.lock
-	for need in "" client mavlink page server bench fuzz docs; do \
+	$(COMPILE) --extra dev pyproject.toml -o locks/dev.lock
+	$(COMPILE) --group setup -o locks/setup.lock
+	for need in fly client mavlink page server bench fuzz docs; do \
 		case "$$need" in \
-			"") extras="--extra server --extra page --extra plot --extra record";; \
+			fly) extras="--extra server --extra page --extra plot --extra record";; \
 			client) extras="";; \
 			*) extras="--extra $$need";; \
 		esac; \
-		$(COMPILE) $$extras --constraint requirements-dev.lock pyproject.toml \
-			-o requirements$${need:+-$$need}.lock || exit; \
+		$(COMPILE) $$extras --constraint locks/dev.lock pyproject.toml \
+			-o locks/$$need.lock || exit; \
 	done
 
 clean:

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from airborne import Air
+from bench.autopilots import MODELS
 from skytether.autopilot.flavours import FlavourName, FlightMode
-from skytether.lab.benchmarks.autopilots import MODELS
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.text import chunks

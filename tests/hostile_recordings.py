@@ -23,10 +23,10 @@ from typing import Any
 import matplotlib.figure  # noqa: F401 - before memory is bounded, as everything that is large
 import numpy as np
 
+from fuzz.recordings import hostile, records
 from skytether.cli.export import export
 from skytether.cli.recover import recover
 from skytether.cli.report import report
-from skytether.lab.fuzz.recordings import hostile, records
 from skytether.shell import command
 
 

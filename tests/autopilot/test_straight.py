@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench import autopilots
 from helpers import packaged
 from skytether.__main__ import main
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse as fault
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.benchmarks import autopilots
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from airborne import Air
+from bench.autopilots import MODELS
 from skytether.autopilot.faults import COMMANDED
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.benchmarks.autopilots import MODELS
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.core.aboard import SecondCommander, Strays

@@ -4,7 +4,6 @@ What is not installed does not compete; nothing here asserts a time.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,12 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import (
+from bench import (
     accuracy,
     flood,
-    footprint,
     growth,
-    least,
     link,
     motions,
     netem,
@@ -31,10 +28,10 @@ from skytether.lab.benchmarks import (
     versions,
     wire,
 )
-from skytether.lab.benchmarks.__main__ import DOCUMENT, ROOT, SECTIONS, write
-from skytether.lab.benchmarks.airspace import PlannedFleet
-from skytether.lab.benchmarks.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
-from skytether.lab.benchmarks.harness import (
+from bench.__main__ import DOCUMENT, ROOT, SECTIONS, write
+from bench.airspace import PlannedFleet
+from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
+from bench.harness import (
     HOT,
     PACED,
     Lateness,
@@ -43,8 +40,8 @@ from skytether.lab.benchmarks.harness import (
     machine,
     refresh,
 )
-from skytether.lab.benchmarks.problems import RecordedProblems, listening, record
-from skytether.lab.benchmarks.reference import Reference
+from bench.problems import RecordedProblems, listening, record
+from bench.reference import Reference
 from skytether.server.control.controller import BLOCK
 from skytether.server.control.exact import ExactSolver
 
@@ -101,8 +98,7 @@ def test_every_table_has_its_place_in_the_document(
     document.write_text(DOCUMENT.read_text())
     write(results, file, document, tmp_path)
     assert set(json.loads(file.read_text())) == set(SECTIONS)
-    for figure in (tick.FIGURE, restarts.FIGURE):
-        assert (tmp_path / figure.name).read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / tick.FIGURE.name).read_bytes().startswith(b"\x89PNG")
     for name, section in SECTIONS.items():
         for table in section.tables(results[name]).values():
             assert table.markdown() in document.read_text()
@@ -197,7 +193,7 @@ def test_the_reference_is_the_same_whoever_finds_it(
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
-    monkeypatch.setattr("skytether.lab.benchmarks.reference.find_spec", lambda _: None)
+    monkeypatch.setattr("bench.reference.find_spec", lambda _: None)
     by_scipy = [reference.solve(gradient) for gradient in gradients]
     np.testing.assert_allclose(by_scipy, by_quadprog, rtol=0, atol=1e-14)
 
@@ -273,34 +269,3 @@ def test_a_table_without_a_place_is_an_error() -> None:
     )
     with pytest.raises(ValueError, match="table two: got 0 places in the document, expected 1"):
         refresh(text, {"two": table})
-
-
-def test_the_footprint_is_of_what_is_installed(tmp_path: Path) -> None:
-    """A client with keys is larger, for it has its ciphers; an extra adds what it needs."""
-    options = footprint.FootprintOptions(runs=1, flight_s=0.5, extras=("", "record"))
-    try:
-        found = footprint.measure(options)
-    except RuntimeError as error:
-        pytest.skip(f"{error}, which may reach no index")
-    bare, record = (found["extras"][extra] for extra in options.extras)
-    assert record["packages"] > bare["packages"]
-    assert record["disk_bytes"] > bare["disk_bytes"] > 0
-    plaintext, keys = found["aboard"]["plaintext"], found["aboard"]["keys"]
-    assert keys["resident_bytes"] > plaintext["resident_bytes"] > plaintext["mapped_bytes"] > 0
-    assert plaintext["cpu_s"] > 0
-    extras, aboard = footprint.tables(found).values()
-    assert [row[0] for row in extras.rows] == ["none (≤ 150 MB)", "record"]
-    assert [row[0] for row in aboard.rows] == ["plaintext", "keys"]
-
-    (tmp_path / "file").write_bytes(bytes(100_000))
-    (tmp_path / "link").symlink_to("file")
-    assert 100_000 <= footprint.disk_bytes(tmp_path) < 110_000
-
-
-def test_the_least_stands_beside_what_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every part has a row with its time."""
-    assert least.main(["--vehicles", "20", "--turns", "2"]) == 0
-    rows = re.findall(r"^ (\w.*?) {2,}(\d[\d.]*) *$", capsys.readouterr().out, re.MULTILINE)
-    assert [name.split(",")[0] for name, _ in rows][:2] == ["memory of a plan", "planning"]
-    assert len(rows) == 6
-    assert all(float(figure) > 0.0 for _, figure in rows)

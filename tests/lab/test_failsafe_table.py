@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from bench import failsafe
+from bench.failsafe import CaseName, Ending, FaultOutcome
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.benchmarks import failsafe
-from skytether.lab.benchmarks.failsafe import CaseName, Ending, FaultOutcome
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 SILENCE_S = (1.4, 2.1)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import flood
-from skytether.lab.benchmarks.flood import FORGED, FloodCounts
-from skytether.lab.benchmarks.link import NOW_NS, PEER, Ends
-from skytether.lab.benchmarks.wire import messages
+from bench import flood
+from bench.flood import FORGED, FloodCounts
+from bench.link import NOW_NS, PEER, Ends
+from bench.wire import messages
 from skytether.server.secure import FORMS, SecureGate
 from skytether.shared.core.endpoint import Datagram, Form
 from skytether.shared.scenario.reading import load

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from mcap.exceptions import McapError
 
-from skytether.lab.fuzz import __main__ as command
-from skytether.lab.fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
-from skytether.lab.fuzz.handshake import Holder, Strangers
-from skytether.lab.fuzz.mutators import corpus, seeds
-from skytether.lab.fuzz.target import Target, functions
-from skytether.lab.fuzz.targets import TARGETS
+from fuzz import __main__ as command
+from fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
+from fuzz.handshake import Holder, Strangers
+from fuzz.mutators import corpus, seeds
+from fuzz.target import Target, functions
+from fuzz.targets import TARGETS
 from skytether.server.reception import IMPLAUSIBLE
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import feed

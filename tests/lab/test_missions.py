@@ -1,20 +1,23 @@
-"""Random missions: reproducible, and harsh ones with links that are cut and servers that die."""
+"""Missions as benchmarks: reproducible, also with links that are cut and servers that die."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from skytether.lab.benchmarks import missions
-from skytether.lab.benchmarks.missions import MissionsOptions
+from bench import missions, motions
+from bench.missions import RandomOptions, flights
+from bench.motions import MotionsOptions
 from skytether.server.control import aside
 from skytether.server.control.aims import Aims
+from skytether.shared.base.errors import ConfigError
 
 
 def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
     """Harsh ones are the same, over links that are cut as well."""
-    drawn = missions.mission(MissionsOptions(), 5, tmp_path)
-    again = missions.mission(MissionsOptions(harsh=True), 5, tmp_path)
+    drawn = missions.random_mission(RandomOptions(), 5, tmp_path)
+    again = missions.random_mission(RandomOptions(harsh=True), 5, tmp_path)
     assert again.mission == drawn.mission
     assert again.network.uplink.text.startswith(f"{drawn.network.uplink.text} & outages(")
 
@@ -22,7 +25,7 @@ def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_harsh_missions_keep_apart() -> None:
     """Vehicles that have not arrived are no fault there."""
-    table, told = missions.table(MissionsOptions(missions=6, harsh=True, duration=60.0))
+    table, told = missions.random_table(RandomOptions(flights=6, harsh=True, duration=60.0))
     assert told == []
     assert sum(int(row[1]) for row in table.rows) == 6
     assert all(float(row[2]) > 0.5 for row in table.rows)
@@ -35,15 +38,37 @@ def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
     """A way fits through it and a motion does not. Ablation: else one vehicle stays before it, or
     flies to and fro there.
     """
-    assert missions.fly(MissionsOptions(), 31463).late == 0
-    assert missions.fly(MissionsOptions(), 104503).late == 0
+    assert missions.fly_random(RandomOptions(), 31463).late == 0
+    assert missions.fly_random(RandomOptions(), 104503).late == 0
     monkeypatch.setattr(Aims, "close", lambda *_: False)
-    assert missions.fly(MissionsOptions(), 104503).late == 1
+    assert missions.fly_random(RandomOptions(), 104503).late == 1
 
 
 @pytest.mark.long
 def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """One of them steps aside, though it is nearer than plans keep. Ablation: else nobody does."""
-    assert missions.fly(MissionsOptions(), 31906).late == 0
+    assert missions.fly_random(RandomOptions(), 31906).late == 0
     monkeypatch.setattr(aside, "_least", lambda places, _, apart_m: np.full(len(places), apart_m))
-    assert missions.fly(MissionsOptions(), 31906).late == 1
+    assert missions.fly_random(RandomOptions(), 31906).late == 1
+
+
+def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
+    """A command goes on where it ended, with more flights if asked; else nothing is kept."""
+    out = tmp_path / "flights"
+    assert flights(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, 1) == [2.0, 3.0]
+    # Another function shows which are flown now.
+    assert flights(math.fabs, [4.0, 9.0, 16.0], float, {"seed": 1}, out, 1) == [2.0, 3.0, 16.0]
+    assert flights(math.fabs, [4.0], float, {"seed": 1}, None, 1) == [4.0]
+    with pytest.raises(ConfigError, match="seed: got 2, expected 1"):
+        flights(math.fabs, [4.0], float, {"seed": 2}, out, 1)
+
+
+def test_solvers_agree_on_the_problems_of_a_flight() -> None:
+    """As far as their tolerances go; those that are not installed take no part."""
+    table = motions.solvers(MotionsOptions(problems=5, duration=4.0))
+    found = {row[0]: float(row[3]) for row in table.rows}
+    assert {"ours, dual active set", "OSQP", "DAQP"} <= set(found)
+    assert found.pop("ours, dual active set") == 0.0
+    # OSQP stops at 1e-4 of its residuals.
+    assert max(found.values()) < 0.5
+    assert found["DAQP"] == pytest.approx(0.0, abs=1e-2)

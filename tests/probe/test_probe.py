@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,11 @@ from scipy import stats
 
 from skytether.__main__ import main
 from skytether.client.link import PlainLink
-from skytether.lab.benchmarks.probing import CLOCK, measure, models
+from skytether.netem.proxy import Proxy
 from skytether.probe import analysis, fits
 from skytether.probe.listener import HOLD_NS, IDLE_NS, SESSIONS_MAX, Listener
 from skytether.probe.outcome import outcome, rows, trace
-from skytether.probe.prober import BYTES_MIN, Prober
+from skytether.probe.prober import BYTES_MIN, MeasuredPath, Prober
 from skytether.probe.wire import (
     NO_NUMBER,
     NONCE_BYTES,
@@ -38,10 +39,18 @@ from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
+from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.telemetry.record import (
+    DOWNLINK,
+    PACKET_COLUMNS,
+    UPLINK,
+    Recorder,
+    Rows,
+    parse,
+)
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
-from skytether.sim.world import Clock
+from skytether.sim.world import Clock, World
 
 LISTENER = ("listener", 0)
 HOUR_NS = 3600 * SECOND_NS
@@ -226,6 +235,39 @@ def test_a_train_is_answered_together_or_as_far_as_it_has_come() -> None:
 
 
 # -- a measurement --------------------------------------------------------------------------------
+
+CLOCK = Clock(HOUR_NS, 20_000)
+"""Clock of the listener: an hour ahead, and 20 ppm fast."""
+
+
+def measure(
+    uplink: str, downlink: str, *, seconds: float, clock: Clock = CLOCK
+) -> tuple[MeasuredPath, Rows]:
+    """Measure a netem network in virtual time, 20 packets a second; with netem's rows."""
+    network = NetworkConfig(
+        uplink=DirectionConfig(impairments=uplink), downlink=DirectionConfig(impairments=downlink)
+    )
+    sink, world = BytesIO(), World()
+    listener = world.add("listener", Listener(PlainGate(), b"secret" * 5), clock=clock)
+    recorder = Recorder(PACKET_COLUMNS, sink)
+    scenario = Scenario(network=network)
+    netem = world.add("netem", Proxy(scenario, server=listener, recorder=recorder))
+    prober = Prober(
+        PlainLink(),
+        netem,
+        bytes(range(NONCE_BYTES)),
+        probes=round(seconds * 20),
+        period_ns=SECOND_NS // 20,
+        size=400,
+    )
+    world.add("prober", prober)
+    world.run(lambda: prober.finished, limit_ns=round((seconds + 120.0) * SECOND_NS))
+    return prober.measured(), parse(sink.getvalue())
+
+
+def models(text: str) -> set[str]:
+    """Names of the delays and losses in a text."""
+    return {name for name, _ in path(text).impairments} - {"rate", "ordered"}
 
 
 def in_order(packets: Rows, direction: int) -> Rows:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from skytether.lab.benchmarks.problems import gradients
+from bench.problems import gradients
 from skytether.server.control import exact
 from skytether.server.control.exact import ExactSolver, active_sets, workspace
 from skytether.server.control.mpc import (

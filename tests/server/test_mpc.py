@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from skytether.lab.benchmarks.problems import gradients
+from bench.problems import gradients
 from skytether.server.control.mpc import (
     FIRST,
     LATER,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 import skytether.server.control.planner
-from skytether.lab.benchmarks.problems import gradients, listening, solving
+from bench.problems import gradients, listening, solving
 from skytether.server.control.controller import BLOCK
 from skytether.server.control.desired import Desired
 from skytether.server.control.exact import ExactSolver, Workspace

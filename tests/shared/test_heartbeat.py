@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import skytether
-from skytether.lab.benchmarks import liveness
-from skytether.lab.benchmarks.heartbeats import computed, keep, main
+from idle_link import keep
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import ModeChanged
 from skytether.shared.law.heartbeat import (
     ASSUMED,
     FALSE_PER_H,
@@ -22,7 +22,7 @@ from skytether.shared.law.heartbeat import (
     silences,
 )
 from skytether.shared.scenario.schema import DirectionConfig, LinkConfig
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason
 from skytether.sim.flight import fly
 
 DT_NS = 50 * MILLISECOND_NS
@@ -140,27 +140,16 @@ def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
     assert hearing.silence == 10
 
 
-@pytest.mark.parametrize("loss", [0.1, 0.3])
-def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float) -> None:
+@pytest.mark.parametrize(("loss", "packets_per_s"), [(0.1, 1.4), (0.3, 2.7)])
+def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float, packets_per_s: float) -> None:
     """In three hours; where heartbeats do not follow the loss, far more often."""
     network = DirectionConfig(loss=loss)
-    kept = keep(network, 2.0, None, 18)
+    kept = keep(network, 18, LinkConfig(timeout_s=2.0))
     assert kept.false_per_h <= 0.34
-    assert kept.noticed_s[1] < 2.0 + 0.6
-    assert computed(loss, 2.0, None) <= FALSE_PER_H
+    assert max(kept.noticed_s) < 2.0 + 0.6
+    assert kept.packets_per_s == pytest.approx(packets_per_s, rel=0.1)
     if loss == 0.3:
-        assert keep(network, 2.0, 0.5, 18).false_per_h > 30.0
-        assert (
-            kept.packets_per_s > 1.5 * keep(DirectionConfig(loss=0.1), 2.0, None, 6).packets_per_s
-        )
-
-
-def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """A row for each link and network."""
-    main(["--hours", "0.1"])
-    rows = capsys.readouterr().out.splitlines()
-    assert len(rows) == 2 + 4 * 5
-    assert all(row.count("|") == 7 for row in rows)
+        assert keep(network, 18, LinkConfig(timeout_s=2.0, heartbeat_s=0.5)).false_per_h > 30.0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
@@ -179,33 +168,36 @@ def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> N
 
 def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
     """A loss of 10 % ends no link by mistake; a loss of 60 % does."""
-    kept = liveness.keep(DirectionConfig(loss=0.1), 6)
-    assert kept.hours == 1.0
-    assert kept.false <= 1
+    kept = keep(DirectionConfig(loss=0.1), 6)
+    assert kept.false_per_h <= 1.0
     assert len(kept.noticed_s) == 6
     assert 1.2 < min(kept.noticed_s) <= max(kept.noticed_s) < 2.1
-    assert liveness.keep(DirectionConfig(loss=0.6), 6).false > 0
-    assert liveness.keep(DirectionConfig(loss=0.0), 1) == (
-        1 / 6,
-        0,
-        pytest.approx([1.75], abs=0.35),
-    )
+    assert keep(DirectionConfig(loss=0.6), 6).false_per_h > 0
+    calm = keep(DirectionConfig(loss=0.0), 1)
+    assert (calm.false_per_h, calm.noticed_s) == (0, pytest.approx([1.75], abs=0.35))
 
 
 def test_bursts_are_longer_than_any_heartbeat_helps_against() -> None:
     """Bursts of 2 s make a link be taken for lost dozens of times an hour."""
-    burst = DirectionConfig(loss=0.1, burst_s=2.0)
-    assert liveness.keep(burst, 6).false > 20
+    assert keep(DirectionConfig(loss=0.1, burst_s=2.0), 6).false_per_h > 20
 
 
 def test_a_flight_notices_that_it_is_cut() -> None:
     """At the step after the time-out, counted from the packet that came last."""
-    assert 1.4 < liveness.noticed_s(0.1, 1) < 2.1
-
-
-def test_liveness_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    """A row for each network."""
-    liveness.main(["--hours", "0.17"])
-    printed = capsys.readouterr().out
-    assert all(f"{loss:g}" in printed for loss in liveness.LOSSES)
-    assert "in bursts of 2 s" in printed
+    cut_s = 40.0
+    keys = {
+        "control.scheme": "trajectory",
+        "control.trigger": "expected_gap(0.05) | silence(1)",
+        "vehicle.report": "deviation(0.05) | silence(1)",
+        "link.timeout_s": 1.5,
+        "network.uplink.loss": 0.1,
+        "network.downlink.loss": 0.1,
+    }
+    cut = {f"network.{direction}.loss": 1.0 for direction in ("uplink", "downlink")}
+    flown = fly(skytether.load("demo", duration=50.0, **keys), changes=[(cut_s, cut)])
+    noticed_s = [
+        time_ns / SECOND_NS - cut_s
+        for time_ns, _, event in flown.events
+        if isinstance(event, ModeChanged) and event.reason == str(Reason.LOST)
+    ]
+    assert 1.4 < noticed_s[-1] < 2.1

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from skytether.lab.benchmarks.browser import (
+from chromium import (
     CHROMIUM,
     chromium,
     cut,

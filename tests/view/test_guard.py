@@ -1,6 +1,9 @@
 """The page's websocket with real clients: who may open it, and what may be sent by it."""
 
+import base64
+import os
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from types import SimpleNamespace
@@ -8,21 +11,13 @@ from typing import Any
 
 import msgspec
 import pytest
+import viser
+import zstandard
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from helpers import until
-from skytether.lab.benchmarks.hostile import (
-    BINARY,
-    CAMERA,
-    PING,
-    PROTOCOL,
-    element,
-    frame,
-    opened,
-    uploaded,
-)
-from skytether.lab.benchmarks.page import messages
 from skytether.shared.scenario import reading
 from skytether.sim import flight as virtual
 from skytether.view.browser import guard
@@ -32,6 +27,93 @@ from skytether.view.browser.page import Page
 from skytether.view.frames import of_flight
 
 PATIENCE_S = 30.0
+PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
+BINARY, PING = 2, 9
+"""Opcodes of websocket frames."""
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, 5.0],
+    "fov": 0.7,
+    "near": 0.1,
+    "far": 100.0,
+    "image_height": 900,
+    "image_width": 1400,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+"""First message of a viser browser; without it the server creates no panel."""
+
+
+def messages(payload: bytes) -> list[dict[str, Any]]:
+    """Messages that viser sends a browser at once."""
+    size = int.from_bytes(payload[8:16], "little")
+    inner = msgspec.msgpack.decode(zstandard.decompress(payload[16 : 16 + size]))
+    return [each[1] if isinstance(each, list) else each for each in inner["messages"]]
+
+
+def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
+    """Websocket frame of a browser; its mask is zeros."""
+    size = len(payload)
+    if size < 126:
+        length = bytes([0x80 | size])
+    elif size < 1 << 16:
+        length = bytes([0x80 | 126]) + struct.pack(">H", size)
+    else:
+        length = bytes([0x80 | 127]) + struct.pack(">Q", size)
+    return bytes([opcode | (0x80 if last else 0)]) + length + bytes(4) + payload
+
+
+def opened(port: int) -> socket.socket:
+    """Open the page's websocket on a raw socket with a small receive buffer.
+
+    Raises:
+        OSError: the connection is refused.
+    """
+    sock = socket.socket()
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        sock.settimeout(5.0)
+        sock.connect(("127.0.0.1", port))
+        lines = [
+            "GET / HTTP/1.1",
+            f"Host: 127.0.0.1:{port}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}",
+            "Sec-WebSocket-Version: 13",
+            f"Sec-WebSocket-Protocol: {PROTOCOL}",
+        ]
+        sock.sendall("\r\n".join([*lines, "", ""]).encode())
+        if b" 101 " not in sock.recv(64):
+            raise ConnectionRefusedError
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def element(browser: ClientConnection) -> str:
+    """Id of an element of the page that the browser could change.
+
+    Raises:
+        ConnectionClosed: the browser is refused.
+    """
+    while True:
+        payload = browser.recv()
+        assert isinstance(payload, bytes)
+        for told in messages(payload):
+            if told["type"] == "GuiDropdownMessage":
+                return str(told["uuid"])
+
+
+def uploaded(uuid: str, number: int) -> tuple[bytes, bytes]:
+    """Messages that begin an upload to an element, and send a part of it."""
+    ids = {"source_component_uuid": uuid, "transfer_uuid": str(number)}
+    named = {"filename": "x", "mime_type": "x", "part_count": 1 << 30, "size_bytes": 1 << 60}
+    begin = {"type": "FileTransferStartUpload", **ids, **named}
+    part = {"type": "FileTransferPart", **ids, "part_index": 0, "content": bytes(60_000)}
+    return msgspec.msgpack.encode(begin), msgspec.msgpack.encode(part)
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 import hostile_recordings
+from fuzz.recordings import records, written
 from skytether.cli import page_process, recorder
 from skytether.cli.export import export
 from skytether.cli.fly import fly
@@ -38,7 +39,6 @@ from skytether.cli.recorder import Live
 from skytether.cli.recover import recover as recover_command
 from skytether.cli.report import report
 from skytether.figures.tables import to_csv
-from skytether.lab.fuzz.recordings import records, written
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.core.aboard import AutopilotText
 from skytether.shared.scenario import reading

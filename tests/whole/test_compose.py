@@ -58,7 +58,7 @@ def test_each_image_of_ours_is_a_stage_with_a_lock_file() -> None:
     """The Dockerfile builds what is named, of what is pinned."""
     targets = {each["build"]["target"] for each in SERVICES.values() if "build" in each}
     assert targets == set(re.findall(r"^FROM bare AS (\w+)$", DOCKERFILE, re.MULTILINE))
-    for lock in re.findall(r"^COPY (requirements-\w+\.lock)", DOCKERFILE, re.MULTILINE):
+    for lock in re.findall(r"^COPY (locks/\w+\.lock)", DOCKERFILE, re.MULTILINE):
         assert (ROOT / lock).exists()
 
 

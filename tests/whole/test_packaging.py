@@ -17,7 +17,7 @@ from skytether.shared.scenario import reading
 ROOT = Path(__file__).parents[2]
 OLD_NAMES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "view", "scenarios")
 """Names that were ours before there was one package, and that anybody may have."""
-LOCKS = sorted(ROOT.glob("requirements*.lock"))
+LOCKS = sorted((ROOT / "locks").glob("*.lock"))
 SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
 

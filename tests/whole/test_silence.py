@@ -11,20 +11,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGE = ROOT / "skytether"
 CORES = (
     *("shared", "quadrotor", "mavlink", "server", "client", "netem", "autopilot"),
     *("sim", "figures", "view", "lab"),
 )
-DRIVERS = ("lab/benchmarks", "lab/commands", "lab/fuzz", "view/browser")
+DRIVERS = ("lab/commands", "view/browser")
 """Rooms within a core that drive processes, and are none themselves."""
 
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the package, in which links are folders, and of the contracts."""
+    """A copy of the packages, in which links are folders, and of the contracts."""
     ignore = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(PACKAGE, tmp_path / "skytether", ignore=ignore)
+    for package in ("skytether", "bench", "fuzz"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=ignore)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path / "skytether"
 

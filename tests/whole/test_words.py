@@ -11,13 +11,13 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FILES = [
     file.relative_to(ROOT).as_posix()
-    for folder in ("skytether", "server", "client", "netem", "shared", "tests")
+    for folder in ("skytether", "server", "client", "netem", "shared", "bench", "fuzz", "tests")
     for file in sorted((ROOT / folder).rglob("*.py"))
 ]
 NOUN_FIRST = [
     name
     for name in FILES
-    if name.startswith("skytether/")
+    if name.startswith(("skytether/", "bench/", "fuzz/"))
     and name.split("/")[1] not in {"server", "client", "netem", "shared"}
 ]
 """Files whose docstrings begin with the noun that they describe, or with a verb."""

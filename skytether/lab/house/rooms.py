@@ -32,7 +32,7 @@ class Room(NamedTuple):
 
 ROOMS: Mapping[str, Room] = {
     "library": Room(380, 40, "import skytether"),
-    "lab": Room(380, 120, "studies, benchmarks"),
+    "lab": Room(380, 120, "studies"),
     "cli": Room(380, 200, "commands that fly"),
     "view": Room(95, 280, "page, recordings"),
     "sim": Room(610, 280, "virtual time"),

@@ -1,0 +1,135 @@
+"""Every benchmark, one after the other; the figures go into results.json and docs/.
+
+With --only, the figures of the other benchmarks are kept.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import tyro
+
+from bench import (
+    accuracy,
+    flood,
+    growth,
+    link,
+    motions,
+    netem,
+    restarts,
+    sockets,
+    solvers,
+    starting,
+    tick,
+    wire,
+)
+from bench.harness import CONSOLE, TextTable, machine, refresh
+from skytether.shared.base import files
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).with_name("results.json")
+DOCUMENT = ROOT / "docs" / "performance.md"
+Section = Literal[
+    "netem",
+    "solvers",
+    "tick",
+    "growth",
+    "motions",
+    "wire",
+    "sockets",
+    "accuracy",
+    "link",
+    "flood",
+    "restarts",
+    "starting",
+]
+SECTIONS: dict[Section, ModuleType] = {
+    "netem": netem,
+    "solvers": solvers,
+    "tick": tick,
+    "growth": growth,
+    "motions": motions,
+    "wire": wire,
+    "sockets": sockets,
+    "accuracy": accuracy,
+    "link": link,
+    "flood": flood,
+    "restarts": restarts,
+    "starting": starting,
+}
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """Options of a run."""
+
+    only: tuple[Section, ...] = tuple(SECTIONS)
+    """Benchmarks to run."""
+    quick: bool = False
+    """Measure all of them in two minutes, and write nothing."""
+
+
+def main() -> int:
+    """Run as the command line says, and return the exit code."""
+    options = tyro.cli(BenchmarkOptions, description=__doc__)
+    for name in options.only:
+        section = SECTIONS[name]
+        CONSOLE.rule(name)
+        figures = section.measure(section.QUICK if options.quick else section.FULL)
+        for title, table in section.tables(figures).items():
+            table.show(title)
+        if not options.quick:
+            write({name: {"machine": machine(), **figures}})
+    return 0
+
+
+def write(
+    results: Mapping[str, Any],
+    file: Path = RESULTS,
+    document: Path = DOCUMENT,
+    folder: Path = DOCUMENT.parent,
+) -> None:
+    """Merge new figures with those of other sections, and write all into the document.
+
+    Args:
+        results: measured figures, by section.
+        file: file of the figures.
+        document: document with the tables.
+        folder: folder for pictures.
+    """
+    if "tick" in results:
+        tick.draw(results["tick"], folder / tick.FIGURE.name)
+    known = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
+    merged: dict[Section, Any] = {name: known[name] for name in SECTIONS if name in known}
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in merged.items())
+    files.write(file, f"{{{lines}}}\n".encode())
+    tables = {"machine": machines(merged), "packages": packages(merged)}
+    for name, figures in merged.items():
+        tables |= SECTIONS[name].tables(figures)
+    files.write(document, refresh(document.read_text(), tables).encode())
+
+
+def machines(results: Mapping[Section, Any]) -> TextTable:
+    """Machine that each section was measured on, and how late it woke a sleeping process."""
+    rows = []
+    for name, figures in results.items():
+        on, wake = figures["machine"], figures.get("wake")
+        late = [f"{wake[share]:.2f}" for share in wake] if wake else ["", "", ""]
+        where = f"{on['cores']} x {on['cpu']}, Python {on['python']}"
+        rows.append([name, where, on["commit"] or "", on["date"], *late])
+    headings = ["measured", "on", "commit", "date", "wakes late, p50 [ms]", "p99", "max"]
+    return TextTable(headings, rows)
+
+
+def packages(results: Mapping[Section, Any]) -> TextTable:
+    """Versions of the solvers' packages; empty where no solvers were measured."""
+    versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
+    return TextTable(["package", "version"], [list(pair) for pair in versions.items()])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,345 @@
+"""Flights of an autopilot over a bad network, by Skytether and by set-points alone.
+
+`python -m bench.autopilots` flies a figure eight over the paper's network with
+both of the scripted autopilot's flavours, in calm air and in wind, in virtual time: Skytether with
+`vehicle.kind = "mavlink"`, and set-points sent straight by each of the laws of `station.laws`. All
+meet the networks and winds of the same seeds, counted from each one's start. Each flight is
+repeated with the network cut for a while. With --write, the tables go into docs/straight.md.
+"""
+
+import io
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import msgspec
+import numpy as np
+import tyro
+
+from bench.harness import TextTable, progress, refresh
+from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.flavours import FlavourName
+from skytether.shared.base import files
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Flying
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, Rows, parse
+from skytether.shared.telemetry.summary import Summary, position_error, summarise
+from skytether.shared.wire.protocol import Mode
+from skytether.shell import command
+from skytether.sim import flight, straight
+from skytether.station import laws
+from skytether.station.joined import state_at, summary_of, within
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "straight.md"
+Air = Literal["calm", "wind"]
+INPUTS: dict[str, Any] = {
+    "scheme": "committed",
+    "trigger": "cost_gap | silence(1)",
+    "observer_s": 4.0,
+    "terminal_weight": [50.0, 20.0],
+    "input_reference": True,
+}
+"""Keys of `control` with which plans of inputs are sent."""
+OURS: dict[str, dict[str, dict[str, Any]]] = {
+    "skytether": {},
+    "skytether, inputs": {
+        "control": INPUTS,
+        "vehicle": {"report": "always"},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 1.0},
+    },
+    "skytether, patient": {
+        "control": INPUTS | {"dt": 0.1},
+        "vehicle": {"report": "always"},
+        "link": {"heartbeat_s": 0.1, "timeout_s": 8.0, "age_max_s": 12.0},
+    },
+}
+"""Contenders that are Skytether, with the keys that differ from the scenario, which sends the
+desired trajectory. The others send inputs. The patient one flies its plan to the end, 8 s, however
+long the server is silent; the first two brake after two seconds and after one."""
+CALM: Air = "calm"
+WIND: Air = "wind"
+LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
+"""Leads [s] of `targets` and `led`, fitted by hand in calm air: for ArduCopter to a real one, for
+PX4 to the simulated one."""
+MODELS: dict[FlavourName, dict[str, Any]] = {
+    "ardupilot": {},
+    "px4": {
+        "gain": [0.77, 0.77, 0.94],
+        "tau_s": [0.47, 0.47, 0.23],
+        "dead_time_s": [0.13, 0.13, 0.04],
+    },
+}
+"""Keys of the model as measured by steps of 1 m/s, where they differ from the scenario: nothing of
+Skytether is tuned to these flights."""
+SAFE: dict[FlavourName, dict[str, float]] = {
+    "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
+    "px4": {"COM_OBL_RC_ACT": 4},
+}
+"""Parameters without which Skytether refuses to fly."""
+ACTUAL: dict[tuple[str, Air], float] = {
+    ("velocity", CALM): 1.28,
+    ("targets", CALM): 0.64,
+    ("targets, led", CALM): 0.245,
+    ("led, gain 0.3", CALM): 0.075,
+    ("led, gain 0.5", CALM): 0.055,
+    ("targets, led", WIND): 0.262,
+    ("led, gain 0.3", WIND): 0.069,
+}
+"""RMSE xy of ArduCopter 4.5.6 in its own simulator, over the same netem [m]."""
+BLOWS = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
+"""Keys of the vehicle in wind: 6 m/s, turbulent."""
+CUT_S, HEALED_S, WATCHED_S = 15.0, 20.0, 32.0
+"""Times of flight at which the network is cut and restored, and until which the largest error is
+sought [s]."""
+
+
+class Cell(NamedTuple):
+    """Combination that is flown with one seed."""
+
+    contender: str
+    flavour: FlavourName
+    air: Air
+    seed: int
+
+
+class FlownCell(msgspec.Struct, frozen=True, kw_only=True):
+    """Flight of a contender, and its repetition with the network cut for a while."""
+
+    contender: str
+    flavour: FlavourName
+    air: Air
+    seed: int
+    whole: Summary
+    """Figures with an intact network; packets are counted from the first step to the last."""
+    cut: Summary
+    """Figures of the flight with the cut."""
+    largest_m: float
+    """Largest error in the flight with the cut, from the cut until well after its end [m]."""
+
+
+def contenders(flavour: FlavourName) -> dict[str, laws.Law | None]:
+    """Laws of the contenders by name; None for Skytether."""
+    targets_s, led_s = LEADS[flavour]
+    return {
+        "velocity": laws.make("velocity"),
+        "targets": laws.make("targets"),
+        "targets, led": laws.make("targets", targets_s),
+        "led, gain 0.3": laws.make("led", led_s, 0.3),
+        "led, gain 0.5": laws.make("led", led_s, 0.5),
+        **dict.fromkeys(OURS),
+    }
+
+
+def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
+    """Scenario of a cell: the same for all contenders, except for keys that only Skytether uses.
+
+    Args:
+        model: keys of the model that Skytether uses; those of `MODELS` unless given.
+    """
+    table = reading.to_table(reading.load("autopilot"))
+    table["seed"] = cell.seed
+    table["model"] |= MODELS[cell.flavour] if model is None else model
+    table["vehicle"] |= {"address": "udpout:autopilot:0", **(BLOWS if cell.air == WIND else {})}
+    for name, keys in OURS.get(cell.contender, {}).items():
+        table[name] |= keys
+    return reading.check(table, "autopilot")
+
+
+def began_ns(flown: Record) -> int:
+    """Time of the world at which the first step began [ns]."""
+    return next(each.time_ns for each in flown.events if isinstance(each.event, Flying))
+
+
+Changes = Sequence[tuple[float, Mapping[str, Any]]]
+
+
+def fly(
+    scenario: Scenario, law: laws.Law | None, flavour: FlavourName, changes: Changes = ()
+) -> Record:
+    """Fly a contender; the record has true states, and packets from the first step to the last."""
+    if law is not None:
+        return straight.fly(scenario, law, flavour, changes=changes)
+    sink = io.BytesIO()
+    autopilot = Autopilot(
+        scenario, flavour, ready_s=straight.READY_S, recorder=Recorder(TRUTH_COLUMNS, sink)
+    )
+    for name, value in SAFE[flavour].items():
+        autopilot.flight.set(name, value)
+    flown = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
+    return as_it_was(scenario, flown, parse(sink.getvalue()))
+
+
+def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
+    """Record of Skytether's flight with true states, and packets from the first step to the last.
+
+    Args:
+        scenario: scenario that was flown.
+        flown: record of the flight, with states as the client knew them.
+        truth: rows of `record.TRUTH_COLUMNS`, on the clock of the record's events.
+    """
+    times_ns = began_ns(flown) + flown.client["step"] * scenario.dt_ns
+    client = flown.client.copy()
+    client["state"] = state_at(truth, times_ns)[:, : scenario.model.axes]
+    netem = within(flown.netem, times_ns, scenario.dt_ns)
+    return replace(flown, client=client, netem=netem)
+
+
+def fly_cell(cell: Cell) -> FlownCell:
+    """Fly a cell twice: the second time with a cut."""
+    scenario = scenario_of(cell)
+    law = contenders(cell.flavour)[cell.contender]
+    whole = fly(scenario, law, cell.flavour)
+    began_s = began_ns(whole) / SECOND_NS
+    both = ("uplink", "downlink")
+    changes = [
+        (began_s + CUT_S, {f"network.{way}.loss": 1.0 for way in both}),
+        (began_s + HEALED_S, {f"network.{way}.loss": scenario.network.uplink.loss for way in both}),
+    ]
+    cut = fly(scenario, law, cell.flavour, changes)
+    return judged(cell, scenario, whole, cut)
+
+
+def judged(
+    cell: Cell, scenario: Scenario, whole: Record, cut: Record, *, secure: bool = False
+) -> FlownCell:
+    """Figures of both flights of a cell: with an intact network, and cut for a while."""
+    times_s = cut.client["step"] * scenario.control.dt
+    watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
+    errors = np.linalg.norm(position_error(scenario, cut.client)[watched], axis=1)
+    whole_summary, cut_summary = (
+        summarise(scenario, "autopilot", flown.client, flown.server, flown.netem, secure=secure)
+        if cell.contender in OURS
+        else summary_of(scenario, "autopilot", flown)
+        for flown in (whole, cut)
+    )
+    return FlownCell(
+        **cell._asdict(), whole=whole_summary, cut=cut_summary, largest_m=float(errors.max())
+    )
+
+
+HEADINGS = [
+    "set-points",
+    "RMSE xy [m]",
+    "least to most",
+    "largest error [m]",
+    "packets up /s",
+    "down /s",
+    "bytes up /s",
+    "down /s",
+    f"largest error in a cut of {HEALED_S - CUT_S:g} s [m]",
+    "flies on after it",
+]
+
+
+def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
+    """Tables by name: one for each flavour and air, and one of measurements elsewhere."""
+    made = {}
+    for flavour, air in product(get_args(FlavourName), get_args(Air)):
+        of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
+        names = dict.fromkeys(each.contender for each in of_case)
+        if of_case:
+            rows = [row(name, [e for e in of_case if e.contender == name]) for name in names]
+            made[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
+    if near := _near(flights):
+        made["actual"] = TextTable(["RMSE xy [m]", "actual", "simulated", "least to most"], near)
+    return made
+
+
+def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
+    """Rows of ArduCopter's figures, with those of the simulated one."""
+    rows = []
+    for (name, air), actual_m in ACTUAL.items():
+        case = name, "ardupilot", air
+        of_case = [each for each in flights if (each.contender, each.flavour, each.air) == case]
+        if of_case:
+            rows.append([f"{name}, {air}", f"{actual_m:g}", *row(name, of_case)[1:3]])
+    return rows
+
+
+def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
+    """Row of a contender: means over its flights; for errors also the largest."""
+    errors = [each.whole.rmse_xy or np.nan for each in flights]
+
+    def a_second(key: str) -> float:
+        return float(
+            np.mean([getattr(each.whole, key) / each.whole.duration_s for each in flights])
+        )
+
+    flying = {str(Mode.TRACK), str(Mode.COAST)}
+    on = sum(each.cut.mode in flying for each in flights)
+    return [
+        name,
+        f"{np.mean(errors):.3f}",
+        f"{min(errors):.3f} to {max(errors):.3f}",
+        f"{max(each.whole.error_max or np.nan for each in flights):.2f}",
+        f"{a_second('uplink_packets'):.1f}",
+        f"{a_second('downlink_packets'):.1f}",
+        f"{a_second('uplink_bytes'):.0f}",
+        f"{a_second('downlink_bytes'):.0f}",
+        f"{max(each.largest_m for each in flights):.2f}",
+        f"{on} of {len(flights)}",
+    ]
+
+
+@dataclass(frozen=True)
+class AutopilotBenchmarkOptions:
+    """Options of this benchmark."""
+
+    seeds: int = 5
+    """Number of seeds, from 1 on."""
+    only: tuple[str, ...] = ()
+    """Contenders to fly; all unless given."""
+    flavours: tuple[FlavourName, ...] = get_args(FlavourName)
+    """Flavours of the autopilot."""
+    airs: tuple[Air, ...] = get_args(Air)
+    """Air: calm, or wind of 6 m/s."""
+    jobs: int = 1
+    """Number of flights at once."""
+    json: Path | None = None
+    """File for the figures of every flight; flights already in the file are not repeated."""
+    write: bool = False
+    """Put the tables into docs/straight.md."""
+
+
+def main() -> int:
+    """Fly as the command line says, and return the exit code."""
+    options = tyro.cli(AutopilotBenchmarkOptions, description=__doc__)
+    seeds = range(1, options.seeds + 1)
+    flights = kept(options.json)
+    done = {(each.contender, each.flavour, each.air, each.seed) for each in flights}
+    cells = [
+        Cell(name, flavour, air, seed)
+        for flavour, air in product(options.flavours, options.airs)
+        for name in contenders(flavour)
+        for seed in seeds
+        if (not options.only or name in options.only) and (name, flavour, air, seed) not in done
+    ]
+    with ProcessPoolExecutor(options.jobs) as pool:
+        flying = [pool.submit(fly_cell, cell) for cell in cells]
+        for each in progress(flying, "flying"):
+            flights.append(each.result())
+            if options.json:
+                command.write(options.json, msgspec.json.encode(flights))
+    made = tables(flights)
+    for title, table in made.items():
+        table.show(title)
+    if options.write:
+        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
+    return 0
+
+
+def kept(file: Path | None) -> list[FlownCell]:
+    """Flights that a file has already."""
+    if file is None or not file.exists():
+        return []
+    return msgspec.json.decode(file.read_bytes(), type=list[FlownCell])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

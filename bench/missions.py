@@ -1,0 +1,758 @@
+"""Vehicles that keep apart: how near they come to each other and to zones, and when all arrive.
+
+    python -m bench.missions random --flights 1000
+    python -m bench.missions swap
+    python -m bench.missions published
+
+`random`: each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and triangles in
+their way, and a network with losses up to one half, bursts up to two seconds and delays up to half
+a second. Each vehicle has a way to its goal. With --harsh every link is also cut again and again,
+often for so long that the server takes the vehicle for gone, and in half of the missions the server
+dies, and begins anew without memory. With --space they fly at any height, some zones end below or
+begin above them, and whoever hears nothing for 40 s lands. Every fault is printed with its seed:
+`--first 17 --flights 1` flies that mission again.
+
+`swap`: vehicles swap places on a circle or a sphere, over several networks; in one of them the
+server dies three times a flight, for 0.5 to 20 s.
+
+`published`: tasks of published planners, as the authors' own code has them: places, distances,
+bounds, noise. Skytether plans motions as far apart as they do, for vehicles of the paper's time
+constant, over a network that is near (20 ms, no loss) and over the paper's with 30 % lost.
+
+- Luis, Vukosavljev and Schoellig (RA-L, 2020), github.com/carlosluis/online_dmpc: `config.json`
+  (four cross), `sim_params.m` and `comp_dmpc_bvc.m` (random places), `run_algorithm.m` (a crash).
+- Gräfe et al. (DMPC-Swarm, 2025), github.com/Data-Science-in-Mechanical-Engineering/DMPC-Swarm:
+  `setpoint_creator.py` (a circle of 1.5 m), `batch_simulation.yaml` (fifteen random places).
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
+
+import msgspec
+import numpy as np
+import tyro
+
+from bench.harness import TextTable
+from skytether.lab.commands.pool import Flags, crew, writing
+from skytether.lab.journal import Journal
+from skytether.server.control.routes import Routes
+from skytether.server.control.scheme import Foresight
+from skytether.server.control.together import Together
+from skytether.server.endpoint import Server
+from skytether.shared.base import files
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Event
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.motion import MARGIN_M
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.summary import least_separation
+from skytether.shared.wire.protocol import Mode
+from skytether.shell import command, temporary
+from skytether.sim import flight
+
+F = TypeVar("F")
+C = TypeVar("C")
+
+GOAL_AT_S = 2.0
+"""Time from which on the goals of random and published missions hold [s]."""
+ARRIVED_M, PUBLISHED_ARRIVED_M = 0.3, 0.1
+"""Distance from its goal at which a vehicle has arrived; of `comp_dmpc_bvc.m` [m]."""
+ROOM_M2 = 12.0
+"""Area for each vehicle and zone of a random mission [m²]."""
+UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
+"""Ranges of the mean times between two cuts of a link, and for which it is cut [s]."""
+HIGH_M = 6.0
+"""Greatest height of a goal in space [m]; the least is a sixth of it."""
+MORTAL_SHARE = 0.5
+"""Share of the harsh missions in which the server dies."""
+DEATHS, DOWN_S = 3, (0.5, 20.0)
+"""Number of times that the server dies, and shortest and longest time that it is down [s]."""
+MORTAL = "10 %, a server that dies"
+"""Network with which the server dies."""
+SWAP_NETWORKS = {
+    "no loss": "paper(0.4, 0.02, 2)",
+    "10 % lost": "paper(0.4, 0.02, 2) & loss(0.1)",
+    "30 %": "paper(0.4, 0.02, 2) & loss(0.3)",
+    "50 %": "paper(0.4, 0.02, 2) & loss(0.5)",
+    "30 %, bursts of 2 s": "paper(0.4, 0.02, 2) & gilbert_elliott(0.3, 2)",
+    "10 %, all links cut for 5 s every 20 s": "paper(0.4, 0.02, 2) & loss(0.1) & outages(20, 5)",
+    MORTAL: "paper(0.4, 0.02, 2) & loss(0.1)",
+}
+"""Networks, both ways alike."""
+TOLD_S = 20.0
+"""Length of a simulation of `sim_params.m` [s]."""
+PUBLISHED_NETWORKS = {
+    "20 ms": ("constant(0.02)", 0.5),
+    "paper, 30 %": ("paper(0.4, 0.02, 2) & loss(0.3)", 1.0),
+}
+"""Network each way, and `link.join_s` [s]."""
+
+
+@dataclass(frozen=True)
+class Amount:
+    """Amount to fly."""
+
+    flights: int = 10
+    """Flights of each row."""
+    workers: int = 2
+    """Number of processes."""
+    out: Path | None = None
+    """Folder that keeps the flights: after Ctrl-C, or with more, the same command goes on."""
+    markdown: Path | None = None
+    """File for the table as Markdown."""
+
+    def settings(self) -> dict[str, Any]:
+        """Options that the result of a flight follows from."""
+        amount = Amount.__dataclass_fields__
+        return {key: value for key, value in asdict(self).items() if key not in amount}
+
+
+@dataclass(frozen=True)
+class RandomOptions(Amount):
+    """Random missions."""
+
+    flights: int = 100
+    first: int = 1
+    """Seed of the first."""
+    duration: float = 120.0
+    """Length of a flight [s]."""
+    harsh: bool = False
+    """Whether links are cut and servers die."""
+    space: bool = False
+    """Whether vehicles fly in space."""
+
+
+@dataclass(frozen=True)
+class SwapOptions(Amount):
+    """Vehicles that swap places."""
+
+    flights: int = 30
+    shape: Literal["swap", "sphere"] = "swap"
+    """Whether vehicles on a circle swap places, or on a sphere."""
+    vehicles: int = 16
+    duration: float = 120.0
+    """Length of a flight [s]."""
+
+
+@dataclass(frozen=True)
+class PublishedOptions(Amount):
+    """Tasks of published planners."""
+
+    duration: float = 90.0
+    """Length of a flight [s]."""
+
+
+class MissionFlight(NamedTuple):
+    """Result of a flight."""
+
+    seed: int
+    vehicles: int
+    network: str
+    least_m: float
+    """Smallest distance between two vehicles, heights scaled [m]."""
+    clear_m: float
+    """Smallest distance of a vehicle from a zone [m]; infinite without zones."""
+    late: int
+    """Number of vehicles that have not arrived."""
+    arrived_s: float | None
+    """Time from the goals to the last arrival for good [s]; None if a vehicle has not arrived."""
+    left: int
+    """Observations of a vehicle outside its tube."""
+    landed: int
+    """Number of vehicles that have landed."""
+    packets: float
+    """Packets a second both ways, of a vehicle."""
+    plan_ms: float
+    """Time that the server planned for a motion that it sent, on average [ms]."""
+
+
+def fly_mission(
+    scenario: Scenario,
+    vehicles: int,
+    *,
+    deaths: Sequence[tuple[float, float]] = (),
+    goal_at_s: float = GOAL_AT_S,
+    arrived_m: float = ARRIVED_M,
+) -> MissionFlight:
+    """Fly a scenario to its end, and judge it.
+
+    Args:
+        scenario: mission to fly.
+        vehicles: number of vehicles.
+        deaths: when the server dies and begins anew, see `MortalServer`.
+        goal_at_s: time from which on the goals hold, on each vehicle's clock [s]; with 0 the
+            vehicles' clocks are aligned.
+        arrived_m: distance from its goal at which a vehicle has arrived [m].
+    """
+    server = MortalServer(scenario, vehicles, deaths) if deaths else None
+    with timed() as spent:
+        record = flight.fly(scenario, vehicles=vehicles, server=server)
+    goals, dt_s, client = scenario.make_reference(), scenario.control.dt, record.client
+    assert isinstance(goals, Mission)
+    each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
+    told = record.figures["client"]["by_vehicle"]
+    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
+    least = least_separation(each, began_s, dt_s, scenario.mission.height_scale)
+    assert least is not None
+    arrived_s, clear_m, late = [], [], 0
+    for rows, began in zip(each, began_s, strict=True):
+        goal = goals.of(int(rows["vehicle"][0]))(np.array(scenario.duration))[:, 0]
+        away = np.flatnonzero(np.linalg.norm(rows["state"][:, :, 0] - goal, axis=1) > arrived_m)
+        last = int(away.max(initial=-1)) + 1
+        late += last == len(rows)
+        arrived_s.append(last * dt_s - (goal_at_s or min(began_s) - began))
+        flown = rows["state"][int(np.argmax(rows["mode"] == Mode.TRACK)) :, :, 0]
+        clear_m.append(float(scenario.zones.clearance(flown).min(initial=np.inf)))
+    packets = sum(record.figures["netem"][way]["packets"] for way in ("uplink", "downlink"))
+    counts = record.figures["server"]["counts"]
+    return MissionFlight(
+        seed=scenario.seed,
+        vehicles=len(each),
+        network=scenario.network.uplink.text,
+        least_m=least,
+        clear_m=min(clear_m),
+        late=late,
+        arrived_s=None if late else max(arrived_s),
+        left=counts.get("left_tube", 0),
+        landed=sum(bool((rows["mode"] == Mode.LAND).any()) for rows in each),
+        packets=packets / (vehicles * scenario.duration),
+        plan_ms=1e3 * sum(spent) / max(counts.get("events", 0), 1),
+    )
+
+
+@contextmanager
+def timed() -> Iterator[list[float]]:
+    """Time that servers plan meanwhile [s], one item a tick."""
+    real, spent = Together.plan, list[float]()
+
+    def plan(self: Together, rows: Indices, step: Indices, found: Foresight) -> None:
+        began = time.perf_counter()
+        real(self, rows, step, found)
+        spent.append(time.perf_counter() - began)
+
+    Together.plan = plan  # type: ignore[method-assign]
+    try:
+        yield spent
+    finally:
+        Together.plan = real  # type: ignore[method-assign]
+
+
+class MortalServer(Endpoint):
+    """A server that is not there at some times, and begins anew after each without its memory.
+
+    Args:
+        scenario: what is flown.
+        room: number of vehicles.
+        deaths: when it dies and begins anew, since it began [s], in order.
+    """
+
+    def __init__(
+        self, scenario: Scenario, room: int, deaths: Sequence[tuple[float, float]]
+    ) -> None:
+        super().__init__()
+        self._scenario, self._room = scenario, room
+        self._deaths = [(seconds_to_ns(from_s), seconds_to_ns(to_s)) for from_s, to_s in deaths]
+        self._epoch_ns: int | None = None
+        self._lives = 0
+        self._left = 0
+        """Observations outside a tube in lives that are over."""
+        self._server: Server | None = self._begin()
+
+    def _begin(self) -> Server:
+        self._lives += 1
+        entropy = stream(self._scenario.seed, "mortal", self._lives).bytes
+        return Server(self._scenario, boot_id=self._lives, entropy=entropy, room=self._room)
+
+    def _alive(self, now_ns: int) -> Server | None:
+        """The server that lives now; None while there is none."""
+        if self._epoch_ns is None:
+            self._epoch_ns = now_ns
+        while self._deaths and now_ns >= self._epoch_ns + self._deaths[0][0]:
+            if self._server:
+                self._left += self._server.figures()["counts"].get("left_tube", 0)
+            self._server = None
+            if now_ns < self._epoch_ns + self._deaths[0][1]:
+                return None
+            self._deaths.pop(0)
+            self._server = self._begin()
+        return self._server
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if server := self._alive(now_ns):
+            server.receive(datagram, now_ns=now_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        if server := self._alive(now_ns):
+            server.wake(now_ns=now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        due_ns = self._server.next_wake_ns() if self._server else None
+        if not self._deaths or self._epoch_ns is None:
+            return due_ns
+        changes_ns = self._epoch_ns + self._deaths[0][self._server is None]
+        return changes_ns if due_ns is None else min(due_ns, changes_ns)
+
+    def outbox(self) -> list[Datagram]:
+        """See `Endpoint`."""
+        return self._server.outbox() if self._server else []
+
+    def events(self) -> Sequence[Event]:
+        """See `Endpoint`."""
+        return self._server.events() if self._server else ()
+
+    def figures(self) -> dict[str, Any]:
+        """See `Endpoint`; observations outside a tube are those of all lives."""
+        told = self._server.figures() if self._server else {"counts": {}}
+        told["counts"]["left_tube"] = self._left + told["counts"].get("left_tube", 0)
+        return told
+
+
+def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
+    """Times at which a server dies and is started again, drawn from a seed [s]."""
+    rng = stream(seed, "deaths")
+    begins = rng.uniform(np.arange(DEATHS), np.arange(DEATHS) + 1.0) * duration / DEATHS
+    for_s = rng.uniform(*DOWN_S, DEATHS)
+    ends = np.minimum(begins + for_s, np.append(begins[1:], np.inf) - 1.0)
+    return [(b, e) for b, e in zip(begins.tolist(), ends.tolist(), strict=True) if e > b]
+
+
+def flights(
+    fly: Callable[[C], F],
+    cells: Sequence[C],
+    kind: type[F],
+    settings: Mapping[str, Any],
+    out: Path | None,
+    workers: int,
+) -> list[F]:
+    """Results of the flights of some cells, in order.
+
+    Args:
+        fly: flies one; called in a worker.
+        cells: what is to be flown.
+        kind: type of a result.
+        settings: all that the results follow from, but for the number of a cell.
+        out: folder in which they are kept; None: in none.
+        workers: number of processes.
+
+    Raises:
+        CommandError: interrupted, or the folder cannot be written.
+        ConfigError: the folder has the flights of other settings.
+    """
+    with temporary.folder() as folder:
+        place = out or folder / "flights"
+        with writing(place), closing(Journal(place, settings, tuple[int, kind])) as journal:  # type: ignore[valid-type]
+            done = {number for number, _ in journal.entries}
+            todo = [number for number in range(len(cells)) if number not in done]
+            with crew(Flags(workers), "flying", len(cells), "flights") as flyers:
+                flyers.advance(len(cells) - len(todo))
+
+                def keep(index: int, flown: F) -> None:
+                    journal.append((todo[index], flown))
+                    flyers.advance(1)
+
+                flyers.share(fly, [cells[number] for number in todo], keep)
+            found = dict(journal.entries)
+            return [found[number] for number in range(len(cells))]
+
+
+def mission_scenario(
+    name: str, seed: int, duration: float, goals: Array, folder: Path
+) -> dict[str, Any]:
+    """Table of a scenario with goals of its own.
+
+    Args:
+        name: scenario that it is made of.
+        seed: its seed.
+        duration: its length [s].
+        goals: starts and goals [m]; shape (2, vehicles, axes).
+        folder: folder for the file of goals.
+    """
+    rows = [
+        ",".join([str(number), str(at_s), *(f"{each:.4f}" for each in place)])
+        for number, both in enumerate(goals.swapaxes(0, 1), start=1)
+        for at_s, place in zip((0.0, GOAL_AT_S), both, strict=True)
+    ]
+    file = folder / f"mission{seed}.csv"
+    columns = ",".join(["vehicle", "t", *"xyz"[: goals.shape[2]]])
+    files.write(file, "\n".join([columns, *rows, ""]).encode())
+    table = reading.to_table(reading.load(name))
+    table |= {"seed": seed, "duration": duration, "settle": 1.0}
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    return table
+
+
+def arrivals(flown: Sequence[MissionFlight]) -> str:
+    """Median and largest time of the last arrival, of flights in which all arrived."""
+    done = [each.arrived_s for each in flown if each.arrived_s is not None]
+    return f"{np.median(done):.1f}, {max(done):.1f}" if done else "-"
+
+
+# -- random missions -------------------------------------------------------------------------
+
+
+def random_mission(options: RandomOptions, seed: int, folder: Path) -> Scenario:
+    """A random mission; its table of goals is put into a folder."""
+    rng = stream(seed, "mission")
+    vehicles = int(rng.integers(2, 33))
+    obstacles = int(rng.integers(0, 7))
+    half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
+    shapes = list(_zones(rng, obstacles, half_m))
+    apart_m = reading.load("swap").clearances.apart_m
+    kept = zones.parse(" & ".join(shapes), 2)
+    places = _places(rng, vehicles, half_m, kept, apart_m)
+    if options.space:
+        heights = stream(seed, "heights")
+        shapes = [_between(heights, each) for each in shapes]
+        high_m = heights.uniform(HIGH_M / 6.0, HIGH_M, (2, vehicles, 1))
+        places = np.concatenate([places, high_m], axis=2)
+    name = "sphere" if options.space else "swap"
+    table = mission_scenario(name, seed, options.duration, places, folder)
+    table["mission"]["zones"] = " & ".join(shapes)
+    table["link"]["connect_s"] = 60.0
+    way = _network(rng)
+    if options.harsh:
+        cuts = stream(seed, "cuts")
+        way += f" & outages({cuts.uniform(*UP_S):.1f}, {cuts.uniform(*CUT_S):.1f})"
+    table["network"] |= {"uplink": way, "downlink": way}
+    return reading.check(table, f"mission {seed}")
+
+
+def _zones(rng: np.random.Generator, count: int, half_m: float) -> Iterator[str]:
+    yield f"fence({-half_m:.2f}, {half_m:.2f}, {-half_m:.2f}, {half_m:.2f})"
+    for _ in range(count):
+        x, y = rng.uniform(-0.8 * half_m, 0.8 * half_m, 2)
+        wide, deep = rng.uniform(0.3, 2.0, 2)
+        match int(rng.integers(3)):
+            case 0:
+                yield f"box({x:.2f}, {x + wide:.2f}, {y:.2f}, {y + deep:.2f})"
+            case 1:
+                yield f"cylinder({x:.2f}, {y:.2f}, {wide / 2:.2f})"
+            case _:
+                turn = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(3) / 3
+                corners = np.stack([x + wide * np.cos(turn), y + wide * np.sin(turn)], axis=1)
+                yield f"polygon({', '.join(f'{each:.2f}' for each in corners.ravel())})"
+
+
+def _between(heights: np.random.Generator, shape: str) -> str:
+    """A box or cylinder between two heights; any other zone as it is."""
+    low_m, thick_m = heights.uniform(0.0, HIGH_M), heights.uniform(0.5, 3.0)
+    is_high = shape.startswith(("box", "cylinder"))
+    return f"{shape[:-1]}, {low_m:.2f}, {low_m + thick_m:.2f})" if is_high else shape
+
+
+def _places(
+    rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
+) -> Array:
+    """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
+    room_m = 0.75 * apart_m  # from zones: past a vehicle at its goal there is a way
+    routes, found = Routes(kept, room_m), list[Array]()
+    while len(found) < 2:
+        places = np.zeros((0, 2))
+        for _ in range(20_000):
+            place = rng.uniform(-half_m, half_m, (1, 2))
+            near = np.linalg.norm(places - place, axis=1) < 1.6 * apart_m
+            if near.any() or kept.clearance(place).min() < room_m + 0.05:
+                continue
+            if found and not routes.reaches(found[0][len(places)], place[0]):
+                continue
+            places = np.concatenate([places, place])
+            if len(places) == vehicles:
+                found.append(places)
+                break
+        else:
+            found.clear()  # too full: begin anew
+    return np.stack(found)
+
+
+def _network(rng: np.random.Generator) -> str:
+    loss = rng.uniform(0.0, 0.5)
+    late = (
+        "paper(0.4, 0.02, 2)",
+        f"constant({rng.uniform(0.0, 0.4):.3f})",
+        f"gamma(0.02, {rng.uniform(0.15, 0.5):.3f}, {rng.uniform(0.02, 0.3):.3f})",
+    )[int(rng.integers(3))]
+    lost = (
+        f"loss({loss:.3f})",
+        f"gilbert_elliott({0.6 * loss + 0.01:.3f}, {rng.uniform(0.1, 2.0):.2f})",
+    )[int(rng.integers(2))]
+    return f"{late} & {lost}"
+
+
+def fly_random(options: RandomOptions, seed: int) -> MissionFlight:
+    """Fly one; to its end, unless all have arrived by half of the time."""
+    if not options.harsh:
+        half = _fly_random(replace(options, duration=options.duration / 2.0), seed)
+        if not half.late:
+            return half
+    return _fly_random(options, seed)
+
+
+def _fly_random(options: RandomOptions, seed: int) -> MissionFlight:
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = random_mission(options, seed, Path(folder))
+        goals = scenario.make_reference()
+        assert isinstance(goals, Mission)
+        dies = options.harsh and stream(seed, "mortal").random() < MORTAL_SHARE
+        when = deaths(seed, options.duration) if dies else []
+        return fly_mission(scenario, len(goals.vehicles), deaths=when)
+
+
+def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]]:
+    """Fly all; the table, and the flights with a fault."""
+    seeds = range(options.first, options.first + options.flights)
+    work, settings = partial(fly_random, options), options.settings()
+    flown = flights(work, seeds, MissionFlight, settings, options.out, options.workers)
+    asked_m = reading.load("swap").mission.separation_m
+    rows = []
+    for low, high in ((2, 8), (9, 16), (17, 24), (25, 32)):
+        if those := [each for each in flown if low <= each.vehicles <= high]:
+            figures = (
+                len(those),
+                f"{min(each.least_m for each in those):.3f}",
+                sum(each.least_m < asked_m for each in those),
+                f"{min(each.clear_m for each in those):.3f}",
+                sum(each.clear_m < 0.0 for each in those),
+                sum(each.left for each in those),
+                sum(each.landed for each in those),
+                sum(each.late > 0 for each in those),
+                arrivals(those),
+            )
+            rows.append([f"{low} to {high}", *map(str, figures)])
+    headings = [
+        "vehicles",
+        "missions",
+        "least separation\n[m]",
+        "nearer than\nasked",
+        "least distance\nfrom a zone [m]",
+        "in a zone",
+        "out of a tube",
+        "landed",
+        "not all\narrived",
+        "last arrival\np50, max [s]",
+    ]
+    faults = [
+        each
+        for each in flown
+        if each.least_m < asked_m or each.clear_m < 0.0 or (each.late and not options.harsh)
+    ]
+    return TextTable(headings, rows), faults
+
+
+# -- vehicles that swap places --------------------------------------------------------------
+
+
+def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
+    """A flight of a cell."""
+    swap = reading.load(options.shape)
+    way = DirectionConfig(impairments=SWAP_NETWORKS[network])
+    reference = msgspec.structs.replace(
+        swap.reference, shape=f"{options.shape}({options.vehicles})"
+    )
+    return msgspec.structs.replace(
+        swap,
+        seed=seed,
+        duration=options.duration,
+        reference=reference,
+        network=NetworkConfig(uplink=way, downlink=way),
+    )
+
+
+def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
+    """Fly one."""
+    seed, network = cell
+    when = deaths(seed, options.duration) if network == MORTAL else []
+    scenario = swap_scenario(network, options, seed)
+    return fly_mission(scenario, options.vehicles, deaths=when, goal_at_s=0.0)
+
+
+def swap_table(options: SwapOptions) -> TextTable:
+    """Fly every cell."""
+    # By seeds first, so that more flights only add to the end.
+    cells = list(product(range(1, options.flights + 1), SWAP_NETWORKS))
+    work, settings = partial(fly_swap, options), options.settings()
+    done = flights(work, cells, MissionFlight, settings, options.out, options.workers)
+    asked = reading.load(options.shape).mission.separation_m
+    rows = []
+    for i, network in enumerate(SWAP_NETWORKS):
+        flown = done[i :: len(SWAP_NETWORKS)]
+        figures = (
+            f"{min(each.least_m for each in flown):.3f}",
+            f"{sum(each.least_m < asked for each in flown)} of {len(flown)}",
+            sum(not each.late for each in flown),
+            arrivals(flown),
+            f"{np.mean([each.packets for each in flown]):.2f}",
+            sum(each.left for each in flown),
+        )
+        rows.append([network, *map(str, figures)])
+    headings = [
+        "network",
+        "least separation\n[m]",
+        "flights\nnearer than asked",
+        "flights\nin which all arrived",
+        "last arrival\np50, max [s]",
+        "packets/s\na vehicle",
+        "out of a tube",
+    ]
+    return TextTable(headings, rows)
+
+
+# -- tasks of published planners -------------------------------------------------------------
+
+
+class Task(NamedTuple):
+    """A published task."""
+
+    vehicles: int
+    separation_m: float
+    """Distance below which two vehicles count as crashed [m]."""
+    tube_m: float
+    """Half of what the plans of the authors keep beyond that [m]."""
+    stretch: float
+    """Factor of the distance between vehicles that fly one above the other."""
+    low_m: tuple[float, float, float]
+    high_m: tuple[float, float, float]
+    """Corners of the box of random places [m]."""
+    circle_m: float = 0.0
+    """Radius of the circle on which vehicles swap places, in place of that [m]."""
+
+
+TASKS = {
+    "Luis 2020: four cross": Task(4, 0.2, 0.05, 2.0, (0, 0, 1), (0, 0, 1), np.sqrt(2.0)),
+    "Luis 2020: 20 in 4 m³": Task(
+        20, 0.2, 0.05, 2.0, (-0.7937, -0.7937, 0.2), (0.7937, 0.7937, 1.7874)
+    ),
+    "Luis 2020: 30 in 18 m³": Task(30, 0.2, 0.05, 2.0, (-1.5, -1.5, 0.2), (1.5, 1.5, 2.2)),
+    "DMPC-Swarm: 6 on a circle": Task(6, 0.2, 0.1, 4.0, (0, 0, 1), (0, 0, 1), 1.5),
+    "DMPC-Swarm: 15 random": Task(15, 0.2, 0.1, 4.0, (-1.9, -1.9, 0.4), (1.9, 1.9, 2.9)),
+}
+
+
+def places(task: Task, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Starts and goals of the vehicles [m]; two of shape (vehicles, 3)."""
+    if task.circle_m:
+        angle = 2.0 * np.pi * (np.arange(task.vehicles) / task.vehicles) + np.pi / 4.0
+        on = task.circle_m * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        return on + np.array(task.low_m), -on + np.array(task.low_m)
+    keep_m = task.separation_m + 2.0 * task.tube_m
+    scale = np.array([1.0, 1.0, 1.0 / task.stretch])
+    return _spread(task, rng, keep_m, scale), _spread(task, rng, keep_m, scale)
+
+
+def _spread(task: Task, rng: np.random.Generator, keep_m: float, scale: Array) -> Array:
+    """Random places of a box that are so far apart; begun anew where no more fit."""
+    while True:
+        found = np.zeros((0, 3))
+        for _ in range(20_000):
+            place = rng.uniform(task.low_m, task.high_m)
+            if (np.linalg.norm((found - place) * scale, axis=1) > keep_m + 1e-3).all():
+                found = np.append(found, place[None], axis=0)
+            if len(found) == task.vehicles:
+                return found
+
+
+def published_scenario(
+    task: Task, network: str, duration: float, seed: int, folder: Path
+) -> Scenario:
+    """A flight of a task; its table of goals is put into a folder."""
+    goals = np.stack(places(task, stream(seed, "published")))
+    table = mission_scenario("sphere", seed, duration, goals, folder)
+    table["mission"] |= {
+        "separation_m": task.separation_m,
+        "height_m": task.separation_m * task.stretch,
+        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # which Skytether plans with besides
+        "acceleration_mps2": 1.0,
+    }
+    # Places one above the other are no places to land from.
+    table["vehicle"] |= {"wind": 0.0, "land_after_s": 0.0}
+    table["sensor"] |= {"position_noise_m": 0.00228682, "velocity_noise_mps": 0.0109302}
+    way, table["link"]["join_s"] = PUBLISHED_NETWORKS[network]
+    table["network"] |= {"uplink": way, "downlink": way}
+    return reading.check(table, "published")
+
+
+def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) -> MissionFlight:
+    """Fly one."""
+    seed, (name, network) = cell
+    with tempfile.TemporaryDirectory() as folder:
+        task = TASKS[name]
+        scenario = published_scenario(task, network, options.duration, seed, Path(folder))
+        return fly_mission(scenario, task.vehicles, arrived_m=PUBLISHED_ARRIVED_M)
+
+
+def published_table(options: PublishedOptions) -> TextTable:
+    """Fly all."""
+    kinds = list(product(TASKS, PUBLISHED_NETWORKS))
+    cells = list(product(range(1, options.flights + 1), kinds))
+    work, settings = partial(fly_published, options), options.settings()
+    done = flights(work, cells, MissionFlight, settings, options.out, options.workers)
+    rows = []
+    for i, (name, network) in enumerate(kinds):
+        flown = done[i :: len(kinds)]
+        arrived = [each.arrived_s for each in flown if each.arrived_s is not None]
+        crashes = sum(each.least_m < TASKS[name].separation_m for each in flown)
+        rows.append(
+            [
+                f"{name}, {network}",
+                f"{min(each.least_m for each in flown):.3f}",
+                f"{crashes} of {len(flown)}",
+                f"{sum(each <= TOLD_S for each in arrived)}, {len(arrived)}",
+                arrivals(flown),
+                f"{np.mean([each.plan_ms for each in flown]):.2f}",
+            ]
+        )
+    headings = [
+        "task, network",
+        "least separation\n[m]",
+        "flights nearer than\na crash",
+        f"all arrived in\n{TOLD_S:g} s, {options.duration:g} s",
+        "last arrival\np50, max [s]",
+        "planning\na motion [ms]",
+    ]
+    return TextTable(headings, rows)
+
+
+Options = (
+    Annotated[RandomOptions, tyro.conf.subcommand("random")]
+    | Annotated[SwapOptions, tyro.conf.subcommand("swap")]
+    | Annotated[PublishedOptions, tyro.conf.subcommand("published")]
+)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Fly as the command line says, and print a table."""
+    options = tyro.cli(cast(Any, Options), args=argv, description=__doc__)
+    faults: list[MissionFlight] = []
+    if isinstance(options, RandomOptions):
+        table, faults = random_table(options)
+    elif isinstance(options, SwapOptions):
+        table = swap_table(options)
+    else:
+        table = published_table(options)
+    table.show(f"{options.flights} flights of {options.duration:g} s")
+    for each in faults:
+        print(
+            f"seed {each.seed}: {each.vehicles} vehicles, {each.network}: {each.least_m:.3f} m, "
+            f"zones {each.clear_m:.3f} m, {each.late} not arrived"
+        )
+    if options.markdown:
+        files.write(options.markdown, table.markdown().encode())
+
+
+if __name__ == "__main__":
+    sys.exit(command.main(main, sys.argv[1:], "missions"))

@@ -1,0 +1,376 @@
+"""Cost of keeping vehicles apart: a motion's QP beside other solvers, and the planning of a tick.
+
+    python -m bench.motions
+
+The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. All
+solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
+given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog,
+where it is installed, is given the Hessian's factor, DAQP the dense problem. HPIPM takes no part:
+it wants the problem in stages, each with its own half-planes, whose number differs in each problem.
+
+The section `motions` of `make bench` has ticks of fleets of which a share is near others: pairs
+that change places again and again, 20 m from the next pair, beside vehicles that fly to and fro
+alone. The planning of each tick (everything, from the motions that may be flown to the one that is
+sent) is compared with OSQP on one QP for each vehicle planned for in that tick, the last of its
+rounds. Both are CPU time.
+"""
+
+import itertools
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import daqp
+import msgspec
+import numpy as np
+import osqp
+import tyro
+from scipy import sparse
+
+from bench.harness import TextTable, progress
+from bench.problems import derive
+from skytether.server.control.apart import HalfPlanes
+from skytether.server.control.direct import Direct
+from skytether.server.control.dual import DualSolver
+from skytether.server.control.motionplan import MotionPlan
+from skytether.server.control.together import Together
+from skytether.shared.base import files
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim import flight
+
+ROWS = 64
+"""OSQP's problems are filled up to a multiple of this number of constraints with ones that always
+hold: it stays set up for a few sizes instead of one for every number."""
+FLEETS = (16, 64, 200)
+"""Numbers of vehicles in ticks by share."""
+SHARES = (0.0, 0.1, 0.5)
+"""Shares of vehicles near others."""
+LEG_M, APART_M = 3.0, 20.0
+"""Length of a vehicle's way to and fro in these fleets, and distance to the next vehicle [m]."""
+LEG_S = 5.0
+"""Time from one goal to the next there [s]."""
+RIVALS = 60
+"""Number of ticks that OSQP solves the problems of."""
+
+
+@dataclass(frozen=True)
+class MotionsOptions:
+    """Amount to measure."""
+
+    problems: int = 2000
+    duration: float = 30.0
+    """Length of a flight [s]."""
+
+
+@dataclass(frozen=True)
+class MotionsCounts:
+    """Fleets to measure the planning of."""
+
+    fleets: tuple[int, ...] = FLEETS
+    """Numbers of vehicles."""
+    shares: tuple[float, ...] = SHARES
+    """Shares of vehicles near others."""
+    duration: float = 30.0
+    """Length of a flight [s]."""
+
+
+FULL, QUICK = MotionsCounts(), MotionsCounts((16,), (0.5,), 12.0)
+
+
+class MotionProblem(NamedTuple):
+    """A QP, as `DualSolver` takes it."""
+
+    solver: DualSolver
+    linear: Array
+    columns: Array
+    least: Array
+    equal: int
+
+
+@contextmanager
+def kept(problems: list[MotionProblem]) -> Iterator[None]:
+    """Keep every QP that is solved, of vehicles far from all others as well."""
+    real, straight = MotionPlan.solve, Direct.motions
+
+    def solve(
+        self: MotionPlan, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
+    ) -> Any:
+        linear, columns, least = self.posed(p[-1], v[-1], goal, planes)
+        problems.append(MotionProblem(self.solver, linear, columns, least, p.shape[1]))
+        return real(self, p, v, goal, planes)
+
+    plan, direct = cast(Any, MotionPlan), cast(Any, Direct)
+    plan.solve = solve
+    # Vehicles that could fly straight are planned for one by one, with the same result.
+    direct.motions = lambda *_: []
+    try:
+        yield
+    finally:
+        plan.solve, direct.motions = real, straight
+
+
+def filled_up(problem: MotionProblem) -> tuple[Any, Array]:
+    """Constraints and their bounds, to the next multiple of ROWS."""
+    variables, count = problem.columns.shape
+    rows = -(-count // ROWS) * ROWS
+    least, columns = np.full(rows, -1.0), np.zeros((rows, variables))
+    least[:count] = problem.least
+    columns[:count] = problem.columns.T
+    dense = sparse.csc_matrix(np.ones(columns.shape))
+    dense.data = columns.T.ravel()  # every entry, so that the pattern stays the same
+    return dense, least
+
+
+class MotionOsqp:
+    """OSQP for problems with one Hessian."""
+
+    def __init__(self, hessian: Array) -> None:
+        self._hessian = sparse.csc_matrix(np.triu(hessian))
+        self._made: dict[int, Any] = {}
+
+    def solve(self, problem: MotionProblem) -> Array:
+        """The minimum, at its tolerance."""
+        dense, least = filled_up(problem)
+        rows, most = len(least), np.full(len(least), np.inf)
+        most[: problem.equal] = least[: problem.equal]
+        solver = self._made.get(rows)
+        if solver is None:
+            solver = self._made[rows] = osqp.OSQP()
+            solver.setup(
+                self._hessian,
+                -problem.linear,
+                dense,
+                least,
+                most,
+                verbose=False,
+                eps_abs=1e-4,
+                eps_rel=1e-4,
+                polishing=False,
+                max_iter=4000,
+            )
+        else:
+            solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
+        found: Array = np.asarray(solver.solve(raise_error=False).x)
+        return found
+
+
+def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
+    """Solvers by name, each of problems with this Hessian."""
+    found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": MotionOsqp(hessian).solve}
+
+    def of_daqp(problem: MotionProblem) -> Array:
+        least, free = problem.least, np.full(len(problem.least), 1e30)
+        most = np.where(np.arange(len(least)) < problem.equal, least, free)
+        kind = np.where(np.arange(len(least)) < problem.equal, 5, 0).astype(np.int32)
+        rows = np.ascontiguousarray(problem.columns.T)
+        result: Array = daqp.solve(hessian, -problem.linear, rows, most, least, kind)[0]
+        return result
+
+    found["DAQP"] = of_daqp
+    if find_spec("quadprog"):
+        import quadprog
+
+        factor = np.linalg.inv(np.linalg.cholesky(hessian).T)
+
+        def of_quadprog(problem: MotionProblem) -> Array:
+            given = factor, problem.linear, problem.columns, problem.least, problem.equal, True
+            result: Array = quadprog.solve_qp(*given)[0]
+            return result
+
+        found["quadprog"] = of_quadprog
+    return found
+
+
+def solvers(options: MotionsOptions) -> TextTable:
+    """All solvers on the QPs of a flight."""
+    problems: list[MotionProblem] = []
+    with kept(problems):
+        flight.fly(derive("swap", duration=options.duration, settle=1.0), vehicles=16)
+    step = max(1, len(problems) // options.problems)
+    problems = problems[::step][: options.problems]
+    root = problems[0].solver.root
+    hessian = np.linalg.inv(root.T @ root).astype(np.float64)
+    solve: dict[str, Callable[[MotionProblem], Any]] = {
+        "ours, dual active set": lambda problem: problem.solver.solve(*problem[1:]),
+        **rivals(hessian),
+    }
+    spent: dict[str, list[float]] = {name: [] for name in solve}
+    off: dict[str, float] = dict.fromkeys(solve, 0.0)
+    for _ in range(2):  # the first time warms up
+        for each in spent.values():
+            each.clear()
+        for problem in progress(problems, "QPs"):
+            ours = None
+            for name, solver in solve.items():
+                began = time.perf_counter_ns()
+                found = solver(problem)
+                spent[name].append((time.perf_counter_ns() - began) / 1e3)
+                ours = found if ours is None else ours
+                off[name] = max(off[name], float(np.abs(found - ours).max()))
+    p50, p99 = ({n: float(np.quantile(x, q)) for n, x in spent.items()} for q in (0.5, 0.99))
+    rows = [
+        [
+            name,
+            f"{p50[name]:.0f}, {p99[name]:.0f}",
+            f"{p50['OSQP'] / p50[name]:.1f}, {p99['OSQP'] / p99[name]:.1f}",
+            f"{off[name]:.1e}",
+        ]
+        for name in spent
+    ]
+    constraints = np.median([len(problem.least) for problem in problems])
+    title = f"solver; {len(problems)} QPs, 24 variables, {constraints:.0f} constraints (median)"
+    headings = [title, "p50, p99 [µs]", "OSQP over it", "largest difference\n[m/s²]"]
+    return TextTable(headings, rows)
+
+
+def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> Scenario:
+    """Fleet of which a share flies in pairs that change places, in each other's way."""
+    near = 2 * round(share * vehicles / 2)
+    lines = ["vehicle,t,x,y"]
+    for vehicle in range(1, vehicles + 1):
+        # Both of a pair fly along the same line, in opposite directions.
+        place = (vehicle - 1) // 2 if vehicle <= near else vehicle
+        side = 1.0 if vehicle > near or vehicle % 2 else -1.0
+        for leg in range(math.ceil(duration / LEG_S) + 1):
+            x = side * LEG_M / 2 * (-1.0) ** leg
+            lines.append(f"{vehicle},{leg * LEG_S:g},{x:g},{APART_M * place:g}")
+    file = folder / f"fleet-{vehicles}-{near}.csv"
+    files.write(file, "\n".join(lines).encode())
+    made = reading.load("swap")
+    reference = msgspec.structs.replace(made.reference, shape="mission", file=str(file))
+    return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
+
+
+@contextmanager
+def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) -> Iterator[None]:
+    """Take the time of planning at each tick [µs], or else keep the last QP of each vehicle in it.
+
+    Args:
+        plan_us: filled with the time of each tick, unless problems are kept.
+        problems: filled with those of each tick.
+    """
+    plan, toward = Together.plan, Together._toward
+    of_tick: list[MotionProblem] = []
+
+    def timed(self: Together, *given: Any) -> None:
+        began = time.thread_time_ns()
+        plan(self, *given)
+        plan_us.append((time.thread_time_ns() - began) / 1e3)
+
+    def collected(self: Together, *given: Any) -> None:
+        of_tick.clear()
+        plan(self, *given)
+        assert problems is not None
+        problems.append(list(of_tick))
+
+    def last_of(self: Together, *given: Any) -> Any:
+        before = len(of_tick)
+        found = toward(self, *given)
+        del of_tick[before:-1]
+        return found
+
+    own: Any = Together
+    if problems is None:
+        own.plan = timed
+    else:
+        own.plan, own._toward = collected, last_of
+    try:
+        with kept(of_tick) if problems is not None else nullcontext():
+            yield
+    finally:
+        own.plan, own._toward = plan, toward
+
+
+def measure(counts: MotionsCounts) -> dict[str, Any]:
+    """Planning of whole ticks beside OSQP for each vehicle in turn, by the share near others."""
+    fleets = []
+    with tempfile.TemporaryDirectory() as folder:
+        kinds = list(itertools.product(counts.fleets, counts.shares))
+        for vehicles, share in progress(kinds, "fleets"):
+            flown = shared_space(vehicles, share, counts.duration, Path(folder))
+            spent: list[float] = []
+            problems: list[list[MotionProblem]] = []
+            with watched([], None):  # loads machine code
+                flight.fly(msgspec.structs.replace(flown, duration=2 * LEG_S), vehicles=vehicles)
+            with watched(spent, None):
+                flight.fly(flown, vehicles=vehicles)
+            with watched([], problems):  # the same flight once more, to the last bit
+                flight.fly(flown, vehicles=vehicles)
+            planned = [tick for tick, each in enumerate(problems) if each]
+            beside = _beside_osqp(spent, problems, planned)
+            fleets.append({"vehicles": vehicles, "near": share, **beside})
+    return {"fleets": fleets}
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
+    """Table of planning beside OSQP."""
+    rows = []
+    for each in result["fleets"]:
+        ours, theirs = (
+            [each[whose][q] for q in ("p50", "p99")] for whose in ("ours_ms", "osqp_ms")
+        )
+        ratios = (of_osqp / own for of_osqp, own in zip(theirs, ours, strict=True))
+        rows.append(
+            [
+                f"{each['vehicles']}, {each['near']:.0%}",
+                f"{each['planned']:.1f}",
+                ", ".join(f"{ms:.2f}" for ms in ours),
+                ", ".join(f"{ms:.2f}" for ms in theirs),
+                ", ".join(f"{ratio:.1f}" for ratio in ratios),
+            ]
+        )
+    headings = [
+        "vehicles, near others",
+        "planned for in a tick",
+        "planning p50, p99 [ms]",
+        "OSQP p50, p99 [ms]",
+        "OSQP over it p50, p99",
+    ]
+    return {"motions": TextTable(headings, rows)}
+
+
+def _beside_osqp(
+    spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
+) -> dict[str, Any]:
+    """Planning of the ticks in which vehicles are planned for, and OSQP's time."""
+    root = problems[planned[0]][0].solver.root
+    rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
+    looked_at = planned[:: max(1, len(planned) // RIVALS)]
+    for each in problems[looked_at[0]]:
+        rival.solve(each)  # warms up
+    osqp_ms = []
+    for tick in looked_at:
+        began = time.thread_time_ns()
+        for each in problems[tick]:
+            rival.solve(each)
+        osqp_ms.append((time.thread_time_ns() - began) / 1e6)
+    ours_ms = [spent[tick] / 1e3 for tick in looked_at]
+    return {
+        "planned": float(np.mean([len(problems[tick]) for tick in looked_at])),
+        "ours_ms": _quantiles(ours_ms),
+        "osqp_ms": _quantiles(osqp_ms),
+    }
+
+
+def _quantiles(numbers: list[float]) -> dict[str, float]:
+    p50, p99 = np.quantile(numbers, (0.5, 0.99)).tolist()
+    return {"p50": p50, "p99": p99}
+
+
+def main() -> int:
+    """Measure the solvers as the command line says, and print a table."""
+    solvers(tyro.cli(MotionsOptions, description=__doc__)).show("one QP")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

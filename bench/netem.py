@@ -1,0 +1,321 @@
+"""Timing error of netem: 20 000 packets/s through a real netem process on 127.0.0.1.
+
+A sender numbers and timestamps its packets; the kernel timestamps them at the receiver. The delay
+that netem drew for each is in netem's record. So the error of the added delay is
+
+    (received - sent) - drawn
+
+and includes two passages through the kernel. The machine's share is measured as well: how late a
+process that only sleeps wakes, and how long netem waited for a core.
+
+The sender sends in batches, four a millisecond: no process can sleep for 50 µs.
+"""
+
+import contextlib
+import gc
+import multiprocessing
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import Counted, Listening
+from skytether.shared.telemetry.record import DOWNLINK, read
+from skytether.shell.log import LogLine
+from skytether.shell.udp import kernel_drops, open_socket
+
+HOST = "127.0.0.1"
+HEAD = struct.Struct("<qq")
+"""Header of a packet: its number and time of sending [ns]; the rest is zeros."""
+BATCH_NS = MILLISECOND_NS // 4
+SO_TIMESTAMPNS = 35
+QUIET_S = 2
+"""Silence after which no packet is under way [s]: the paper's delays are far shorter."""
+PATIENCE_S = 90.0
+"""Longest wait for an answer [s]; the longest run takes 60 s."""
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class NetemBenchmarkOptions:
+    """Options of this benchmark."""
+
+    runs: int = 5
+    """Number of runs."""
+    seconds: int = 5
+    """Duration of each run [s]."""
+    rate: int = 20_000
+    """Number of packets per second."""
+    size: int = 600
+    """UDP payload of each [B]."""
+
+    @property
+    def packets(self) -> int:
+        """Number of packets in a run."""
+        return self.rate * self.seconds
+
+
+FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1)
+
+
+@dataclass(frozen=True)
+class NetemRun:
+    """Figures of one run."""
+
+    sent: int
+    received: int
+    dropped_before: int
+    """Number of packets dropped before netem read them, because its receive buffer was full."""
+    dropped_within: int
+    """Number of packets dropped by netem, because its queue was full or the kernel refused to
+    send."""
+    dropped_after: int
+    """Number of packets dropped after netem, because the receiver's buffer was full."""
+    measured: int
+    """Number of packets whose drawn delay is known: those before the first that netem never
+    read."""
+    error_ms_p50: float
+    error_ms_p99: float
+    error_ms_max: float
+    netem_ms_p99: float
+    """Error that netem itself reports [ms]: from the due time until handed to the driver."""
+    netem_cpu: float
+    """Share of a core that netem used."""
+    netem_waited: float
+    """Share of the time that netem was ready to run, but waited for a core."""
+    wake_ms_p50: float
+    """Median lateness of a sleeping process in the same seconds [ms]."""
+    wake_ms_p99: float
+    wake_ms_max: float
+    """Largest lateness of the sleeping process [ms]."""
+
+
+def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
+    """Run a task in this process, send its result, and wait to be killed.
+
+    The end of a Python process takes a core for 20 ms, which would disturb the measurement.
+    """
+    gc.disable()
+    pipe.send(task(pipe, *args))
+    signal.pause()
+
+
+def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
+    """Number, timestamp and send packets by absolute deadlines; returns how many."""
+    sock = open_blocking()
+    sock.connect((HOST, port))
+    packet, number = bytearray(options.size), 0
+    pipe.send("ready")
+    start_ns = pipe.recv()
+    for batch_ns in range(BATCH_NS, options.seconds * SECOND_NS + 1, BATCH_NS):
+        sleep_until(start_ns + batch_ns)
+        while number < options.rate * batch_ns // SECOND_NS:
+            HEAD.pack_into(packet, 0, number, time.monotonic_ns())
+            sock.send(packet)
+            number += 1
+    return number
+
+
+def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, list[int], int]:
+    """Receive packets; returns headers, arrival times [ns], and the kernel's drops."""
+    sock = open_blocking()
+    pipe.send(sock.getsockname()[1])
+    pipe.recv()
+    # The kernel's own time-out: Python's would call poll() before every packet.
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", QUIET_S, 0))
+    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    packet, heads = bytearray(options.size), bytearray()
+    arrivals: list[int] = []
+    with contextlib.suppress(BlockingIOError):  # no packet for QUIET_S
+        while len(arrivals) < options.packets:
+            _, ((_, _, stamp),), _, _ = sock.recvmsg_into([packet], 64)
+            seconds, ns = struct.unpack("ll", stamp)
+            # The kernel's timestamps are on the wall clock.
+            wall_to_monotonic_ns = time.monotonic_ns() - time.time_ns()
+            arrivals.append(seconds * SECOND_NS + ns + wall_to_monotonic_ns)
+            heads += packet[: HEAD.size]
+    return bytes(heads), arrivals, kernel_drops(sock)
+
+
+def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
+    """Sleep until every next millisecond; returns the lateness of each wake [ns]."""
+    pipe.send("ready")
+    start_ns, late_ns = pipe.recv(), []
+    for due_ns in range(start_ns, start_ns + options.seconds * SECOND_NS, MILLISECOND_NS):
+        sleep_until(due_ns)
+        late_ns.append(time.monotonic_ns() - due_ns)
+    return late_ns
+
+
+def open_blocking() -> socket.socket:
+    """Blocking socket on a free port, with large buffers."""
+    sock = open_socket((HOST, 0))
+    sock.setblocking(True)
+    return sock
+
+
+def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
+    """One run with netem, sender, receiver and sleeper as processes, all ended with it."""
+    with ExitStack() as stack:
+        receiver = start(stack, receive, options)
+        record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
+        netem, port = start_netem(stack, answer(receiver), seed, record)
+        sender, sleeper = start(stack, send, options, port), start(stack, sleep, options)
+        answer(sender), answer(sleeper)
+
+        used_ns, start_ns = scheduled_ns(netem.pid), time.monotonic_ns() + SECOND_NS // 10
+        for pipe in (receiver, sleeper, sender):
+            pipe.send(start_ns)
+        sent = answer(sender)
+        used_ns = scheduled_ns(netem.pid) - used_ns
+        (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
+
+        netem.send_signal(signal.SIGTERM)
+        log, _ = netem.communicate(timeout=PATIENCE_S)
+        drawn_ns = drawn_delays_ns(record, sent)
+
+    numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
+    counted = msgspec.json.decode(log.splitlines()[-1], type=LogLine).event
+    assert isinstance(counted, Counted)
+    downlink = counted.figures["downlink"]
+    taken = downlink["packets"]
+    # A packet that netem never read has no row there, and shifts the numbers after it.
+    known = sent if taken == sent else first_missing(numbers)
+    error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < known]
+    return NetemRun(
+        sent=sent,
+        received=len(numbers),
+        dropped_before=sent - taken,
+        dropped_within=downlink["overflowed"] + counted.figures["send_errors"],
+        dropped_after=dropped_after,
+        measured=len(error_ns),
+        error_ms_p50=quantile_ms(error_ns, 0.5),
+        error_ms_p99=quantile_ms(error_ns, 0.99),
+        error_ms_max=quantile_ms(error_ns, 1.0),
+        netem_ms_p99=downlink["error_ms_p99"],
+        netem_cpu=used_ns[0] / SECOND_NS / options.seconds,
+        netem_waited=used_ns[1] / SECOND_NS / options.seconds,
+        wake_ms_p50=quantile_ms(late_ns, 0.5),
+        wake_ms_p99=quantile_ms(late_ns, 0.99),
+        wake_ms_max=quantile_ms(late_ns, 1.0),
+    )
+
+
+def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Connection:
+    """Run a task in a process that ends with the stack; returns the pipe to it."""
+    ours, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=work, args=(task, theirs, *args), daemon=True)
+    process.start()
+    theirs.close()
+    stack.callback(process.join)
+    stack.callback(process.kill)
+    return ours
+
+
+def start_netem(
+    stack: ExitStack, server_port: int, seed: int, record: Path
+) -> tuple[subprocess.Popen[str], int]:
+    """Run netem with the paper's delays and without loss; returns process and port."""
+    # -P: without it, a folder `netem` in the working directory would be run.
+    command = [sys.executable, "-P", "-m", "skytether.netem", "paper", f"--seed={seed}"]
+    command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
+    command += ["--network.downlink.loss=0", f"--record={record}"]
+    netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    stack.callback(netem.wait)
+    stack.callback(netem.kill)
+    assert netem.stdout is not None
+    listening = msgspec.json.decode(netem.stdout.readline(), type=LogLine).event
+    assert isinstance(listening, Listening)
+    return netem, listening.port
+
+
+def answer(pipe: Connection) -> Any:
+    """Result of a task's process, waited for."""
+    if not pipe.poll(PATIENCE_S):
+        raise TimeoutError("a process of the benchmark does not answer")
+    return pipe.recv()
+
+
+def scheduled_ns(pid: int) -> NDArray[np.int64]:
+    """CPU time of a process, and the time that it has waited for a core [ns]; shape (2,)."""
+    return np.array(Path(f"/proc/{pid}/schedstat").read_text().split()[:2], dtype=np.int64)
+
+
+def drawn_delays_ns(record: Path, count: int) -> NDArray[np.int64]:
+    """Delays that netem drew for the packets to the server, by number [ns]; shape (count,)."""
+    rows, drawn_ns = read(record), np.zeros(count, np.int64)
+    rows = rows[rows["direction"] == DOWNLINK]
+    drawn_ns[rows["number"]] = rows["delay_ns"]
+    return drawn_ns
+
+
+def first_missing(numbers: NDArray[np.int64]) -> int:
+    """Lowest number that is missing."""
+    present = np.zeros(numbers.max(initial=-1) + 2, bool)
+    present[numbers] = True
+    return int(present.argmin())
+
+
+def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
+    """Figures of all runs, and the median of each over them."""
+    seeds = range(1, options.runs + 1)
+    runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
+    return {
+        "options": asdict(options),
+        "median": {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])},
+        "runs": [asdict(run) for run in runs],
+        "wake": {
+            "p50_ms": median(run.wake_ms_p50 for run in runs),
+            "p99_ms": median(run.wake_ms_p99 for run in runs),
+            "max_ms": max(run.wake_ms_max for run in runs),
+        },
+    }
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
+    """Table with a row for every run."""
+    headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
+    headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99"]
+    rows = [
+        [
+            str(number),
+            str(run.sent),
+            str(run.received),
+            str(lost(run)),
+            f"{run.error_ms_p50:.2f}",
+            f"{run.error_ms_p99:.2f}",
+            f"{run.error_ms_max:.1f}",
+            f"{run.netem_cpu:.0%}",
+            f"{run.netem_waited:.0%}",
+            f"{run.wake_ms_p50:.2f}",
+            f"{run.wake_ms_p99:.2f}",
+        ]
+        for number, run in enumerate(runs_of(result), start=1)
+    ]
+    return {"netem": TextTable(headings, rows)}
+
+
+def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
+    """Runs in the figures of `measure`."""
+    return [NetemRun(**run) for run in result["runs"]]
+
+
+def lost(run: NetemRun) -> int:
+    """Number of packets that never arrived; netem was configured to lose none."""
+    return run.sent - run.received

@@ -1,0 +1,228 @@
+"""Starts of the commands: time until each has done what it was started for, and memory then.
+
+A command that ends is measured to its end, with the most memory that it had; a server until it
+says that it listens, and a client until its first packet arrives. *Warm* starts find bytecode and
+the machine code of kernels on disk, *cold* ones find neither, as after an installation. Starts take
+turns, and CPU time stands beside the time that passed: on a busy machine it says more.
+
+`python -m bench.starting OTHER/.venv/bin/python` measures another checkout by
+turns with this one, and writes nothing.
+"""
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from bench.children import HOST, PATIENCE_S
+from bench.harness import TextTable, median, progress
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Listening, address_text
+from skytether.shell.log import line_of
+from skytether.shell.workers import die_with_parent
+
+MB = 1_000_000
+POLL_S = 0.01
+"""Interval at which the memory of a command is read that will end [s]."""
+
+
+class Start(NamedTuple):
+    """A command to start, and what it should take."""
+
+    command: str
+    """Words of the command line."""
+    warm_s: float | None = None
+    """Target of a warm start [s]."""
+    memory_mb: float | None = None
+    """Target of its memory [MB]."""
+    cold_s: float | None = None
+    """Target of a cold start [s]."""
+
+
+STARTS = {
+    "--help": Start("--help"),
+    "scenarios": Start("scenarios"),
+    "server --help": Start("server --help"),
+    "server demo": Start("server demo", warm_s=0.5, memory_mb=120, cold_s=8),
+    "server paper": Start("server paper", warm_s=0.5, memory_mb=120, cold_s=8),
+    "client demo": Start("client demo", memory_mb=40),
+    "fly demo, 10 s": Start("fly demo --virtual --duration 10", warm_s=1),
+}
+
+
+@dataclass(frozen=True)
+class StartingCounts:
+    """Number of starts of each command."""
+
+    warm: int = 9
+    cold: int = 1
+
+
+FULL = StartingCounts()
+QUICK = StartingCounts(2, 0)
+
+
+class StartCost(NamedTuple):
+    """Time and memory of one start."""
+
+    wall_s: float
+    """Time that passed [s]."""
+    cpu_s: float
+    """CPU time of all its threads [s]."""
+    memory_bytes: float
+    """Resident memory [B]: at the end of what is measured, or the most of a command that ended."""
+
+
+def measure(counts: StartingCounts) -> dict[str, Any]:
+    """Costs of each start, medians."""
+    return {"starts": by_turns({"": sys.executable}, counts)[""]}
+
+
+def by_turns(pythons: Mapping[str, str], counts: StartingCounts) -> dict[str, dict[str, Any]]:
+    """Costs of each start in each environment, medians of warm and of cold ones.
+
+    Args:
+        pythons: Python interpreter of each environment.
+        counts: number of starts.
+    """
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    found: dict[tuple[str, str, str], list[StartCost]] = {}
+    # The first warm start leaves on disk what the others find there, and does not count.
+    turns = [("warm", turn) for turn in range(counts.warm + 1)]
+    turns += [("cold", turn + 1) for turn in range(counts.cold)]
+    for (kind, turn), name, where in progress([*product(turns, STARTS, pythons)], "starting"):
+        with tempfile.TemporaryDirectory() as folder:
+            nothing = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": folder}
+            environment = kept | (nothing if kind == "cold" else {})
+            cost = started(pythons[where], STARTS[name].command, environment)
+        if turn:
+            found.setdefault((where, name, kind), []).append(cost)
+    costs: dict[str, dict[str, Any]] = {where: {name: {} for name in STARTS} for where in pythons}
+    for (where, name, kind), each in found.items():
+        costs[where][name][kind] = StartCost(*map(median, zip(*each, strict=True)))._asdict()
+    return costs
+
+
+def started(python: str, command: str, environment: Mapping[str, str]) -> StartCost:
+    """Cost of one start.
+
+    Raises:
+        TimeoutError: the process has not done what it was started for.
+        RuntimeError: the command has failed.
+    """
+    name, *rest = command.split()
+    with ExitStack() as stack:
+        sink = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        sink.settimeout(PATIENCE_S)
+        sink.bind((HOST, 0))
+        if ends := name not in ("server", "client") or "--help" in rest:
+            more = []
+        elif name == "server":
+            more = ["--bind", f"{HOST}:0", "--log", "json"]
+        else:
+            more = ["--server", address_text(*sink.getsockname())]
+        began_ns = time.monotonic_ns()
+        process = subprocess.Popen(
+            [python, "-P", "-m", "skytether", name, *rest, *more],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            preexec_fn=die_with_parent,  # noqa: PLW1509 - one call of the kernel, which takes no lock
+        )
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        assert process.stdout is not None
+        stack.enter_context(process.stdout)
+        if ends:
+            memory_bytes = _peak_bytes(process)
+            _, status, used = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            if process.returncode:
+                raise RuntimeError(f"skytether {command}: exit code {process.returncode}")
+        elif name == "server":
+            lines = map(line_of, process.stdout)
+            if not any(line and isinstance(line.event, Listening) for line in lines):
+                raise RuntimeError(f"skytether {command}: ended before it listened")
+        else:
+            sink.recv(1)
+        wall_s = (time.monotonic_ns() - began_ns) / SECOND_NS
+        if ends:
+            return StartCost(wall_s, used.ru_utime + used.ru_stime, memory_bytes)
+        there = Path(f"/proc/{process.pid}")
+        spent_ns = sum(int(each.read_text().split()[0]) for each in there.glob("task/*/schedstat"))
+        pages = int((there / "statm").read_text().split()[1])
+        return StartCost(wall_s, spent_ns / SECOND_NS, pages * os.sysconf("SC_PAGE_SIZE"))
+
+
+def _peak_bytes(process: subprocess.Popen[bytes]) -> float:
+    """Most memory that a process has until it closes its output [B].
+
+    What the kernel tells of a process that has ended counts the memory of the one that started it,
+    which the two shared before `exec`.
+    """
+    assert process.stdout is not None
+    output, status, most_kb = process.stdout.fileno(), Path(f"/proc/{process.pid}/status"), 0
+    while True:
+        ready, _, _ = select.select([output], [], [], POLL_S)
+        told = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        most_kb = max(most_kb, int(told.get("VmHWM", "0 kB").split()[0]))
+        if ready and not os.read(output, 1 << 16):
+            return 1024.0 * most_kb
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
+    """Table of the starts, with the targets in brackets."""
+    rows = []
+    for name, costs in result["starts"].items():
+        start, warm, cold = STARTS[name], costs["warm"], costs.get("cold")
+        row = [
+            f"`skytether {start.command}`",
+            _shown(f"{warm['wall_s']:.2f}", start.warm_s),
+            f"{warm['cpu_s']:.2f}",
+            _shown(f"{warm['memory_bytes'] / MB:.0f}", start.memory_mb),
+        ]
+        if cold:
+            row += [_shown(f"{cold['wall_s']:.1f}", start.cold_s), f"{cold['cpu_s']:.1f}"]
+        rows.append(row if cold else [*row, "", ""])
+    headings = ["start", "warm [s]", "CPU [s]", "memory [MB]", "cold [s]", "CPU [s]"]
+    return {"starting": TextTable(headings, rows)}
+
+
+def _shown(figure: str, target: float | None) -> str:
+    return figure if target is None else f"{figure} (≤ {target:g})"
+
+
+@dataclass(frozen=True)
+class StartingOptions:
+    """Options of a comparison."""
+
+    pythons: tyro.conf.Positional[tuple[Path, ...]]
+    """Python interpreters of the environments to measure by turns with this one."""
+    warm: int = FULL.warm
+    """Number of warm starts of each command."""
+    cold: int = 0
+    """Number of cold starts of each command."""
+
+
+def main() -> None:
+    """Print the costs of each start in several environments."""
+    options = tyro.cli(StartingOptions, description=__doc__)
+    pythons = {str(each): str(each) for each in (*options.pythons, Path(sys.executable))}
+    for where, starts in by_turns(pythons, StartingCounts(options.warm, options.cold)).items():
+        for table in tables({"starts": starts}).values():
+            table.show(where)
+
+
+if __name__ == "__main__":
+    main()

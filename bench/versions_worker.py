@@ -1,0 +1,118 @@
+"""A checkout's half of `versions`: takes turns, one a line, and answers with figures.
+
+Each checkout runs its own, so that names may change from one to the other; the turns may not. A
+line of stdin is a JSON list of a turn's name and its arguments; the answer is a line of JSON on
+stdout. No garbage is collected during a turn.
+"""
+
+import gc
+import json
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from bench import solvers, tick
+from bench.airspace import Airspace
+from bench.harness import HOT, PACED, machine
+from bench.problems import derive
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim.flight import fly, fly_batch
+
+PLANNING = {"estimate", "trigger", "plan", "solve"}
+"""Laps of the stopwatch between a decoded observation and a horizon; a checkout may lack some."""
+
+
+def where() -> dict[str, Any]:
+    """The folder that this process imports from, and what `machine` says of it."""
+    return {"folder": str(Path(tick.__file__).parents[1]), **machine()}
+
+
+def ticks(name: str, vehicles: int, count: int, paced: bool) -> list[float]:
+    """CPU time of whole ticks per vehicle [ns]: hot without the first, or each after a pause."""
+    space, spent = _space(name, vehicles, timed=False), []
+    for number in range(count):
+        space.prepare()
+        if paced or number == 0:
+            _pause(PACED.pause_s if paced else HOT.pause_s)
+        start_ns = time.process_time_ns()
+        space.wake()
+        spent.append((time.process_time_ns() - start_ns) / vehicles)
+    return spent if paced else spent[1:]
+
+
+def planning(name: str, vehicles: int, count: int) -> list[float]:
+    """CPU time of the laps in PLANNING [ns], of ticks that each follow a pause."""
+    space, spent = _space(name, vehicles, timed=True), []
+    laps_ns = space.server.stopwatch.spent_ns
+    for _ in range(count):
+        space.prepare()
+        _pause(PACED.pause_s)
+        laps_ns.clear()
+        space.wake()
+        spent.append(float(sum(laps_ns[lap] for lap in PLANNING)))
+    return spent
+
+
+def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
+    """Vehicle-steps per second of CPU time, of one flight in virtual time, or of a batch of seeds.
+
+    Args:
+        name: the scenario, flown for so many seconds.
+        vehicles: how many in each flight; a batch has one in each.
+        seeds: how many flights; a single one is flown with the scenario's own seed.
+    """
+    scenario = derive(name, duration=seconds, settle=0.0)
+    start_ns = time.process_time_ns()
+    if seeds == 1:
+        flights = [fly(scenario, vehicles=vehicles)]
+    else:
+        flights = fly_batch(scenario, range(1, seeds + 1))
+    took_ns = time.process_time_ns() - start_ns
+    return [sum(len(flown.client) for flown in flights) * SECOND_NS / took_ns]
+
+
+@cache
+def _space(name: str, vehicles: int, *, timed: bool) -> Airspace:
+    """Vehicles that have flown long enough to have left the reference, where they start."""
+    stopwatch = Stopwatch(time.process_time_ns) if timed else None
+    space = Airspace(_scenarios()[name], vehicles, stopwatch)
+    for _ in range(tick.SETTLE):
+        space.prepare()
+        space.wake()
+    return space
+
+
+@cache
+def _scenarios() -> dict[str, Scenario]:
+    return {**solvers.flights(), **tick.mixes()}
+
+
+def _pause(pause_s: float) -> None:
+    time.sleep(pause_s)
+    time.process_time_ns()  # the first call after a pause takes long
+
+
+TURNS: dict[str, Callable[..., Any]] = {
+    turn.__name__: turn for turn in (where, ticks, planning, flight)
+}
+"""Functions that a line may ask for, by name."""
+
+
+def main() -> None:
+    """Answer line by line until stdin is closed."""
+    for line in sys.stdin:
+        name, *arguments = json.loads(line)
+        gc.collect()
+        gc.disable()
+        figures = TURNS[name](*arguments)
+        gc.enable()
+        print(json.dumps(figures), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,6 @@
+"""Fuzzing: arbitrary bytes from outside may only raise the documented error.
+
+A target (`fuzz.target`) takes bytes, and raises if a guarantee is broken; `fuzz.targets`
+lists all targets, each with its own mutations of valid inputs. `python -m fuzz` feeds
+them inputs, guided by coverage if atheris is installed.
+"""

@@ -1,0 +1,144 @@
+"""Fuzzing as a command: guided by coverage with atheris; random without it, or with --count."""
+
+import argparse
+import multiprocessing
+import os
+import resource
+import sys
+import tempfile
+import time
+from ctypes import c_longlong
+from pathlib import Path
+from random import Random
+
+from fuzz.target import functions
+from fuzz.targets import TARGETS
+
+try:
+    import atheris
+except ImportError:
+    atheris = None
+
+LOOK_EVERY = 100
+"""Number of inputs between two checks of the time."""
+GUIDED_SHARE = 0.5
+"""Share of inputs that a target mutates itself, by its knowledge of the format; atheris makes the
+rest."""
+SHM = Path("/dev/shm")
+"""Folder in memory for files that are rewritten often."""
+
+
+def memory_mb() -> float:
+    """Peak memory of this process [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> str:
+    """Feed random inputs to a target; returns the result, as a sentence.
+
+    Args:
+        name: name of the target.
+        folder: folder for its files.
+        seed: seed of the inputs.
+        count: most inputs.
+        seconds: longest time [s].
+    """
+    target, rng = TARGETS[name](folder), Random(seed)
+    begin_s, done, before_mb = time.monotonic(), 0, 0.0
+    while done < count and time.monotonic() - begin_s < seconds:
+        for _ in range(min(LOOK_EVERY, count - done)):
+            payload = target.next(rng)
+            try:
+                target(payload)
+            except BaseException:
+                print(f"{name}, seed {seed}, input {done}: {payload.hex()}", file=sys.stderr)
+                raise
+            done += 1
+        before_mb = before_mb or memory_mb()  # allocations made once are complete by now
+    took_s, grown_mb = time.monotonic() - begin_s, memory_mb() - before_mb
+    return f"{told(name, done, took_s)}, seed {seed}, no fault, {grown_mb:.1f} MB grown"
+
+
+def told(name: str, done: int, took_s: float) -> str:
+    """Number of inputs that a target had, and their rate, in words."""
+    return f"{name}: {done} inputs in {took_s:.0f} s, {done / took_s:.0f} per s"
+
+
+def guided(name: str, folder: Path, seconds: float) -> str:
+    """Let atheris search from a target's seeds, in another process; returns the result, as a
+    sentence.
+
+    Raises:
+        SystemExit: with 1, if it has found a fault.
+    """
+    done = multiprocessing.RawValue(c_longlong, 0)
+    child = multiprocessing.get_context("fork").Process(
+        target=_search, args=(name, folder, seconds, done)
+    )
+    begin_s = time.monotonic()
+    child.start()
+    child.join()
+    said = told(name, int(done.value), time.monotonic() - begin_s)
+    if child.exitcode:
+        print(f"{said}, guided, and then a fault", file=sys.stderr)
+        raise SystemExit(1)
+    return f"{said}, guided, no fault"
+
+
+def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
+    """Let atheris search; ends the process."""
+    target = TARGETS[name](folder)
+    for function in (each for space in target.code for each in functions(space)):
+        atheris.instrument_func(function)
+
+    def one(payload: bytes) -> None:
+        done.value += 1
+        target(payload)
+
+    def mutated(payload: bytes, size: int, seed: int) -> bytes:
+        rng = Random(seed)
+        if rng.random() >= GUIDED_SHARE:
+            return atheris.Mutate(payload, size)
+        return target.mutated(rng, rng.choice((payload, *target.seeds())))[:size]
+
+    corpus = folder / f"corpus of {name}"
+    corpus.mkdir()
+    for number, payload in enumerate(target.seeds()):
+        (corpus / str(number)).write_bytes(payload)
+    limits = [f"-max_total_time={seconds:.0f}", f"-max_len={target.largest}"]
+    limits += ["-mutate_depth=2", "-timeout=60"]
+    atheris.Setup(["fuzz", *limits, str(corpus)], one, custom_mutator=mutated)
+    atheris.Fuzz()
+
+
+def main() -> None:
+    """Run targets for a time, or a number of inputs."""
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=main.__doc__)
+    parser.add_argument("--target", choices=TARGETS, help="what is fuzzed; left out: all")
+    parser.add_argument(
+        "--seconds", type=float, help="how long in all, guided where atheris is there"
+    )
+    parser.add_argument("--count", type=int, help="how many random inputs of each target")
+    parser.add_argument("--jobs", type=int, default=1, help="processes, for --count")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the first process")
+    given = parser.parse_args()
+    names = [given.target] if given.target else list(TARGETS)
+    each_s = (given.seconds or (30.0 if given.count is None else float("inf"))) / len(names)
+    each = sys.maxsize if given.count is None else -(-given.count // given.jobs)
+    with tempfile.TemporaryDirectory(dir=SHM if os.access(SHM, os.W_OK) else None) as folder:
+        for name in names:
+            if given.count is None and atheris:
+                print(guided(name, Path(folder), each_s), flush=True)
+                continue
+            jobs = []
+            for seed in range(given.seed, given.seed + given.jobs):
+                own = Path(folder) / f"{name} {seed}"
+                own.mkdir()
+                jobs.append((name, own, seed, each, each_s))
+            with multiprocessing.get_context("fork").Pool(given.jobs) as pool:
+                for said in pool.starmap(attack, jobs):
+                    print(said, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,339 @@
+"""Target for recordings: carefully altered files, and everything that commands make of them.
+
+Each is read as `export`, `report` and `recover` read it: it is accepted, or `RecordingError` says
+why not; and reading takes little memory, whatever sizes the file claims.
+"""
+
+import io
+import json
+import resource
+import struct
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from typing import Any
+from zlib import crc32
+
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from fuzz.target import SCENARIO, Target, flown
+from skytether.cli import recorder
+from skytether.shared.base.errors import RecordingError
+from skytether.shared.telemetry import feed
+from skytether.shared.telemetry import summary as summaries
+from skytether.shared.telemetry.summary import summarise
+from skytether.view import container, export, recording, recovery, rows
+from skytether.view.recording import Recorded
+from skytether.view.report import page
+
+REPORTED = 500
+"""Rate at which readable recordings are also drawn, one in this number, because drawing is slow."""
+MEMORY_MAX_MB = 600
+"""Memory that reading may take above the process's earlier peak [MB]."""
+ODD: tuple[Any, ...] = (
+    *(
+        -(2**63),
+        -1,
+        0,
+        7,
+        255,
+        2**16,
+        600_000_000,
+        2**31,
+        2**40,
+        2**53,
+        2**63 - 1,
+        2**63,
+        2**64 - 1,
+    ),
+    *(2**70, -0.0, 1e-320, 1e12, 1e99, 1e308, -1e308, None, True, "", "x" * 5000, "=1+1", [], {}),
+    *([0.5] * 400, ["position_x_m=000000000000f0ff"], [[]] * 50),
+)
+"""Values that are rarely valid."""
+DEEP = 100_000
+"""Depth of nested lists."""
+COLUMNS = (
+    *(
+        "[]",
+        "{}",
+        "null",
+        '[["step","|O"]]',
+        '[["step","<i8",[1000000000]]]',
+        '[["step","<M8[s]"]]',
+        '[["step","f8,("]]',
+    ),
+    *('[["vehicle","<u2"],["step","<i8"]]', '[["state","<f8",[2,2]],["x","<f8",[900000]]]'),
+    "[" * DEEP,
+)
+"""Column descriptions that no part has."""
+
+
+def records(content: bytes) -> list[Any]:
+    """Metadata, attachments, schemas, channels and messages of a recording."""
+    kinds = Metadata | Attachment | Schema | Channel | Message
+    found: list[Any] = []
+    for each in StreamReader(io.BytesIO(content)).records:
+        if isinstance(each, kinds) and not (isinstance(each, Schema | Channel) and each in found):
+            found.append(each)
+    return found
+
+
+def written(found: list[Any]) -> bytes:
+    """Complete file of such records, with valid checksums."""
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=64 * 1024)
+    writer.start()
+    schemas, channels = {}, {}
+    for each in found:
+        match each:
+            case Metadata():
+                writer.add_metadata(each.name, each.metadata)
+            case Attachment():
+                writer.add_attachment(0, 0, each.name, each.media_type, each.data)
+            case Schema():
+                schemas[each.id] = writer.register_schema(each.name, each.encoding, each.data)
+            case Channel():
+                channels[each.id] = writer.register_channel(
+                    each.topic, each.message_encoding, schemas[each.schema_id], each.metadata
+                )
+            case Message():
+                writer.add_message(
+                    channels[each.channel_id], each.log_time, each.data, each.publish_time
+                )
+    writer.finish()
+    return file.getvalue()
+
+
+def deep(rng: Random) -> bytes:
+    """Nested lists or objects."""
+    return rng.choice([b"[" * DEEP, b'{"a":' * DEEP, b"[" * DEEP + b"]" * DEEP])
+
+
+def changed_value(rng: Random, found: list[Any]) -> None:
+    """Message with another value, without one, or deeply nested."""
+    at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Message)])
+    if rng.random() < 0.1:
+        found[at] = replace(found[at], data=deep(rng))
+        return
+    message = json.loads(found[at].data)
+    below = message
+    while isinstance(below, dict) and below:
+        key = rng.choice(list(below))
+        if isinstance(below[key], dict) and rng.random() < 0.8:
+            below = below[key]
+            continue
+        if rng.random() < 0.1:
+            del below[key]
+        else:
+            below[key] = rng.choice(ODD)
+        break
+    found[at] = replace(found[at], data=json.dumps(message).encode())
+
+
+def changed_column(rng: Random, found: list[Any]) -> None:
+    """One value in a column of every row."""
+    channels = [each for each in found if isinstance(each, Channel) and "part" in each.metadata]
+    channel, key, value = rng.choice(channels), "", rng.choice(ODD)
+    for i, each in enumerate(found):
+        if isinstance(each, Message) and each.channel_id == channel.id:
+            row = json.loads(each.data)
+            key = key or rng.choice(list(row))
+            row[key] = value
+            found[i] = replace(each, data=json.dumps(row).encode())
+
+
+def changed_channel(rng: Random, found: list[Any]) -> None:
+    """Other columns, or another kind of frame."""
+    at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Channel)])
+    about = dict(found[at].metadata)
+    key = rng.choice([*about, "columns", "part"])
+    about[key] = rng.choice([*COLUMNS, "client", "netem", "Opened", "Figures", "Rows", ""])
+    found[at] = replace(found[at], metadata=about)
+
+
+def changed_words(rng: Random, found: list[Any]) -> None:
+    """Changed metadata, scenario or summary of a recording."""
+    at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Metadata | Attachment)])
+    each = found[at]
+    if isinstance(each, Metadata):
+        key = rng.choice(list(each.metadata))
+        values = {**each.metadata, key: str(rng.choice(ODD))}
+        found[at] = replace(each, metadata=values)
+        return
+    data = each.data
+    match rng.randrange(4):
+        case 0:
+            data = b"x = " + deep(rng)
+        case 1:
+            data = b".".join([b"reference"] * DEEP) + b" = 1\n"
+        case 2:
+            data = data.replace(b"= 0.05", b"= " + str(rng.choice(ODD[:20])).encode())
+        case _:
+            lines = data.splitlines(keepends=True)
+            lines[rng.randrange(len(lines))] = b'points = "' + b"x" * 10**6 + b'"\n'
+            data = b"".join(lines)
+    found[at] = replace(each, data=data)
+
+
+def changed_times(rng: Random, found: list[Any]) -> None:
+    """Message with another time."""
+    at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Message)])
+    time_ns = rng.choice([0, 1, 2**31, 2**50, 2**62, 2**63, 2**64 - 1])
+    found[at] = replace(found[at], log_time=time_ns)
+
+
+def repeated(rng: Random, found: list[Any]) -> None:
+    """Message repeated many times."""
+    message = rng.choice([each for each in found if isinstance(each, Message)])
+    found += [message] * rng.choice([100, 2000])
+
+
+def of_columns_alone(rng: Random, found: list[Any]) -> None:
+    """Empty rows of a part with huge rows."""
+    at = rng.choice(
+        [i for i, e in enumerate(found) if isinstance(e, Channel) and "part" in e.metadata]
+    )
+    columns = json.loads(found[at].metadata["columns"])
+    columns.append(["inputs" if rng.random() < 0.5 else "more", "<f4", [2, 100_000]])
+    about = {**found[at].metadata, "columns": json.dumps(columns)}
+    found[at] = replace(found[at], metadata=about)
+    found += [Message(found[at].id, 1, b"{}", 1, 0)] * 3000
+
+
+def bomb(rng: Random, content: bytes) -> bytes:
+    """Chunk that decompresses to far more, with the scenario before it and an index after it."""
+    with_it = records(content)
+    channel = rng.choice([each for each in with_it if isinstance(each, Channel)])
+    builder = RecordBuilder()
+    Message(channel.id, 0, rng.choice([b"{}", b"[" * 200, b" " * 4000]), 0, 0).write(builder)
+    inside = builder.end()
+    inside *= rng.choice([1 << 16, 1 << 24, 40 << 20]) // len(inside)
+    data = zstandard.compress(inside, 19 if len(inside) < 1 << 20 else 3)
+    size = len(inside)
+    if rng.random() < 0.3:
+        size = rng.choice([0, 1, 2**31, 2**40, 2**63])
+    if rng.random() < 0.2:  # a zstd frame that claims more than it contains
+        data = (
+            b"\x28\xb5\x2f\xfd\xe0"
+            + struct.pack("<Q", rng.choice([2**33, 2**40, 2**62]))
+            + data[9:]
+        )
+    made = Chunk("zstd", data, 10**9, 0, rng.choice([0, crc32(inside)]), size)
+    made.write(builder)
+    record = builder.end() * rng.choice([1, 1, 30])
+    reader = make_reader(io.BytesIO(content))
+    summary = reader.get_summary()
+    assert summary is not None
+    place = summary.chunk_indexes[0].chunk_start_offset
+    if rng.random() < 0.5:  # at the position of a chunk in the index
+        return content[:place] + record + content[place + len(record) :]
+    return content[:place] + record + content[place:]
+
+
+def misled(rng: Random, content: bytes) -> bytes:
+    """Index that points to missing or repeated positions, or headers with false sizes."""
+    changed = bytearray(content)
+    start = struct.unpack_from("<Q", content, len(content) - 28)[0]
+    match rng.randrange(4):
+        case 0:
+            where = rng.choice([8, start // 2, len(content) - 37, 2**40])
+            struct.pack_into("<Q", changed, len(content) - 28, where)
+        case 1:
+            ends = changed[start:]
+            changed[start:start] = ends[: ends.find(b"\x0b")] * rng.choice([2, 500])
+        case 2:
+            for _ in range(rng.randrange(1, 6)):
+                at = rng.randrange(start, len(changed) - 36)
+                changed[at] = rng.choice([0, 1, 127, 128, 255])
+        case _:
+            summary = make_reader(io.BytesIO(content)).get_summary()
+            assert summary is not None
+            at = rng.choice(summary.chunk_indexes).chunk_start_offset
+            for _ in range(rng.randrange(1, 4)):
+                changed[at + rng.randrange(50)] = rng.choice([0, 1, 127, 128, 255])
+    return bytes(changed)
+
+
+def scattered(rng: Random, content: bytes) -> bytes:
+    """Bytes changed, or cut off."""
+    changed = bytearray(content)
+    for _ in range(rng.randrange(1, 5)):
+        changed[rng.randrange(len(changed))] = rng.randrange(256)
+    if rng.random() < 0.3:
+        del changed[rng.randrange(len(changed)) :]
+    return bytes(changed)
+
+
+INSIDE = (
+    *(changed_value, changed_value, changed_column, changed_column, changed_channel),
+    *(changed_words, changed_times, repeated, of_columns_alone),
+)
+"""Changes of records, which are written as a valid file again."""
+OUTSIDE = (bomb, misled, scattered)
+"""Changes of bytes."""
+
+
+def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
+    """Mutated recording, and the name of the mutation.
+
+    Args:
+        rng: random generator.
+        content: a recording.
+        known: its records.
+    """
+    if rng.random() < 0.6:
+        how, found = rng.choice(INSIDE), list(known)
+        how(rng, found)
+        return how.__name__, written(found)
+    outside = rng.choice(OUTSIDE)
+    return outside.__name__, outside(rng, content)
+
+
+class RecordingFile(Target):
+    """Target for a recording's file: it is refused, or all that commands make of it can be made."""
+
+    code = (container, export, feed, recording, recovery, rows, summaries)
+    largest = 256 * 1024
+
+    def __init__(self, folder: Path) -> None:
+        self._path, self._out = folder / "it.mcap", folder / "out.mcap"
+        self._before_mb = peak_mb()
+        parts = flown().client, flown().server, flown().netem
+        summary = summarise(SCENARIO, "demo", *parts)
+        assert recorder.write(self._path, SCENARIO, "demo", flown(), summary) is None
+        self._content = self._path.read_bytes()
+        self._records = records(self._content)
+
+    def seeds(self) -> Sequence[bytes]:
+        """A recording."""
+        return (self._content,)
+
+    def mutated(self, rng: Random, payload: bytes) -> bytes:
+        """Recording with changed records, written as a valid file, or with changed bytes."""
+        if payload != self._content:
+            return scattered(rng, payload or b"\0")
+        return hostile(rng, payload, self._records)[1]
+
+    def __call__(self, payload: bytes) -> None:
+        """Read the recording, and recover it."""
+        self._path.write_bytes(payload)
+        with suppress(RecordingError), Recorded(self._path) as recorded:
+            for columns in export.tables(recorded).values():
+                export.csv(columns)
+            if crc32(payload) % REPORTED == 0:
+                page(recorded, [])
+        with suppress(RecordingError):
+            recovery.recover(self._path, self._out)
+        assert peak_mb() < self._before_mb + MEMORY_MAX_MB
+
+
+def peak_mb() -> float:
+    """Peak memory of this process [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

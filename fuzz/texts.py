@@ -1,0 +1,212 @@
+"""Targets for texts: scenarios, requests for changes in flight, and output of processes."""
+
+import importlib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import msgspec
+import numpy as np
+
+from fuzz.datagrams import SCENARIOS, EndpointInFlight
+from fuzz.mutators import text_changed, words_of
+from fuzz.target import Target, flown
+from skytether.netem.proxy import Proxy
+from skytether.shared.base import toml
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core import change
+from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.core.events import Counted
+from skytether.shared.scenario import contradictions, mission, policies, reading, reference, zones
+from skytether.shared.scenario.air import traces
+from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
+from skytether.shared.wire import handshake, keys
+from skytether.shared.wire.protocol import Hello, Welcome, decode, encode
+from skytether.shell import log
+from skytether.shell.control import ANSWER_BYTES_MAX, ControlError, answer_of
+from skytether.shell.log import LogLine, line_of
+
+SAMPLES_S = np.array([-1.0, 0.0, 0.05, 7.3, 1e3, 1e5])
+"""Times at which a scenario's trajectory must be finite [s]."""
+LIVE = reading.check(
+    {
+        "reference": {"shape": "live", "points_m": [[0.0, 0.0]]},
+        "control": {"scheme": "committed", "trigger": "state_gap & budget(5, 2) | silence(1)"},
+    },
+    "fuzz",
+)
+"""Scenario in which as many keys as possible can be changed in flight."""
+POLICIES = [name.encode() for name in (*TRIGGERS, *REFERENCES)] + b"( ) & | ! ,".split()
+"""Fragments of policies."""
+
+
+class Text(Target):
+    """Target that takes text.
+
+    Args:
+        known: texts to begin with.
+        words: replacements for tokens, besides the words of these texts.
+    """
+
+    largest = 8192
+
+    def __init__(self, known: Sequence[bytes], words: Sequence[bytes] = ()) -> None:
+        self._known = known
+        self._words = [*words_of(known), *words]
+
+    def seeds(self) -> Sequence[bytes]:
+        """Valid texts."""
+        return self._known
+
+    def mutated(self, rng: Random, payload: bytes) -> bytes:
+        """Text with changed words."""
+        return text_changed(rng, payload, self._words)
+
+
+class ScenarioFile(Text):
+    """Target for a scenario file: it raises `ConfigError`, or it can be agreed upon and flown."""
+
+    code = (
+        reading,
+        contradictions,
+        policies,
+        reference,
+        toml,
+        importlib.import_module("tomllib._parser"),
+    )
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "it.toml"
+        files = [(reading.SCENARIOS / f"{name}.toml").read_bytes() for name in reading.names()]
+        whole = [reading.to_toml(reading.load(name)) for name in reading.names()]
+        made = [reading.to_toml(each) for each in (*SCENARIOS, LIVE)]
+        words = [f'"{name}"'.encode() for name in (*reading.names(), "compare/none", "it.toml")]
+        super().__init__([*files, *whole, *made], [*words, *POLICIES])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read the scenario."""
+        self._path.write_bytes(payload)
+        try:
+            scenario = reading.load(str(self._path))
+        except ConfigError:
+            return
+        again = toml.loads(reading.to_toml(scenario).decode())
+        assert reading.check(again) == scenario
+        terms, largest = scenario.terms(), 2**64 - 1
+        hello = encode(Hello(2**16 - 1, largest, terms))
+        welcome = encode(Welcome(2**16 - 1, 2**32 - 1, largest, largest, 2**63 - 1, 0, terms))
+        for message in (hello, welcome):
+            assert encode(decode(message, terms)) == message
+        assert len(hello) <= handshake.HELLO_BYTES_MAX
+        assert len(welcome) <= handshake.WELCOME_BYTES_MAX
+        assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
+
+
+class NamedFiles(Text):
+    """Target for files that a scenario names: tables, zones, traces, and keys.
+
+    The first byte of an input chooses the reader, which raises an error for the user, or gives
+    values that can be flown.
+    """
+
+    code = (reference, mission, zones, traces, keys)
+    largest = 20_000
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "it"
+        row = "64 bytes from 192.0.2.1: icmp_seq={0} ttl=57 time={0}.5 ms"
+        stamps = '{"client":{"send":{"monotonic":%d}}}'
+        trip = f'{{"lost":"false","delay":{{"rtt":2000000}},"timestamps":{stamps}}}'
+        ring = "[[[0,0],[9,0],[9,9],[0,9],[0,0]]]"
+        feature = '{{"type":"Feature","properties":{},"geometry":{{"type":"{}","coordinates":{}}}}}'
+        box = feature.format('{"kind":"fence"}', "Polygon", ring)
+        point = feature.format('{"radius_m":3}', "Point", "[4,4]")
+        texts = (
+            "t,x,y\n0,0,0\n5,1.5,-2\n",
+            "vehicle,t,x,y\n1,0,0,0\n1,5,4,4\n2,0,9,0\n",
+            f'{{"type":"FeatureCollection","units":"m","features":[{box},{point}]}}',
+            "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
+            "\n".join(map(row.format, (1, 2, 4))),
+            f'{{"round_trips":[{trip % 5},{trip % 9}]}}',
+            "0\n3\n3\n17\n",
+            keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
+        )
+        kinds = b"\0\1\2\3\3\3\4\5"
+        known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
+        super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read the file."""
+        self._path.write_bytes(payload[1:])
+        with suppress(ConfigError, PolicyError, ValueError):
+            match (payload or b"\0")[0] % 6:
+                case 0:
+                    assert np.isfinite(reference.from_csv(self._path, 2)(SAMPLES_S)).all()
+                case 1:
+                    mission.mission(self._path, 2).nearest(1.0, 1.0)
+                case 2:
+                    zones.parse(f'geojson("{self._path}")', 2).clearance(np.zeros((2, 2)))
+                case 3:
+                    found = traces._recorded.__wrapped__(str(self._path), "auto")
+                    assert np.isfinite(found.delay_s[~found.lost]).all()
+                case 4:
+                    assert np.isfinite(traces._deliveries.__wrapped__(str(self._path))).all()
+                case _:
+                    keys.parse("it", payload[1:])
+
+
+class ControlTarget(Text, EndpointInFlight):
+    """Target for control requests: each is answered, and the changed scenario can be flown."""
+
+    code = (change, reading, contradictions, policies)
+    largest = REQUEST_BYTES_MAX + 1
+
+    def __init__(self) -> None:
+        EndpointInFlight.__init__(self, LIVE)
+        tables = [reading.to_table(each) for each in (LIVE, *SCENARIOS)]
+        values = [
+            {key: change._at(table, key)}
+            for table in tables
+            for running in self._running
+            for key in sorted(running.changeable)
+        ]
+        known = [msgspec.json.encode(each) for each in ({}, *values)]
+        Text.__init__(self, known, POLICIES)
+
+    def _begin(self) -> None:
+        super()._begin()
+        ends = (self.server, self.client, Proxy(self._scenario, server=("server", 0)))
+        self._running = [Running(end, self._scenario) for end in ends]
+
+    def _attack(self, payload: bytes) -> None:
+        for running in self._running:
+            before = running.scenario
+            answer = running.answer(payload[: REQUEST_BYTES_MAX + 1], now_ns=self._now_ns)
+            assert len(answer) <= ANSWER_BYTES_MAX, payload.hex()
+            said = answer_of(answer)
+            assert bool(said.changed) == (running.scenario != before), payload.hex()
+            assert not (said.refused and said.changed), payload.hex()
+            reading.check(reading.to_table(running.scenario), known=running.scenario)
+        running._endpoint.events()  # no other sender asks netem
+
+
+class LogLines(Text):
+    """Target for lines of a process, and answers at its control socket."""
+
+    code = (log,)
+
+    def __init__(self) -> None:
+        own = {type(each.event): each.event for each in flown().events}
+        events = *own.values(), Counted(figures={"missed": 3, "dropped": {"late": 2}})
+        lines = [LogLine(process="client", time_ns=5, event=event) for event in events]
+        answers = Answer(refused="no such key"), Answer(values={"network.uplink.loss": 0.1})
+        super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
+
+    def __call__(self, payload: bytes) -> None:
+        """Read the bytes as both."""
+        line = line_of(payload)
+        assert line is None or str(line.event).splitlines(), payload.hex()
+        with suppress(ControlError):
+            answer_of(payload)

@@ -1,0 +1,161 @@
+"""The page in Chromium, and pictures of it. Chromium is found by `CHROMIUM` or PATH."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skytether.view.words import FLOWN_S
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
+"""Chromium's executable; empty if there is none."""
+FLAGS = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+"""Flags that make Chromium render in software."""
+SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
+"""Width and height of windows [pixels]."""
+PATIENCE_S = 90.0
+"""Longest time to wait for a condition [s]."""
+SHOWN_S = 25.0
+"""Time of flight at which pictures are taken [s]."""
+
+
+@contextmanager
+def chromium() -> "Iterator[Browser]":
+    """Run Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def served(*arguments: str) -> Iterator[str]:
+    """Run a command that serves a page; yields the page's address.
+
+    Raises:
+        RuntimeError: the command serves none.
+    """
+    command = [sys.executable, "-P", "-m", "skytether", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    said = []
+    try:
+        for line in process.stdout:
+            said.append(line)
+            address = next((word for word in line.split() if word.startswith("http://")), None)
+            if address:
+                yield address
+                return
+        raise RuntimeError(f"no page: {''.join(said)}")
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE_S)
+
+
+@contextmanager
+def opened(browser: "Browser", address: str, size: str = "wide") -> "Iterator[Page]":
+    """Open a page in a window of a size."""
+    width, height = SIZES[size]
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.goto(address)
+    yield page
+    page.close()
+
+
+def until(true: Callable[[], object], what: str) -> None:
+    """Wait until a condition holds.
+
+    Raises:
+        TimeoutError: the condition did not hold in time.
+    """
+    ends_s = time.monotonic() + PATIENCE_S
+    while not true():
+        if time.monotonic() > ends_s:
+            raise TimeoutError(f"not in {PATIENCE_S:g} s: {what}")
+        time.sleep(0.05)
+
+
+def status(page: "Page", place: int = 0) -> str:
+    """Status text of a flight; empty before any."""
+    words = page.locator(".skytether-status")
+    return words.nth(place).inner_text() if words.count() > place else ""
+
+
+def flown_s(page: "Page", place: int = 0) -> float:
+    """Time of flight on the page [s]; 0 before any."""
+    words = page.locator(".skytether-status")
+    return float(words.nth(place).get_attribute(FLOWN_S) or 0) if words.count() > place else 0.0
+
+
+def plotted_s(page: "Page") -> float:
+    """Newest time in the first plot [s]; 0 before any."""
+    newest = """() => {
+        const plots = Object.values((window.__viserTestpoints || {}).uplots || {});
+        return plots.length ? plots[0].chart.data[0].at(-1) : 0;
+    }"""
+    return float(page.evaluate(newest))
+
+
+def put(page: "Page", label: str, value: float | str) -> None:
+    """Type a number beside a slider, or a text into a field."""
+    nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
+    field = page.locator(nearest).last
+    field.fill(value if isinstance(value, str) else f"{value:g}")
+    # Not on the field: the page takes it away as soon as the token in it is right.
+    page.keyboard.press("Enter")
+
+
+def cut(page: "Page") -> None:
+    """Cut the link, and say that it is meant."""
+    page.get_by_role("button", name="Cut the link").click()
+    page.get_by_role("button", name="Yes, cut it").click()
+
+
+def picture(page: "Page", file: Path) -> None:
+    """Save a picture, without the browser's notice about software rendering."""
+    remark = page.locator(".mantine-Notification-closeButton")
+    for _ in range(remark.count()):
+        remark.first.click()
+    page.wait_for_timeout(1500)
+    page.screenshot(path=file)
+
+
+def _tracks(page: "Page") -> bool:
+    return "TRACK" in status(page)
+
+
+def _flown_long_enough(page: "Page") -> bool:
+    return flown_s(page) > SHOWN_S
+
+
+def pictures(browser: "Browser", address: str, folder: Path) -> None:
+    """Take pictures of a flight's page, in each size, dark and light."""
+    for size in SIZES:
+        with opened(browser, address, size) as page:
+            until(partial(_tracks, page), "it flies a plan")
+            until(partial(_flown_long_enough, page), "it has flown for a while")
+            picture(page, folder / f"flight-dark-{size}.png")
+            page.get_by_label("Light page").click()
+            page.wait_for_timeout(1000)
+            picture(page, folder / f"flight-light-{size}.png")
+            if size == "wide":
+                page.get_by_role("tab", name="Network").click()
+                page.wait_for_timeout(2000)
+                picture(page, folder / f"network-light-{size}.png")
