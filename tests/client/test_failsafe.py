@@ -5,7 +5,6 @@ A hand makes the server's messages, at a step of 20 ms each; the vehicle is the 
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -23,7 +22,6 @@ from skytether.client.endpoint import Client
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
 from skytether.client.link import PlainLink
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
-from skytether.lab.states import svg
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -53,7 +51,6 @@ from skytether.shared.wire.protocol import (
 )
 
 SERVER: Address = ("server", 0)
-DIAGRAM = Path(__file__).parents[2] / "docs/failsafe.svg"
 STEPS_PER_S = 50
 H = 100
 D = 5
@@ -761,11 +758,6 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         locked &= not (cause is Reason.GOOD and before[0] in (Mode.SYNC, Mode.HOVER))
         locked |= told[-1:] == [cause] and cause in failsafe.LOCKING
         assert not (locked and aboard.takes)
-
-
-def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
-    """`lab.states` draws the diagram of modes, and says how to draw it anew."""
-    assert DIAGRAM.read_text() == svg()
 
 
 # -- without its guards ----------------------------------------------------------------------------
