@@ -10,7 +10,6 @@ from skytether.shared.base.errors import ConfigError
 
 
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
-    """A command goes on where it ended, with more flights if asked; else nothing is kept."""
     out = tmp_path / "flights"
     assert flights(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, 1) == [2.0, 3.0]
     # Another function shows which are flown now.

@@ -76,7 +76,6 @@ def test_a_vehicle_that_brakes_in_time_is_inside() -> None:
 def test_a_vehicle_that_brakes_late_or_softly_or_never_flies_again_is_outside(
     flown: ProcessLife, figure: str
 ) -> None:
-    """The figure of each fault puts it outside."""
     found, good = verdict(flown), verdict(life())
     assert not found.is_inside
     assert getattr(found, figure) > getattr(good, figure) + 0.01

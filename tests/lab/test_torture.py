@@ -80,7 +80,6 @@ def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
 
 
 def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
-    """All of them are drawn."""
     drawn = [make_scenario(seed) for seed in range(100)]
     control = {(scenario.control.scheme, scenario.control.feedback) for scenario, _ in drawn}
     assert control == {
@@ -198,7 +197,6 @@ def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
 
 
 def test_every_kind_of_fault_is_tried() -> None:
-    """In the tests above."""
     assert {one.kind for one, _ in EFFECTS} | {Kind.STEP, Kind.SKEW} == set(RANGES)
 
 
@@ -429,7 +427,6 @@ def test_a_rule_of_trajectories_that_is_broken_is_caught(
 
 
 def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
-    """They need none."""
     counts = fly(Trial(FOLLOWS, (fault(Kind.SOLVER, "server", 5, 4),))).counts
     assert counts["steps along trajectories"] > 100
     assert not any(name.startswith("brake") for name in counts)
@@ -474,8 +471,6 @@ def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyP
 
 
 def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what it raised, and where."""
-
     def raise_(*_: Any, **__: Any) -> None:
         raise ValueError("no such thing")
 
@@ -506,7 +501,6 @@ def run(*argv: str) -> "subprocess.CompletedProcess[str]":
 
 @pytest.mark.long
 def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
-    """The outcome is printed as a table and written as JSON."""
     path = tmp_path / "counts.json"
     done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
     assert done.returncode == 0, done.stderr
@@ -530,7 +524,6 @@ def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: P
 def test_what_cannot_be_flown_is_refused(
     argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line."""
     assert main(["torture", *argv]) == 2
     assert said in capsys.readouterr().err
 
@@ -565,7 +558,6 @@ def alone(*_: Any) -> Iterator[Alone]:
 def test_a_failure_is_printed_with_its_schedule_and_flies_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """Exit code 1, a command line to fly it again, and a file of schedules does as well."""
     monkeypatch.setattr(skytether.lab.commands.torture, "crew", alone)
     no_stall(monkeypatch)
     file = tmp_path / "seeds.txt"

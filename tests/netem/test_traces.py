@@ -113,7 +113,6 @@ def test_formats_are_told_apart_by_their_content(
     ],
 )
 def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, said: str) -> None:
-    """With its name and the row."""
     name = file(tmp_path, text)
     with pytest.raises(ConfigError) as raised:
         reading.check({"network": {"uplink": f'trace("{name}")'}})
@@ -124,7 +123,6 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, said: str) -> N
 
 @pytest.mark.parametrize("text", ["", "x\n", "5\n3\n", "-1\n", "nan\n", "0\n0\n"])
 def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> None:
-    """Times that fall, none at all, or only the time 0."""
     name = file(tmp_path, text)
     with pytest.raises(ConfigError, match="a file of mahimahi") as raised:
         reading.check({"network": {"downlink": f'deliveries("{name}")'}})

@@ -493,7 +493,6 @@ def test_the_record_tells_what_was_known_of_the_reference() -> None:
 
 
 def test_a_live_velocity_has_a_number_for_each_axis() -> None:
-    """The refusal is worded as for a key of a scenario."""
     with pytest.raises(
         ConfigError, match=r"reference.velocity_mps: got \[1.0\], expected 2 numbers"
     ):

@@ -130,7 +130,6 @@ def test_an_odd_observation_is_not_believed_and_changes_nothing(
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
-    """An observation that is odd for one vehicle may be the first of another."""
     expected = Belief.JUMP if row == 0 else Belief.BELIEVED
     assert judge(after(), elsewhere(105), row=row) == expected
 
@@ -197,7 +196,6 @@ def test_a_late_observation_tells_of_the_clocks_alone() -> None:
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
-    """It is treated as one that was never heard; its neighbour is not forgotten."""
     plausibility = after()
     assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
     plausibility.forget(0)

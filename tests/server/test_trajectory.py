@@ -536,7 +536,6 @@ def test_a_packet_is_small(axes: int, count: int) -> None:
 
 
 def test_what_is_sent_is_what_is_read() -> None:
-    """To the last bit."""
     flown = scenario()
     knots = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
     read = decode(encode(message(77, knots)), flown.terms())
@@ -571,7 +570,6 @@ def wire(**fields: Any) -> bytes:
     ],
 )
 def test_hostile_fields_are_refused(fields: dict[str, Any], reason: str) -> None:
-    """They are the peer's mistake."""
     terms = scenario().terms()
     assert isinstance(decode(wire(), terms), Trajectory)
     with pytest.raises(ProtocolError, match=rf"^{reason}$"):
@@ -579,7 +577,6 @@ def test_hostile_fields_are_refused(fields: dict[str, Any], reason: str) -> None
 
 
 def test_each_scheme_takes_its_own_messages_alone() -> None:
-    """A plan is no trajectory, and a trajectory no plan."""
     splines, plans = scenario().terms(), scenario().terms()._replace(scheme="committed")
     inputs = bytes(8 * plans.horizon)
     plan = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, inputs, b"", 4, 300])

@@ -33,13 +33,11 @@ class Shared(Section, frozen=True):
 
 @pytest.mark.parametrize("section", [Free, Shared])
 def test_a_key_without_one_owner_is_a_mistake(section: type[Section]) -> None:
-    """It is told by its name, as soon as the catalogue is made."""
     with pytest.raises(AssertionError, match=r"air\.wind: expected one owner"):
         dict(keys(section, "air."))
 
 
 def test_the_documented_keys_change_in_flight() -> None:
-    """Exactly those in the table of docs/control.md, at each socket."""
     text = (DOCS / "control.md").read_text()
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
@@ -54,7 +52,6 @@ def test_the_documented_keys_change_in_flight() -> None:
 
 
 def test_the_page_of_all_keys_is_up_to_date() -> None:
-    """It is what `make keys` writes, with one row for each key."""
     text = keys_document.document()
     assert sorted(re.findall(r"^\| `(.*?)` \|", text, re.MULTILINE)) == sorted(KEYS)
     assert (DOCS / "keys.md").read_text() == text, "docs/keys.md is out of date: run `make keys`"
@@ -63,7 +60,6 @@ def test_the_page_of_all_keys_is_up_to_date() -> None:
 def test_help_has_the_sentences_of_the_page(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both read a key's docstring."""
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
         emulate(["--help"])

@@ -381,7 +381,6 @@ def write(folder: Path, name: str, text: str) -> Path:
 def test_what_is_wrong_is_said_with_file_key_given_and_expected(
     text: str, said: str, tmp_path: Path
 ) -> None:
-    """In one line."""
     path = write(tmp_path, "mine.toml", text)
     assert refusal(path) == f"{path}: {said}"
 
@@ -450,7 +449,6 @@ def test_the_network_of_a_former_flyaway_is_flown_now() -> None:
 
 
 def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
-    """The refusal names the nearest scenario, or all of them if none is near."""
     assert refusal("papr") == "papr: no such scenario; did you mean paper?"
     assert refusal("xyz") == f"xyz: no such scenario; there are {', '.join(reading.names())}"
 
@@ -477,14 +475,12 @@ def test_the_compared_scenarios_are_no_scenario_themselves() -> None:
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    """With the system's reason."""
     path = tmp_path / "none.toml"
     assert refusal(path) == f"{path}: cannot be read: No such file or directory"
 
 
 @pytest.mark.parametrize("content", [b"dt = ", b"= 3", b"seed = 1\nseed = 2", b'title = "\xff"'])
 def test_a_file_that_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> None:
-    """With the parser's reason."""
     path = tmp_path / "mine.toml"
     path.write_bytes(content)
     assert refusal(path).startswith(f"{path}: no valid TOML: ")
@@ -568,7 +564,6 @@ def test_a_scenario_may_extend_one_that_comes_with_skytether(tmp_path: Path) -> 
 
 
 def test_what_is_left_out_is_the_default(tmp_path: Path) -> None:
-    """An empty file is a scenario."""
     assert reading.load(str(write(tmp_path, "empty.toml", ""))) == Scenario()
 
 
@@ -584,7 +579,6 @@ def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str) -> Non
 
 @pytest.mark.parametrize("name", reading.names())
 def test_a_scenario_survives_being_written_and_read(name: str, tmp_path: Path) -> None:
-    """Every value of it, without a base to extend."""
     scenario = reading.load(name)
     path = tmp_path / "copy.toml"
     path.write_bytes(reading.to_toml(scenario))
@@ -598,7 +592,6 @@ def test_a_scenario_survives_being_a_table() -> None:
 
 
 def test_the_names_of_scenarios_are_sorted_and_the_papers_are_there() -> None:
-    """The order is that of `skytether scenarios`."""
     assert reading.names() == sorted(reading.names())
     assert {"demo", "paper", "paper-every-step", "paper-no-compensation"} <= set(reading.names())
 
@@ -679,7 +672,6 @@ def test_only_a_plain_table_of_a_thought_of_size_is_read(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("table", ["t,x,y\n0,0,0\n1,2e6,0\n", "t,x,y\n0,0,0\n1e-300,1,0\n"])
 def test_a_trajectory_out_of_this_world_is_refused(table: str, tmp_path: Path) -> None:
-    """Too far away, and too fast."""
     write(tmp_path, "path.csv", table)
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     said = "a table of the trajectory (expected at most 1e+06 m from the origin, and 1e+06 m/s)"

@@ -403,7 +403,6 @@ SENTENCES = [
 
 
 def test_every_event_is_tested() -> None:
-    """Here, by its sentence."""
     assert {type(event) for event, _ in SENTENCES} == set(typing.get_args(Event))
 
 
@@ -411,7 +410,6 @@ def test_every_event_is_tested() -> None:
     ("event", "sentence"), SENTENCES, ids=[type(event).__name__ for event, _ in SENTENCES]
 )
 def test_an_event_is_a_sentence_and_survives_its_line_of_json(event: Event, sentence: str) -> None:
-    """Tagged with the name of its class."""
     assert str(event) == sentence
     line = LogLine(process="server", time_ns=5, event=event)
     sent = msgspec.json.encode(line)
@@ -475,7 +473,6 @@ def test_figures_are_names_and_numbers_in_two_columns() -> None:
 
 
 def test_two_groups_of_a_kind_share_the_lines() -> None:
-    """Netem's two directions are two columns; a figure of one alone is 0 in the other."""
     ways = {
         "uplink": {"lost": 12, "delays_ms": {"20": 7}},
         "downlink": {"lost": 3, "delays_ms": {"40": 1234}},
@@ -522,7 +519,6 @@ def test_workers_who_share_a_pipe_do_not_mix_up_their_lines(
 
 
 def test_an_event_in_json_is_one_write(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its end of line."""
     with piped(monkeypatch) as pipe:
         log = Log("server.1", "json")
         log.say(Counted(figures={"missed": 3}))

@@ -130,7 +130,6 @@ def test_journals_and_keys_are_not_written_through_a_link(tmp_path: Path) -> Non
 
 
 def test_a_file_that_is_there_is_written_anew(tmp_path: Path) -> None:
-    """All of the old content is gone, and its mode is as it was."""
     at = tmp_path / "it"
     files.write(at, b"long content")
     at.chmod(0o600)

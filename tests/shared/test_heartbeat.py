@@ -133,7 +133,6 @@ def test_of_a_burst_no_more_than_its_rest_by_the_modulus_is_seen(burst: int) -> 
 
 
 def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
-    """`link.heartbeat_s` as a number."""
     hearing = Hearing(2 * SECOND_NS, DT_NS, SECOND_NS // 4)
     assert hearing.silence == 10  # of half a step of 50 ms
     hear(hearing, 100)
@@ -156,7 +155,6 @@ def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float) -> None:
 
 
 def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """A row for each link and network."""
     main(["--hours", "0.1"])
     rows = capsys.readouterr().out.splitlines()
     assert len(rows) == 2 + 4 * 5
@@ -204,7 +202,6 @@ def test_a_flight_notices_that_it_is_cut() -> None:
 
 
 def test_liveness_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    """A row for each network."""
     liveness.main(["--hours", "0.17"])
     printed = capsys.readouterr().out
     assert all(f"{loss:g}" in printed for loss in liveness.LOSSES)

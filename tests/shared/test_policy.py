@@ -115,7 +115,6 @@ def test_what_is_written_is_read(text: str, read: policies.Expression) -> None:
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.items(), ids=REFUSED)
 def test_what_is_no_trigger_is_refused_in_one_line(text: str, said: tuple[str, str]) -> None:
-    """With the part that is wrong, and what was expected."""
     assert refusal(text) == f"mine: control.trigger: got {said[0]!r}, expected {said[1]}"
 
 
@@ -217,5 +216,4 @@ def written(tree: policies.Expression) -> str:
 
 @given(trees)
 def test_every_combination_can_be_written(tree: policies.Expression) -> None:
-    """Each combination is read as it was meant."""
     assert policies.parse(written(tree)) == tree

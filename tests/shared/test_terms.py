@@ -175,7 +175,6 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
 
 @pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values() - keys_of(InFlight.LEAP)))
 def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
-    """The vehicle flies."""
     ours, theirs = differing(key, tmp_path)
     assert ours != theirs
     _, client = shake_hands(ours, theirs)

@@ -64,8 +64,6 @@ def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> None:
-    """All that was set so far, in a file that only its owner may read."""
-
     def ask(caller: Caller) -> Any:
         caller.ask({"network.uplink.loss": 0.25})
         caller.ask({"network.downlink.loss": 0.5})
@@ -91,7 +89,6 @@ def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path)
 
 
 def test_what_is_refused_is_not_kept(tmp_path: Path) -> None:
-    """Nothing has changed."""
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 2}))
     assert not kept(tmp_path).exists()
     assert begun(tmp_path).news == []

@@ -36,7 +36,6 @@ def test_a_line_is_what_is_written(text: str, line: Line, peer: Address | None) 
     "text", ["", "udp", "udp:14550", "http:h:1", "tcp:h:70000", "serial:57600", "serial:/dev/x:0"]
 )
 def test_what_is_no_line_is_refused_with_its_key(text: str) -> None:
-    """The line says what was expected, too."""
     with pytest.raises(ConfigError, match=r"^vehicle.address: got .*, expected udp:HOST:PORT"):
         parse_line("vehicle.address", text)
 

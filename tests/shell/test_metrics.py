@@ -308,7 +308,6 @@ def test_metrics_and_health_are_served(served: Metrics) -> None:
     ],
 )
 def test_anything_else_is_refused(served: Metrics, request_: bytes, status: bytes) -> None:
-    """In a line, and the next is answered."""
     assert asked(served, request_)[0] == b"HTTP/1.1 " + status
     assert asked(served, b"GET /healthz HTTP/1.0\r\n\r\n")[0] == b"HTTP/1.1 200 OK"
 
@@ -363,7 +362,6 @@ def test_no_answer_may_be_shown_in_a_frame(served: Metrics, path: str) -> None:
 
 
 def test_a_request_may_come_in_pieces(served: Metrics) -> None:
-    """Byte by byte."""
     with calling(served) as sock:
         for byte in b"GET /healthz HTTP/1.1\r\n\r\n":
             sock.send(bytes([byte]))
@@ -419,7 +417,6 @@ def test_an_address_that_is_taken_is_said_in_a_line(
 
 
 def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
-    """Every metric that a process serves is among the listed names."""
     told: Callable[[str], set[str]] = lambda process: {  # noqa: E731
         name for name, _ in numbers(process, figures[process])
     }
@@ -427,7 +424,6 @@ def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
 
 
 def test_the_documented_metrics_are_those_there_are() -> None:
-    """Name and kind of each, and the labels that a number has."""
     text = (ROOT / "docs" / "feed.md").read_text()
     lines = re.findall(r"^\| `skytether_(\w+)` \| (\w+) \| ([^|]*) \|", text, re.MULTILINE)
     assert {(name, kind) for name, kind, _ in lines} == {

@@ -37,7 +37,6 @@ def holding() -> "subprocess.Popen[str]":
 
 
 def test_a_folder_is_gone_at_the_end(tmp_path: Path) -> None:
-    """With all that is in it, and however the block ends."""
     outside = tmp_path / "outside"
     outside.mkdir()
     with suppress(KeyError), folder() as made:

@@ -25,7 +25,6 @@ def pipe() -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 
 
 def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
-    """All of it, and it is counted."""
     pieces = [b"%d\n" % number for number in range(10_000)]
     with (tmp_path / "file").open("wb") as file:
         writer = Writer(file, room=10**6, together=100, pause_s=0.001)

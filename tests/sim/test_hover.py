@@ -12,7 +12,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import Finished, ModeChanged, NotFlown
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Reason, Record
 from skytether.shared.wire.protocol import Heartbeat, Horizon, Idle, decode, encode
 from skytether.sim.flight import MIDNIGHT_NS, fly
 
@@ -143,11 +143,11 @@ def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> Non
     *changes, finished = said(flight)[-6:]
     assert isinstance(finished, Finished)
     assert [(each.after, each.reason) for each in changes] == [
-        ("brake", "the server is silent"),
-        ("hover", "the server is silent"),
-        ("hover", "the server has restarted"),
-        ("hover", "the link has been good for a second"),
-        ("track", "a horizon has come"),
+        ("brake", str(Reason.LOST)),
+        ("hover", str(Reason.LOST)),
+        ("hover", str(Reason.RESTARTED)),
+        ("hover", str(Reason.GOOD)),
+        ("track", str(Reason.HORIZON)),
     ]
     assert not flight.client["covered"].all()
     assert flight.client["covered"][-100:].all()

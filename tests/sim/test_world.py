@@ -271,8 +271,6 @@ def test_a_host_at_work_can_be_restarted_at_once() -> None:
 
 
 def test_the_end_of_a_later_life_is_told() -> None:
-    """Once, as that of the first would have been."""
-
     class Finite(Probe):
         @property
         def finished(self) -> bool:

@@ -321,7 +321,6 @@ def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
 
 
 def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path) -> None:
-    """Forwards, backwards, and paused."""
     file = tmp_path / "demo.mcap"
     record = [sys.executable, "-P", "-m", "skytether", "fly", "demo", "--virtual"]
     subprocess.run([*record, "--record", str(file)], check=True, capture_output=True)
@@ -344,7 +343,6 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
 
 
 def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
-    """Words, plots and vehicles of both, by name."""
     names = "demo", "demo-no-compensation"
     with served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address:
         page = browser.new_page(viewport={"width": 1400, "height": 900})

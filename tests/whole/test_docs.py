@@ -207,7 +207,6 @@ WOKEN_LATE = re.compile(
 def test_the_documented_recordings_are_made_and_read(
     document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of a document, one after the other."""
     reads = ("skytether report ", "skytether export ", "skytether recover ")
     lines = [line for block in blocks(ROOT / document) for line in block]
     lines = [line for line in lines if line.startswith(reads) or "--record" in line]
@@ -246,7 +245,6 @@ def test_the_documented_python_runs_and_prints_what_it_says(
 
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
 def test_documented_targets_exist(line: str) -> None:
-    """`make -n` knows each."""
     run = subprocess.run(
         ["make", "-n", *shlex.split(line)[1:]], cwd=ROOT, capture_output=True, check=False
     )
@@ -262,7 +260,6 @@ def test_documented_extras_exist() -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_links_lead_somewhere(document: Path) -> None:
-    """Every relative link of every document."""
     for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text()):
         assert (document.parent / target).exists(), target
 
