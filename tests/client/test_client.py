@@ -151,14 +151,11 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
 
 
 @pytest.mark.parametrize(
-    ("refusal", "reason", "said"),
-    [
-        (Refusal.FULL, "full", "the server is full; see its --vehicles"),
-        (Refusal.TAKEN, "taken", "another client flies under this number; see --id"),
-    ],
+    ("refusal", "reason"),
+    [(Refusal.FULL, "full"), (Refusal.TAKEN, "taken")],
 )
 def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
-    refusal: int, reason: Literal["full", "taken"], said: str
+    refusal: int, reason: Literal["full", "taken"]
 ) -> None:
     """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
     server, hellos = Server(scenario(link={"connect_s": 15.0})), 0
@@ -169,7 +166,6 @@ def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason
     failure = NoSession(vehicle=4, host="server", port=0, reason=reason)
     assert server.client.failure == failure
     assert server.client.events() == (failure,)
-    assert str(failure) == f"vehicle 4 is refused by server:0: {said}"
     assert server.client.next_wake_ns() is None
     assert server.client.dropped == {reason: 38}
 

@@ -129,22 +129,22 @@ EFFECTS = [
     (fault(Kind.BURST, "uplink", 5, 4, 10.0), "packets: burst"),
     (fault(Kind.DUPLICATES, "both", 5, 4, 0.9), "packets: duplicates"),
     (fault(Kind.REORDERING, "both", 5, 4, 2.0), "packets: reordering"),
-    (fault(Kind.PARTITION, "both", 5, 4), "brake: the server is silent"),
-    (fault(Kind.PARTITION, "both", 5, 14), "land: the server has been silent for long"),
-    (fault(Kind.RESTART, "server", 5, 0.05), "brake: the server is silent"),
+    (fault(Kind.PARTITION, "both", 5, 4), f"brake: {Reason.LOST}"),
+    (fault(Kind.PARTITION, "both", 5, 14), f"land: {Reason.ALONE}"),
+    (fault(Kind.RESTART, "server", 5, 0.05), f"brake: {Reason.LOST}"),
     (fault(Kind.RESTART, "client", 5, 1.0), "lives of client"),
-    (fault(Kind.RESTART, "netem", 5, 1.5), "brake: the server is silent"),
-    (fault(Kind.FREEZE, "client", 5, 1.0), "brake: its own computer woke it too late"),
-    (fault(Kind.FREEZE, "server", 5, 2.0), "brake: the server is silent"),
+    (fault(Kind.RESTART, "netem", 5, 1.5), f"brake: {Reason.LOST}"),
+    (fault(Kind.FREEZE, "client", 5, 1.0), f"brake: {Reason.STALLED}"),
+    (fault(Kind.FREEZE, "server", 5, 2.0), f"brake: {Reason.LOST}"),
     (fault(Kind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
-    (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), "brake: the server is silent"),
+    (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), f"brake: {Reason.LOST}"),
     (fault(Kind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
-    (fault(Kind.DELAY, "uplink", 5, 6, 3.0), "brake: the server is silent"),
-    (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), "brake: the server is silent"),
+    (fault(Kind.DELAY, "uplink", 5, 6, 3.0), f"brake: {Reason.LOST}"),
+    (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), f"brake: {Reason.LOST}"),
     (fault(Kind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
     (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
     (fault(Kind.COPY, "both", 5, 6), "packets: copy"),
-    (fault(Kind.KEYS, "server", 5, 3), "brake: the server is silent"),
+    (fault(Kind.KEYS, "server", 5, 3), f"brake: {Reason.LOST}"),
     (fault(Kind.CROWD, "netem", 5, 6, 200.0), "packets: crowd"),
     (fault(Kind.PORT, "client", 5, 0), "faults: port"),
 ]
@@ -189,7 +189,7 @@ def test_if_one_answer_earned_a_place_an_observer_would_shut_vehicles_out(
 @pytest.mark.parametrize("amount", [3600.0, -3600.0])
 def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
     """Nobody brakes for it, whichever clock it is."""
-    braked = "brake: its own computer woke it too late"
+    braked = f"brake: {Reason.STALLED}"
     for where in ("client", "server"):
         outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
         assert not outcome.failure

@@ -23,7 +23,7 @@ from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Reason, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_ns
@@ -455,6 +455,6 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]
-    why = "its state has jumped further than a vehicle can move"
+    why = str(Reason.LEAPT)
     assert changes[-2:] == [("brake", why), ("hover", why)]
     assert np.abs(flight.client["input"][-1]).max() == 0.0

@@ -102,7 +102,7 @@ def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
 ) -> None:
     """The server answers, and sends heartbeats: that is no flight."""
     flight = interrupted(monkeypatch, scenario(), 0.0, mute=True)
-    why = "no newer horizon has come"
+    why = str(Reason.OLD)
     assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
     assert said(flight)[-1] == flight.failure
     assert not flight.client["input"].any()
@@ -114,7 +114,7 @@ def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
 ) -> None:
     """The server dies after a heartbeat, or sends nothing but heartbeats from then on."""
     flight = interrupted(monkeypatch, scenario(), 10.6, mute=mute)
-    why = "no newer horizon has come" if mute else "the server is silent"
+    why = str(Reason.OLD if mute else Reason.LOST)
     assert isinstance(flight.failure, NotFlown)
     assert flight.failure.why == why
     assert flight.failure.covered == np.count_nonzero(flight.client["covered"])
