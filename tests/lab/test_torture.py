@@ -179,7 +179,7 @@ def test_an_observer_at_netem_keeps_no_vehicle_from_flying() -> None:
 def test_if_one_answer_earned_a_place_an_observer_would_shut_vehicles_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: as in an early version, one answer earns a place for a minute."""
+    """Ablation: one answer earns a place for a minute."""
     monkeypatch.setattr(skytether.netem.places, "EXCHANGES", 1)
     monkeypatch.setattr(skytether.netem.places, "EARNED_NS", 60 * SECOND_NS)
     monkeypatch.setattr(skytether.netem.places, "HOST_FLOWS", 128)

@@ -324,7 +324,7 @@ def no_bound_for_a_host(patch: pytest.MonkeyPatch) -> None:
 def test_if_places_were_earned_otherwise_newcomers_would_be_shut_out(
     monkeypatch: pytest.MonkeyPatch, ablation: Callable[[pytest.MonkeyPatch], None], rate_hz: int
 ) -> None:
-    """Ablation: by one answer, as in an early version; or by one host without a bound."""
+    """Ablation: by one answer; or by one host without a bound."""
     ablation(monkeypatch)
     siege = Siege(make_proxy(flows=128), [ATTACKER], 128, rate_hz)
     siege.run(13)

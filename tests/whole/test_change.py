@@ -378,8 +378,9 @@ def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
     """The guard of the test above: it would fly its plan to the end."""
     rows = {key: mode for key, mode in TABLE.items() if key[1] is not Reason.UNARMED}
     monkeypatch.setattr("skytether.client.endpoint.TABLE", rows)
-    modes = [event.after for *_, event in told(arming((5.0, False)), ModeChanged)]
-    assert "brake" not in modes
+    flight = arming((5.0, False))
+    modes = [(event.after, event.reason) for *_, event in told(flight, ModeChanged)]
+    assert ("brake", str(Reason.UNARMED)) not in modes
 
 
 def test_what_is_refused_in_flight_is_an_event_and_the_flight_is_the_same() -> None:

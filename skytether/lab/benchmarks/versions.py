@@ -28,16 +28,16 @@ from skytether.lab.benchmarks.harness import HOT, PACED, Lateness, TextTable, pr
 from skytether.shared.base import files
 
 ROOT = Path(__file__).parents[3]
-WORKER = "skytether/lab/benchmarks/versions_worker.py"
-"""Path of a checkout's worker, by its own names for everything."""
+WORKERS = ("skytether/lab/benchmarks/versions_worker.py", "benchmarks/versions_worker.py")
+"""Paths of a checkout's worker, of today and until 0.1.0, by its own names for everything."""
 RUN = """
-import runpy, sys
-from skytether.lab.benchmarks import harness as there
-worker, pause_s = sys.argv[1:]
+import importlib, runpy, sys
+worker, harness, pause_s = sys.argv[1:]
+there = importlib.import_module(harness)
 there.PACED = type(there.PACED)(there.PACED.turn, float(pause_s))
 runpy.run_path(worker, run_name="__main__")
 """
-"""Program that runs a worker with the pauses of this checkout."""
+"""Program that runs a worker with the pauses of this checkout; older ones have pauses of 5 ms."""
 SIDES = ("before", "after")
 VALUES_MIN = 20
 """Number of values below which no p99 is given."""
@@ -190,10 +190,12 @@ def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
 
 def _start(folder: Path) -> subprocess.Popen[str]:
     """A worker that imports from this folder; closing its stdin ends it."""
-    if not (folder / WORKER).exists():
+    worker = next((name for name in WORKERS if (folder / name).exists()), None)
+    if worker is None:
         raise ValueError(f"{folder}: got a folder without benchmarks, expected a checkout")
+    harness = ".".join(Path(worker).with_name("harness").parts)
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", RUN, WORKER, str(PACED.pause_s)],
+        [sys.executable, "-P", "-c", RUN, worker, harness, str(PACED.pause_s)],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder)},
         stdin=subprocess.PIPE,
