@@ -150,7 +150,6 @@ def test_px4_errs_as_measured() -> None:
 
 
 def test_10_setpoints_a_second_answer_as_50_do() -> None:
-    """The autopilot holds the last one."""
     often, seldom = Companion(), Companion()
     for companion in (often, seldom):
         companion.climb()
@@ -392,7 +391,6 @@ def test_what_is_silent_says_nothing_and_flies_on() -> None:
 def test_a_lost_ground_station_sends_it_home_where_it_is_to(
     flavour: FlavourName, keys: dict[str, float], after_s: float
 ) -> None:
-    """Off by default, as in both."""
     for told, flown in ((keys, FlightMode.RETURN), ({}, FlightMode.GUIDED)):
         companion = Companion(flavour)
         for name, value in told.items():

@@ -48,7 +48,6 @@ def test_frames_are_found_among_noise(noise: list[bytes], stream: bool) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_frame_that_was_cut_off_takes_no_other_with_it(data: st.DataObject) -> None:
-    """Wherever it was cut."""
     first, second = frames(2)
     cut = first[: data.draw(st.integers(0, len(first) - 1))]
     assert names(Codec(255, 190).decode(cut + second)) == ["LOCAL_POSITION_NED"]

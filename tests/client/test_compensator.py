@@ -379,7 +379,6 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
 
 
 def test_feedback_stays_within_the_bounds() -> None:
-    """However far away the vehicle is."""
     compensator = Compensator(terms(scheme="committed", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     far = np.array([[1e6, 0.0], [-1e6, 0.0]])

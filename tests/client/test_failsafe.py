@@ -411,7 +411,6 @@ def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
 
 
 def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
-    """A few stragglers say nothing."""
     hand = tracking()
     hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
     for _ in range(5):

@@ -287,7 +287,6 @@ def test_another_search_in_the_same_folder_is_refused(
 def test_a_journal_that_does_not_fit_the_search_is_refused(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its scores belong to other points."""
     shutil.copy(searched / "settings.toml", tmp_path)
     _, points = json.loads((searched / "journal.jsonl").read_text().splitlines()[0])
     points[2]["keys"]["reference.radius_m"] *= 1.1

@@ -189,7 +189,6 @@ def test_a_flight_beside_the_reference_is_astray() -> None:
 
 
 def test_a_flight_without_a_step_is_unanswered() -> None:
-    """No session, no record."""
     assert judge(SCENARIO, np.zeros(0, client_columns(2))) == PointVerdict("unanswered")
 
 
@@ -221,7 +220,6 @@ UNPLANNED = until(400)
     ids=["held", "too slow", "begun anew"],
 )
 def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, said: str) -> None:
-    """However near it still is."""
     verdict = judge(SCENARIO, rows)
     assert verdict.outcome == "flyaway"
     assert verdict.line.startswith(said)

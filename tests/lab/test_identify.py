@@ -131,7 +131,6 @@ def test_what_is_no_first_order_is_said_to_be_none() -> None:
 
 
 def test_what_noise_hides_is_said_to_be_unknown() -> None:
-    """Neither refused nor accepted."""
     best = found(answered(Numbers(1.0, 0.4, 0.2), np.random.default_rng(3), noise=1.0, count=4))
     assert "cannot be told" in verdict(best)
 

@@ -241,7 +241,6 @@ def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_pat
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It may fly otherwise."""
     journal_of(ONE, tmp_path).close()
     here = metadata.version("skytether")
     monkeypatch.setattr(metadata, "version", lambda _: "2")
@@ -257,7 +256,6 @@ def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
 
 
 def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None:
-    """Nobody knows what they are of."""
     (tmp_path / "journal.jsonl").write_text("{}\n")
     said = "got journal.jsonl without settings.toml, expected both"
     with pytest.raises(ConfigError, match=said):

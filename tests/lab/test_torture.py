@@ -73,7 +73,6 @@ def fault(
     "seed", [*range(1, 5), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(5, 9))]
 )
 def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
-    """To the last count."""
     outcome = fly(short_trial(seed))
     assert not outcome.failure
     assert outcome == fly(short_trial(seed))
@@ -109,7 +108,6 @@ def test_trajectories_are_flown_by_a_third_or_more_with_all_that_belongs_to_them
 
 
 def test_each_step_under_a_plan_is_held_against_the_compiled_rule() -> None:
-    """Along a trajectory, and by inputs."""
     along, planned = fly(Trial(FOLLOWS, ())).counts, fly(Trial(PLANS, ())).counts
     assert along["steps along trajectories"] > 30
     assert planned["steps by inputs"] > 30

@@ -122,7 +122,6 @@ def test_shares_are_those_asked_for(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_flipped_bits_lie_anywhere(seed: int) -> None:
-    """Uniformly over the packet."""
     places = [fate.flipped for fate in fates("corrupt(0.5)", seed) if fate.flipped is not None]
     assert stats.kstest(places, stats.uniform.cdf).pvalue > P_MIN
 
@@ -235,7 +234,6 @@ def test_arguments_may_have_names_and_defaults() -> None:
 
 
 def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
-    """Any file name is possible."""
     assert with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
         'trace("/x/a.csv", loop, auto) & loss(0.1)'
     )

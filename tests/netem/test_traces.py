@@ -137,7 +137,6 @@ def test_too_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
 
 
 def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
-    """While a process goes on."""
     name = file(tmp_path, "time_s,delay_s\n0,0.1\n")
     assert path(f"trace({name})").mean_s == 0.1
     file(tmp_path, "time_s,delay_s\n0,0.25\n")

@@ -154,7 +154,6 @@ def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
 
 
 def test_three_that_do_not_agree_are_not_believed() -> None:
-    """Each contradicts the one before it."""
     plausibility = after()
     for n, step in enumerate(range(105, 125)):
         assert judge(plausibility, elsewhere(step, 100.0 * (n + 1))) == Belief.JUMP
@@ -162,7 +161,6 @@ def test_three_that_do_not_agree_are_not_believed() -> None:
 
 
 def test_two_among_believed_ones_are_not_in_a_row() -> None:
-    """However many there are of them."""
     plausibility = after()
     for step in range(105, 205, 3):
         assert judge(plausibility, elsewhere(step)) == Belief.JUMP

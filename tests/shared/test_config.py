@@ -461,7 +461,6 @@ def test_only_a_plain_file_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
 
 
 def test_a_long_chain_of_scenarios_is_refused(tmp_path: Path) -> None:
-    """Twenty are enough for anybody."""
     for number in range(30):
         write(tmp_path, f"{number}.toml", f'extends = "{number + 1}.toml"')
     write(tmp_path, "30.toml", "seed = 9")
@@ -480,7 +479,6 @@ def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.toml", "../{folder}/a.toml"])
 def test_scenarios_that_extend_each_other_are_refused(name: str, tmp_path: Path) -> None:
-    """Every form of path is recognised."""
     path = write(tmp_path, "a.toml", 'extends = "b.toml"')
     write(tmp_path, "b.toml", f'extends = "{name.format(folder=tmp_path.name)}"')
     said = refusal(path)
@@ -510,7 +508,6 @@ def test_extends_lays_a_scenario_over_another_key_by_key(tmp_path: Path) -> None
 
 
 def test_a_scenario_may_extend_one_that_comes_with_skytether(tmp_path: Path) -> None:
-    """The name works from any folder."""
     path = write(tmp_path, "mine.toml", 'extends = "paper"\nseed = 9')
     ours, theirs = (
         reading.to_table(reading.load("paper")),

@@ -256,7 +256,6 @@ def test_every_other_field_is_known_with_every_scheme(scheme: str, tmp_path: Pat
 def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
     tmp_path: Path,
 ) -> None:
-    """Once, and with nothing after it."""
     plug(tmp_path, NEVER)
     assert flown("never").server["event"].sum() == 1
 
@@ -399,7 +398,6 @@ def test_every_bound_of_a_text_holds(
 
 
 def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) -> None:
-    """All numbers are written, or none."""
     code = """
         @trigger
         def slip(now, a: float = -2.0, b: int = 3):

@@ -48,7 +48,6 @@ def test_no_input_is_flown_for_longer_than_the_age_bound_allows(observed: int, c
 
 @pytest.mark.parametrize(("horizon", "steps"), [(1, 2), (11, 2), (12, 3), (40, 10), (120, 30)])
 def test_a_horizon_may_be_late_by_a_quarter_of_itself(horizon: int, steps: int) -> None:
-    """By two steps at least."""
     assert late_max(horizon) == steps
 
 
@@ -163,7 +162,6 @@ COMPILED = {
 def test_compiled_it_says_the_same(
     stage: int, length: int, numbers: tuple[float, float, float, float, float]
 ) -> None:
-    """To the last bit, each function."""
     told, back, speed, brake, bound = numbers
     share = remaining(stage, length, speed, brake)
     for function, *given_ in (

@@ -200,7 +200,6 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
 
 
 def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) -> None:
-    """Nobody listens there."""
     path = tmp_path / "netem"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))

@@ -459,7 +459,6 @@ def test_at_the_end_readers_get_the_rest(driven: Driven) -> None:
 def test_the_end_does_not_wait_long_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of them share the time."""
     monkeypatch.setattr(skytether.shell.feed, "PATIENCE_S", 0.01)
     for _ in range(READERS_MAX):
         driven.look()

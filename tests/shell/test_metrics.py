@@ -224,7 +224,6 @@ def test_a_client_is_well_while_it_is_flown_or_could_be(mode: Mode) -> None:
 
 
 def test_a_server_is_well_while_it_is_in_time() -> None:
-    """A netem is while it turns."""
     assert trouble("server", {"degraded": False}) == trouble("netem", {}) == ""
     assert trouble("server", {"degraded": True}) == "it misses more ticks than allowed"
 
@@ -342,7 +341,6 @@ def test_who_comes_by_the_name_of_a_website_is_refused(
 
 
 def test_the_name_that_the_user_has_given_may_be_used() -> None:
-    """That of --metrics, and no other."""
     with closing(Metrics(("localhost", 0), Collected("netem", "demo", 0.05))) as one:
         one.take({"flows": 1, **PROCESS})
         one._name = "vehicle.fleet.example"
@@ -353,7 +351,6 @@ def test_the_name_that_the_user_has_given_may_be_used() -> None:
 
 @pytest.mark.parametrize("path", ["/metrics", "/healthz", "/", "/ HTTP/2"])
 def test_no_answer_may_be_shown_in_a_frame(served: Metrics, path: str) -> None:
-    """Nor may a refusal."""
     with calling(served) as sock:
         sock.sendall(f"GET {path} HTTP/1.1\r\n\r\n".encode())
         head = said(sock).partition(b"\r\n\r\n")[0].split(b"\r\n")

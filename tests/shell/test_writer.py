@@ -76,7 +76,6 @@ def test_a_pipe_that_does_not_block_loses_nothing(pipe: tuple[IO[bytes], IO[byte
 
 
 def test_a_full_disk_ends_the_writing_and_nothing_else() -> None:
-    """The system's reason is kept."""
     with Path("/dev/full").open("wb", buffering=0) as full:
         writer = Writer(full, room=100, together=100)
         for _ in range(1000):

@@ -91,8 +91,6 @@ def test_moving_data_is_drawn_within_three_seconds_and_nobody_outside_is_asked(
 def test_the_loss_slider_changes_the_measured_loss(
     browser: "sync_api.Browser", flight: str
 ) -> None:
-    """Both ways, as netem counts it."""
-
     def measured() -> list[int]:
         return [int(each) for each in re.findall(r"(\d+) % (?:up|down)", status(page))]
 

@@ -281,7 +281,6 @@ def test_a_plot_with_gaps_reaches_a_browser() -> None:
 
 
 def test_the_lines_of_a_scene_have_the_gaps_of_what_is_known() -> None:
-    """No piece leads over one."""
     points = np.array([[0.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [3.0, 0.0], [4.0, 0.0]])
     assert segments(points)[:, :, 0].tolist() == [[0.0, 1.0], [3.0, 4.0]]
 

@@ -386,7 +386,6 @@ def chunks(path: Path) -> list[tuple[int, int]]:
 
 
 def test_a_torn_recording_is_refused_and_told_how_to_mend(torn: Path) -> None:
-    """It has no end."""
     with pytest.raises(RecordingError, match=f"it has no end.*skytether recover {torn}"):
         Recorded(torn)
 

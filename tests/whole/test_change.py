@@ -131,7 +131,6 @@ def test_what_cannot_be_is_refused_with_one_line_and_nothing_changes(
 
 
 def test_a_request_without_keys_is_answered_with_what_may_change() -> None:
-    """Each key with its present value."""
     _, running = probe()
     running.change({"vehicle.steady_wind_mps": [0.5, 0]}, now_ns=5)
     assert answer(running, b"{}").values == {
