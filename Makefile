@@ -28,7 +28,7 @@ KERNELS = $(BIN)/python -c "import skytether.lab.loops, skytether.quadrotor.loop
 	$(BIN)/pytest --collect-only -qq >/dev/null & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
-.PHONY: setup demo reproduce test long-test check format lock keys pictures equations docs docker-test page-test autopilot-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -73,12 +73,6 @@ format: setup  ## as `check` wants it
 
 keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
 	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
-
-pictures: setup  ## docs/rooms.svg and docs/packet.svg, from the imports and the calls in the code
-	$(BIN)/python -m skytether.lab.house docs
-
-equations: setup  ## the table of docs/paper.md, from the equations that docstrings name
-	$(BIN)/python -m skytether.lab.equations docs/paper.md
 
 # Open site/index.html; its search works only through a server, as of `python -m http.server -d site`.
 docs: $(DOCS_STAMP)  ## a site of docs/ in site/, offline; a link that leads nowhere fails

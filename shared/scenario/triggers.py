@@ -140,7 +140,7 @@ class Compared(IntEnum):
     COST_GAP = 2
     EXPECTED_GAP = 3
     DEVIATION_M = 4
-    OWN = 7  # 5 and 6 are figures of older recordings
+    OWN = 5
     """Figure of a plug-in's policy, in a unit that it knows itself."""
 
     def __str__(self) -> str:

@@ -183,13 +183,9 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
 def compared(rows: Rows) -> Array:
     """Figure that the trigger compared in each row of the server's part; shape (n,).
 
-    Where nothing was compared it is V(k) of eq. (16), or NaN without one. Older
-    recordings have one column for all figures, `error`.
+    Where nothing was compared it is V(k) of eq. (16), or NaN without one.
     """
     names = rows.dtype.names or ()
-    if "compared" not in names:
-        before: Array = rows["error"]
-        return before
     figures = np.full(len(rows), np.nan)
     for number in np.unique(rows["compared"]).tolist():
         name = str(Compared(number) or Compared.STATE_GAP)

@@ -46,7 +46,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
 
 # Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
-VERSION = 8
+VERSION = 1
 PAYLOAD_BYTES_MAX = 1200
 """Limit below which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
 

@@ -42,8 +42,6 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
 }
 """Words for the codes of some columns."""
-FIGURES = {str(figure) for figure in Compared} | {"compared", "error"}
-"""Columns of the server's part that a recording may lack: older recordings have other ones."""
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest time of a step [s]: a scenario lasts for a day at most."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
@@ -169,7 +167,7 @@ class RowTable:
 def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> None:
     """Refuse columns that a part of the record of a scenario's flight cannot have.
 
-    Additional columns and other figures are accepted. Plans may have any number of inputs.
+    Additional columns are accepted. Plans may have any number of inputs.
 
     Raises:
         ValueError: with the part and the column.
@@ -188,18 +186,12 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
             raise ValueError(f"no flight has a part {part[:20]!r}")
     plain(columns)
     names = columns.names or ()
-    for name in {*(expected.names or ())} - FIGURES:
+    for name in expected.names or ():
         given = columns[name] if name in names else None
         if name == "inputs" and given is not None and len(given.shape) == 2:
             given = np.dtype((given.base, (given.shape[0], 1)))
         if given != expected[name]:
             raise ValueError(f"{part}: the column {name} is {given}, expected {expected[name]}")
-    figures = {*names} & FIGURES if part == "server" else set()
-    for name in figures:
-        if columns[name] != np.dtype("<u1" if name == "compared" else "<f8"):
-            raise ValueError(f"{part}: the column {name} is {columns[name]}")
-    if part == "server" and not figures & {"compared", "error"}:
-        raise ValueError("server: no column says what was compared")
 
 
 def check_values(part: str, rows: Rows, scenario: Scenario) -> None:

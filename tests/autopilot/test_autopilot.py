@@ -150,7 +150,6 @@ def test_px4_errs_as_measured() -> None:
 
 
 def test_10_setpoints_a_second_answer_as_50_do() -> None:
-    """The autopilot holds the last one."""
     often, seldom = Companion(), Companion()
     for companion in (often, seldom):
         companion.climb()
@@ -206,7 +205,6 @@ def test_px4_flies_home_and_lands_after_its_time_out() -> None:
 
 @pytest.mark.parametrize(("value", "name"), [(4, "AUTO.LAND"), (5, "AUTO.LOITER")])
 def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
-    """COM_OBL_RC_ACT, and COM_OF_LOSS_T for when."""
     companion = Companion("px4")
     companion.climb()
     for parameter, number in (("COM_OBL_RC_ACT", value), ("COM_OF_LOSS_T", 0.5)):
@@ -218,7 +216,6 @@ def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
 
 
 def test_a_shorter_time_out_stops_ardupilot_sooner() -> None:
-    """GUID_TIMEOUT, as set by PARAM_SET."""
     companion = Companion()
     companion.climb()
     set_parameter(companion, "GUID_TIMEOUT", 0.5)
@@ -230,7 +227,6 @@ def test_a_shorter_time_out_stops_ardupilot_sooner() -> None:
 
 
 def test_px4_is_not_guided_without_a_stream() -> None:
-    """A refusal in words; setpoints in another mode are what it waits for."""
     companion = Companion("px4")
     companion.run(1.0)
     assert companion.mode(FlightMode.GUIDED) == Result.REJECTED
@@ -241,7 +237,6 @@ def test_px4_is_not_guided_without_a_stream() -> None:
 
 
 def test_ardupilot_forgets_setpoints_of_before() -> None:
-    """Guided again, it stays until it hears a new one."""
     companion = Companion()
     companion.climb()
     companion.velocity = (1.0, 0.0, 0.0)
@@ -336,7 +331,6 @@ def fly_with(fault: str, flavour: FlavourName, seconds: float, **keys: float) ->
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_takes_over(flavour: FlavourName) -> None:
-    """At once; setpoints go on coming, and move nothing."""
     companion = fly_with("pilot@15", flavour, 3.0)
     assert companion.flight.mode is FlightMode.PILOT
     assert math.hypot(*companion.flight.velocity()) < 0.2
@@ -369,7 +363,6 @@ def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None
 def test_a_low_battery_is_told_and_does_what_the_parameter_says(
     flavour: FlavourName, keys: dict[str, float], mode: FlightMode
 ) -> None:
-    """SYS_STATUS tells the charge."""
     companion = fly_with("battery@15", flavour, 1.0, **keys)
     assert companion.flight.mode is mode
     assert any("attery" in text for text in companion.texts())
@@ -378,7 +371,6 @@ def test_a_low_battery_is_told_and_does_what_the_parameter_says(
 
 
 def test_what_is_silent_says_nothing_and_flies_on() -> None:
-    """Its streams stop and come back; setpoints are heard."""
     companion = Companion(faults=("silence@15-17",))
     companion.climb()
     companion.stream(50.0)
@@ -399,7 +391,6 @@ def test_what_is_silent_says_nothing_and_flies_on() -> None:
 def test_a_lost_ground_station_sends_it_home_where_it_is_to(
     flavour: FlavourName, keys: dict[str, float], after_s: float
 ) -> None:
-    """Off by default, as in both."""
     for told, flown in ((keys, FlightMode.RETURN), ({}, FlightMode.GUIDED)):
         companion = Companion(flavour)
         for name, value in told.items():
@@ -436,7 +427,6 @@ def test_its_own_fence_holds_it(flavour: FlavourName, keys: dict[str, float]) ->
     "text", ["", "pilot", "pilot@", "pilot@-1", "pilto@3", "pilot@3-5", "silence@5-4", "silence@x"]
 )
 def test_a_fault_that_is_none_is_refused(text: str) -> None:
-    """With what it could be."""
     with pytest.raises(ConfigError, match=r"^--fault: got"):
         faults.parse(text)
 
@@ -455,7 +445,6 @@ def set_parameter(companion: Companion, name: str, value: float) -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_parameters_are_read_listed_and_set(flavour: FlavourName) -> None:
-    """PX4 sends the bits of its integers."""
     companion = Companion(flavour)
     own, bytewise = FLAVOURS[flavour].parameters, FLAVOURS[flavour].bytewise
     companion.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -514,7 +503,6 @@ def test_a_stream_that_is_stopped_stops() -> None:
 
 
 def test_time_is_told_at_once() -> None:
-    """TIMESYNC: its own time, and the one that it was asked with."""
     companion = Companion()
     companion.run(1.0)
     companion.now_ns += 1_234_567
@@ -542,7 +530,6 @@ def test_time_is_told_at_once() -> None:
     ],
 )
 def test_a_message_is_sent_on_request(flavour: FlavourName, name: str) -> None:
-    """Once; what it has not is denied, what is no command is not known."""
     companion = Companion(flavour)
     companion.run(1.0)
     number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
@@ -618,7 +605,6 @@ def test_a_setpoint_that_cannot_be_flown_is_none(
 
 
 def test_it_heeds_its_own_number_alone() -> None:
-    """Messages for another system, or with the autopilot's own id, are counted and ignored."""
     companion = Companion()
     companion.run(1.0)
     arm = dialect.MAVLink_command_long_message(2, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
@@ -652,7 +638,6 @@ def test_other_peers_hear_it_and_a_crowd_moves_nobody_out() -> None:
 
 
 def test_whom_it_is_told_of_hears_it_from_the_start() -> None:
-    """Heartbeats, and nobody is forgotten."""
     address = ("192.0.2.9", 14540)
     autopilot = Autopilot(Scenario(), "px4", peers=[address], ready_s=0.0)
     autopilot.wake(now_ns=0)
@@ -663,7 +648,6 @@ def test_whom_it_is_told_of_hears_it_from_the_start() -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.binary(max_size=80), max_size=20))
 def test_garbage_is_counted(garbage: list[bytes]) -> None:
-    """No peer is made of it, nothing is sent back, nothing arms."""
     autopilot = Autopilot(Scenario(), "ardupilot", ready_s=0.0)
     for k, payload in enumerate(garbage):
         from_ = ("192.0.2.1", k)

@@ -50,7 +50,6 @@ def heartbeat(own: socket.socket) -> object:
 
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_autopilot_is_one(line: str, tmp_path: Path) -> None:
-    """The documented commands run, with other ports: it answers each sender, or speaks first."""
     counted = tmp_path / "counted.json"
     with companion() as own:
         port = own.getsockname()[1]
@@ -81,7 +80,6 @@ def test_a_documented_autopilot_is_one(line: str, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(argv: list[str], said: str) -> None:
-    """Exit code 2."""
     run = skytether("autopilot", *argv)
     assert run.returncode == 2
     assert said in run.stderr
@@ -89,7 +87,6 @@ def test_what_cannot_be_is_refused_in_a_line(argv: list[str], said: str) -> None
 
 
 def test_an_insecure_one_may_be_reached() -> None:
-    """The option --insecure allows an address that other machines can reach."""
     with Command("autopilot", "--bind", "0.0.0.0:0", "--insecure", "--log", "json") as command:
         assert listening(command)
         command.send_signal(signal.SIGTERM)

@@ -29,7 +29,6 @@ def names(messages: list[object]) -> list[str]:
 
 
 def test_what_is_written_is_read() -> None:
-    """Fields, sender and number."""
     (heartbeat, position) = Codec(255, 190).decode(b"".join(frames(2)))
     assert (heartbeat.custom_mode, heartbeat.autopilot, heartbeat.get_srcSystem()) == (4, 3, 1)
     assert (position.x, position.z, position.vz, position.get_seq()) == (1.0, -5.0, -0.125, 1)
@@ -49,7 +48,6 @@ def test_frames_are_found_among_noise(noise: list[bytes], stream: bool) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_frame_that_was_cut_off_takes_no_other_with_it(data: st.DataObject) -> None:
-    """Wherever it was cut."""
     first, second = frames(2)
     cut = first[: data.draw(st.integers(0, len(first) - 1))]
     assert names(Codec(255, 190).decode(cut + second)) == ["LOCAL_POSITION_NED"]
@@ -58,7 +56,6 @@ def test_a_frame_that_was_cut_off_takes_no_other_with_it(data: st.DataObject) ->
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 40), max_size=20))
 def test_a_stream_may_come_in_any_pieces(sizes: list[int]) -> None:
-    """The decoder never waits for more than one frame."""
     codec, sent, read = Codec(255, 190, stream=True), b"".join(frames(5)), []
     for size in [*sizes, len(sent)]:
         read += codec.decode(sent[:size])
@@ -145,6 +142,5 @@ def test_texts_that_never_end_are_bounded() -> None:
 
 
 def test_down_is_altitude_with_the_other_sign() -> None:
-    """There and back."""
     assert turned((1.0, 2.0, -5.0)) == (1.0, 2.0, 5.0)
     assert turned(turned((1.0, 2.0, -5.0))) == (1.0, 2.0, -5.0)

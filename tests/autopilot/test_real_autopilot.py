@@ -252,7 +252,6 @@ async def test_arducopter_brakes_and_hovers_while_the_link_is_cut(tmp_path: Path
 
 @needs_px4
 async def test_px4_flies_a_figure_eight_over_the_papers_network(tmp_path: Path) -> None:
-    """With the quadrotor of its built-in simulator."""
     model = {"tau_s": [0.5], "gain": 0.85, "dead_time_s": [0.1]}
     flight = Flight(tmp_path, scenario("udp:127.0.0.1:14540", **model))
     build = Path(PX4).resolve()

@@ -20,6 +20,7 @@ from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.aboard import AutopilotText
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import Finished, Flying
 from skytether.shared.scenario import reading
@@ -86,7 +87,6 @@ def test_targets_leave_it_to_the_autopilot_to_regulate() -> None:
 def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
     time_s: float, lead_s: float, age_s: float
 ) -> None:
-    """The set-point is the desired velocity, for every lead and age."""
     heard = Heard(time_s - age_s, EIGHT(np.array(time_s - age_s))[:, 0])
     chosen = setpoint(laws.make("led", lead_s), EIGHT, time_s, heard)
     np.testing.assert_allclose(chosen.velocity, EIGHT(np.array(time_s + lead_s))[:, 1])
@@ -108,7 +108,6 @@ def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
 def test_a_number_that_is_of_no_use_is_refused(
     argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Before anything is flown, by both commands."""
     for name in ("straight", "station"):
         assert main([name, *argv]) == 2
         assert capsys.readouterr().err == f"{name}: {said}\n"
@@ -143,13 +142,12 @@ def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
     one, other = flown("targets", "px4"), flown("targets", "px4")
     assert one.trace_hash() == other.trace_hash()
     assert [type(each.event) for each in one.events].count(Finished) == 1
-    said = [str(each.event) for each in one.events]
-    assert "vehicle 1, its autopilot: Disarmed by external command" in said
+    said = [each.event.text for each in one.events if isinstance(each.event, AutopilotText)]
+    assert any(text.startswith("Disarmed") for text in said)
     np.testing.assert_allclose(one.client["state"][0, :, 0], [0.0, 0.0, 5.0], atol=0.6)
 
 
 def test_half_of_all_packets_may_be_lost() -> None:
-    """Every request is repeated until it is confirmed."""
     half = {"delay": "constant", "minimum_s": 0.2, "loss": 0.5}
     record = flown(network={"uplink": half, "downlink": half})
     assert record.failure is None
@@ -246,11 +244,10 @@ def test_bytes_of_anybody_change_nothing(garbage: list[bytes], system: int) -> N
 
 
 def test_what_is_no_quadrotor_is_not_flown() -> None:
-    """Said in words."""
     station = Station(scenario(), laws.LAWS["led"])
     plane = dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
     station.receive(Datagram(Codec(1, 1).encode(plane), ("plane", 1)), now_ns=0)
-    assert "it is of MAV_TYPE 1, expected one that hovers" in str(station.failure)
+    assert "MAV_TYPE 1" in str(station.failure)
     assert station.finished
 
 
@@ -320,7 +317,6 @@ def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> au
 
 
 def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
-    """Means over seeds of one flavour and air."""
     flights = [
         flight("led", "wind", 0, rmse_xy=0.1, uplink_packets=80),
         flight("led", "wind", 1, rmse_xy=0.2, uplink_packets=120),

@@ -64,7 +64,6 @@ def run(argv: list[str], environment: str = "") -> subprocess.CompletedProcess[s
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: Path) -> None:
-    """It ends with 0 and says nothing on stderr; where there is a stream, it has its table."""
     file = tmp_path / "summary.json"
     fleet = run(["fleet", *VIRTUAL, "--json", str(file)], environment)
     assert (fleet.returncode, fleet.stderr) == (0, "")
@@ -105,7 +104,6 @@ def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> 
 
 
 def test_a_sweep_needs_neither_streams_nor_home(tmp_path: Path) -> None:
-    """In its workers, too."""
     out = tmp_path / "swept"
     argv = ["sweep", "demo", *SHORT, "--runs", "2", "--workers", "1", "--out", str(out)]
     assert run(argv, "everything at once").returncode == 0
@@ -114,7 +112,6 @@ def test_a_sweep_needs_neither_streams_nor_home(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("term", ["dumb", "xterm"])
 def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> None:
-    """No escape sequence is sent to it; another has a progress bar."""
     ours, theirs = pty.openpty()
     argv = [*SKYTETHER, "fleet", *VIRTUAL]
     environment = os.environ | {"TERM": term}
@@ -142,7 +139,6 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     ],
 )
 def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag: str) -> None:
-    """The message has the number needed, the number allowed, and the remedy."""
     done = run(argv, "64 open files")
     assert done.returncode in (1, 2)
     said = f"{flag}: got 200, which takes 248 open files; expected at most 16, for 64 may be open"
@@ -151,7 +147,6 @@ def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag
 
 
 def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
-    """Unless it is told how many; and says so."""
     line = f"ulimit -n 64; exec {shlex.join([*SKYTETHER, 'netem', '--bind', '127.0.0.1:0'])}"
     with subprocess.Popen(
         ["sh", "-c", line], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -169,7 +164,6 @@ def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
 def test_a_file_that_cannot_be_written_is_told_before_the_flight(
     command: str, flag: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A folder that is missing, a folder in the file's place; nothing else changes."""
     kept = tmp_path / "kept.png"
     kept.write_text("kept")
     argv = [command, "--virtual", "--duration", "86400"]
@@ -193,7 +187,6 @@ def test_a_file_that_cannot_be_written_is_told_before_the_flight(
 def test_a_process_that_cannot_write_does_not_start(
     process: str, flag: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """It is told in one line."""
     file = tmp_path / "none" / "a"
     assert main([process, flag, str(file)]) == 2
     said = f"{process}: {flag}: {file}: cannot be written: No such file or directory\n"
@@ -201,7 +194,6 @@ def test_a_process_that_cannot_write_does_not_start(
 
 
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
-    """The disk of standard output may be full, or that of an output file."""
     full = subprocess.run(
         ["sh", "-c", f"{shlex.join([*SKYTETHER, 'scenarios'])} >/dev/full"],
         capture_output=True,
@@ -222,7 +214,6 @@ def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_mistake_is_one_line_whatever_stands_in_it() -> None:
-    """Control characters, and bytes that are no text, are shown and not sent to the terminal."""
     done = run(["fly", "a\n\x1b[31m\udcff"])
     said = r"fly: a\n\x1b[31m\udcff: no such scenario; there are "
     assert done.returncode == 2
@@ -282,7 +273,6 @@ def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) ->
 
 
 def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
-    """While they start, and when they fly."""
     argv = [*SKYTETHER, "fly", *SHORT]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
         until(lambda: ignores_usr1(fly.pid))
@@ -305,7 +295,6 @@ def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
 def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
     count: int, number: int, tmp_path: Path
 ) -> None:
-    """One line, no file, and none of the processes that were there, one, two or all of them."""
     folder = tmp_path / "tmp"
     folder.mkdir()
     # A horizon that never comes: the flight cannot begin before the signal does.
@@ -324,7 +313,6 @@ def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
 
 
 def test_ctrl_c_while_a_command_is_imported_is_no_traceback() -> None:
-    """It ends at once, as if nothing had begun."""
     argv = [*SKYTETHER, "fly"]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
         until(lambda: ignores_usr1(fly.pid))  # the imports have just begun

@@ -104,7 +104,6 @@ def refusal(prog: str, module: str, extra: str) -> str:
 
 
 def test_every_command_has_its_needs_told_here() -> None:
-    """A new one is added to the table above."""
     assert set(NEEDS) == set(COMMANDS)
 
 
@@ -175,7 +174,6 @@ def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
 
 
 def test_a_library_call_names_the_extra_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The smallest of those that have the module; a module of no extra is left as it is."""
     for module in ("mcap", "json.tool", "pytest"):
         monkeypatch.setitem(sys.modules, module, None)
     smallest = pytest.raises(extras.ExtraMissing, match=r"^mcap is not .*'skytether\[record\]'$")

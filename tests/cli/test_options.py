@@ -65,7 +65,6 @@ def by_tyro(default: Any, argv: Sequence[str], monkeypatch: pytest.MonkeyPatch) 
 def test_plain_flags_are_read_as_tyro_reads_them(
     default: Any, argv: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To the last value."""
     plain = options.plain(default, argv)
     assert plain is not None
     assert plain == by_tyro(default, argv, monkeypatch)
@@ -73,12 +72,10 @@ def test_plain_flags_are_read_as_tyro_reads_them(
 
 @pytest.mark.parametrize(("default", "argv"), NOT_PLAIN)
 def test_any_other_line_is_for_tyro(default: Any, argv: list[str]) -> None:
-    """Help, mistakes, and all that has more than one meaning."""
     assert options.plain(default, argv) is None
 
 
 def test_a_command_with_a_required_option_is_for_tyro() -> None:
-    """It says what is missing."""
     assert options.plain(keygen.KeygenOptions(options), ["file"]) is None  # type: ignore[arg-type]
 
 

@@ -168,7 +168,6 @@ def line_of(option: str, inputs: dict[str, Path], out: Path) -> tuple[list[str],
 def test_no_output_is_an_input(
     option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By whichever name: here the output is another link to the same file."""
     out = tmp_path / "out"
     out.mkdir()
     argv, source, target = line_of(option, inputs, out)
@@ -199,7 +198,6 @@ def test_nor_by_its_own_name(
 def test_a_file_that_a_scenario_names_is_an_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What it extends, and its trajectory."""
     (tmp_path / "below.toml").write_text(SCENARIO)
     (tmp_path / "way.csv").write_text("t,x,y\n0,0,0\n10,1,1\n")
     above = tmp_path / "above.toml"
@@ -214,7 +212,6 @@ def test_a_file_that_a_scenario_names_is_an_input(
 def test_two_options_do_not_name_one_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The second would replace the first."""
     at = str(tmp_path / "it.png")
     assert main(["fly", "demo", *SHORT, "--json", at, "--figure", at]) == 2
     assert "another option names it as well" in capsys.readouterr().err
@@ -256,7 +253,6 @@ def test_two_commands_do_not_write_one_file(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The second is refused before it flies."""
     at = tmp_path / name
     if name == "folder":
         at.mkdir()
@@ -271,7 +267,6 @@ def test_two_commands_do_not_write_one_file(
 
 
 def test_a_new_file_is_locked_at_once_and_gone_where_nothing_was_written(tmp_path: Path) -> None:
-    """It is empty until then."""
     at = tmp_path / "it"
     with files.apart():
         files.claim(at)
@@ -341,7 +336,6 @@ def test_a_full_disk_leaves_the_older_file(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Whole, and nothing beside it; without an older one there is none."""
     at = tmp_path / name
     words = [str(recording) if word == "FLIGHT" else word for word in argv]
     for older in (b"older", None):

@@ -32,7 +32,6 @@ from skytether.shell.log import LogLine
 
 
 async def test_a_child_is_known_by_its_events() -> None:
-    """It listens where its first event says, and counts at its end, which is no last word."""
     heard: list[LogLine] = []
     argv = ("demo", "--bind", "0.0.0.0:0", "--insecure")
     async with started("server", *argv, on_event=heard.append) as server:
@@ -56,7 +55,6 @@ async def test_a_scenario_without_a_failsafe_is_warned_of(name: str) -> None:
 
 
 async def test_metrics_that_others_can_read_are_warned_of() -> None:
-    """They have no password."""
     for host, local in (("127.0.0.1", True), ("0.0.0.0", False)):
         heard: list[LogLine] = []
         argv = ("demo", "--bind", "127.0.0.1:0", "--metrics", f"{host}:0")
@@ -68,21 +66,18 @@ async def test_metrics_that_others_can_read_are_warned_of() -> None:
 
 @pytest.mark.ipv6
 async def test_a_child_may_listen_on_ipv6() -> None:
-    """Its address is a host and a port, as of any other."""
     argv = ("demo", "--bind", "[::1]:0", "--server", "[::1]:9")
     async with started("netem", *argv) as netem:
         assert netem.address[0] == "::1"
 
 
 async def test_a_child_that_cannot_start_says_why() -> None:
-    """In the one line that it would have for a user."""
     with pytest.raises(CommandError, match=r"netem: papr: no such scenario; did you mean paper\?"):
         async with started("netem", "papr"):
             pass
 
 
 async def test_a_child_that_is_killed_is_said_to_be() -> None:
-    """Its last line, that it listens, is no reason to end."""
     async with started("netem", "demo", "--bind", "127.0.0.1:0") as netem:
         os.kill(netem.process.pid, signal.SIGKILL)
         assert await netem.process.wait() == -signal.SIGKILL
@@ -125,7 +120,6 @@ def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) ->
 
 
 async def test_a_line_without_end_hides_nothing_that_follows() -> None:
-    """Lines after an endless one are still read."""
     heard: list[LogLine] = []
     stream = asyncio.StreamReader(limit=1000)
     line = LogLine(process="client", time_ns=5, event=Flying(vehicle=1))
@@ -137,7 +131,6 @@ async def test_a_line_without_end_hides_nothing_that_follows() -> None:
 
 
 async def test_a_line_that_is_nested_deeply_hides_nothing_that_follows() -> None:
-    """It is no event, and no reason to hear the child no more."""
     heard: list[LogLine] = []
     stream = asyncio.StreamReader(limit=100_000)
     line = LogLine(process="client", time_ns=5, event=Counted(figures={"deep": [[]]}))

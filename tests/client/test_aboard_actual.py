@@ -43,7 +43,6 @@ def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None
 
 
 def test_a_simulator_that_runs_faster_than_time_is_not_flown_and_its_speed_is_told() -> None:
-    """Five times as fast: no clock of ours follows that."""
     air = Air(autopilot_ppm=4e6, mavlink={"patience_s": 5.0})
     air.run(20.0, lambda: bool(air.of(NotTakenOff)))
     (failed,) = air.of(NotTakenOff)

@@ -175,7 +175,6 @@ def test_any_bytes_raise_nothing_and_arm_nothing(
 @given(st.lists(st.binary(max_size=300), max_size=30))
 @settings(max_examples=50, deadline=None)
 def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
-    """Random bytes on a TCP or serial line get no answer and raise nothing."""
     flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
     assert flies.port is not None
     for piece in pieces:
@@ -195,7 +194,6 @@ def test_what_is_set_is_what_is_safe(rules: tuple[safety.Rule, ...]) -> None:
 
 
 def test_the_extra_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`pip install skytether[mavlink]`."""
     monkeypatch.setitem(__import__("sys").modules, "pymavlink", None)
     for name in list(__import__("sys").modules):
         if name.startswith(("skytether.mavlink", "skytether.client.mavlink", "pymavlink.")):

@@ -137,7 +137,6 @@ def field_in(folder: Path) -> list[str]:
 
 @pytest.mark.usefixtures("documented_ports")
 def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """Those of docs/fly-a-real-one.md, with its scenario, each line in a process of its own."""
     blocks = field_in(tmp_path)
     (block,) = (each for each in blocks if "skytether client field.toml" in each)
     lines = [[sys.executable, "-P", "-m", *shlex.split(line)] for line in block.splitlines()]
@@ -155,7 +154,6 @@ def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("documented_ports")
 def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
-    """It sets the parameters where it is told to, and is refused where it is not."""
     field_in(tmp_path)
     skytether = [sys.executable, "-P", "-m", "skytether"]
     fly = [*skytether, "fly", "field.toml", "--duration", "4", "--settle", "0"]
@@ -177,7 +175,6 @@ def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
 
 
 async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
-    """Exit code 2, and nothing is armed."""
     processes = Processes(tmp_path, "ardupilot")
     assert await processes.run() == 2
     (failure,) = processes.events(ParametersUnsafe)

@@ -116,7 +116,6 @@ def flying(**changes: Any) -> Server:
 
 
 def test_hello_is_repeated_until_somebody_answers() -> None:
-    """Once a second, with the terms of the scenario."""
     server = Server(scenario())
     said = []
     for second in range(4):
@@ -136,12 +135,10 @@ def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
     assert server.client.failure == failure
     waits = Unanswered(vehicle=4, host="server", port=0, left_s=10.0)
     assert server.client.events() == (waits, failure)
-    assert str(failure) == "vehicle 4: no answer from server:0 in 16 s"
     assert server.client.next_wake_ns() is None
 
 
 def test_another_scenario_at_the_server_ends_the_client_with_the_difference() -> None:
-    """Flying with other terms than the server's would be flying blind."""
     server = Server(scenario())
     server.wake()
     server.welcome(terms=server.terms._replace(dt_ns=20_000_000))
@@ -151,18 +148,14 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
     )
     assert server.client.failure == failure
     assert server.client.events() == (failure,)
-    assert str(failure).endswith(": control.dt is 0.05 here and 0.02 at the other end")
 
 
 @pytest.mark.parametrize(
-    ("refusal", "reason", "said"),
-    [
-        (Refusal.FULL, "full", "the server is full; see its --vehicles"),
-        (Refusal.TAKEN, "taken", "another client flies under this number; see --id"),
-    ],
+    ("refusal", "reason"),
+    [(Refusal.FULL, "full"), (Refusal.TAKEN, "taken")],
 )
 def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
-    refusal: int, reason: Literal["full", "taken"], said: str
+    refusal: int, reason: Literal["full", "taken"]
 ) -> None:
     """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
     server, hellos = Server(scenario(link={"connect_s": 15.0})), 0
@@ -173,13 +166,11 @@ def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason
     failure = NoSession(vehicle=4, host="server", port=0, reason=reason)
     assert server.client.failure == failure
     assert server.client.events() == (failure,)
-    assert str(failure) == f"vehicle 4 is refused by server:0: {said}"
     assert server.client.next_wake_ns() is None
     assert server.client.dropped == {reason: 38}
 
 
 def test_a_vehicle_that_hears_its_server_says_no_hello_again() -> None:
-    """Without keys there are none to be exchanged: it tells its state alone."""
     server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0})
     said: list[Message] = []
     for step in range(100):
@@ -189,7 +180,6 @@ def test_a_vehicle_that_hears_its_server_says_no_hello_again() -> None:
 
 
 def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
-    """The refusals before leave nothing behind."""
     server = Server(scenario())
     for refusal in (Refusal.FULL, Refusal.TAKEN, Refusal.ACCEPTED):
         server.wake()
@@ -217,7 +207,6 @@ def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
 
 
 def test_another_scenario_in_flight_is_dropped() -> None:
-    """The vehicle goes on with its horizon; only before the first session is it a failure."""
     server = flying()
     server.welcome(terms=server.terms._replace(horizon=server.terms.horizon + 1))
     assert server.client.failure is None
@@ -225,7 +214,6 @@ def test_another_scenario_in_flight_is_dropped() -> None:
 
 
 def test_nothing_of_a_closed_session_is_heard() -> None:
-    """Another WELCOME opens it again."""
     server, beat = flying(vehicle={"exhausted": "brake"}), Heartbeat(4, 7, 0, 0, 0, 1, 25)
     server.say(beat)
     server.say(Close(4, 7))
@@ -250,7 +238,6 @@ def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() ->
 
 
 def test_packets_are_numbered_anew_in_each_session() -> None:
-    """The server counts losses by these numbers."""
     server = flying()
     numbers = [said.number for _ in range(3) for said in server.wake()]  # type: ignore[union-attr]
     server.session = 8
@@ -294,7 +281,6 @@ def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> No
 
 
 def test_the_vehicle_hovers_until_its_first_horizon() -> None:
-    """Zero desired velocity, and an observation at every step all the same."""
     server = flying()
     for step in range(5):
         (said,) = server.wake()
@@ -380,7 +366,6 @@ def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
 
 
 def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
-    """Packets of the old session are dropped; steps go on."""
     server = flying()
     server.wake()
     server.session = 8
@@ -394,7 +379,6 @@ def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
 
 
 def test_an_answer_to_another_life_is_dropped() -> None:
-    """The boot id tells them apart."""
     server = Server(scenario())
     server.wake()
     server.welcome(boot_id=98)
@@ -403,7 +387,6 @@ def test_an_answer_to_another_life_is_dropped() -> None:
 
 
 def test_the_flight_ends_after_its_duration() -> None:
-    """The flight has as many steps as fit, then no more wakes."""
     server = flying()
     for step in range(200):
         assert not server.client.finished
@@ -434,7 +417,6 @@ def test_an_exhausted_horizon_brakes_or_holds() -> None:
 
 
 def test_only_the_servers_address_is_heard() -> None:
-    """Not even what the server has said, from anywhere else: it opens no session."""
     server = Server(scenario())
     server.wake()
     welcome = Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, server.terms)

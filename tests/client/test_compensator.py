@@ -60,7 +60,6 @@ def chosen(compensator: Compensator, step: int, state: Array) -> Array:
 
 
 def test_vehicle_hovers_before_its_first_horizon() -> None:
-    """There is nothing to fly yet."""
     compensator = Compensator(terms())
     assert compensator.in_force == NO_HORIZON
     assert chosen(compensator, 0, HERE).tolist() == [0.0, 0.0]
@@ -115,7 +114,6 @@ def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> N
 
 
 def test_brake_from_a_standstill_stays() -> None:
-    """There is no direction to brake in."""
     compensator = holding(0, np.zeros((2, H)), exhausted="brake")
     assert chosen(compensator, H + 3, HERE).tolist() == [0.0, 0.0]
 
@@ -133,7 +131,6 @@ def test_stale_horizon_is_ignored_after_reordering() -> None:
 @quick
 @given(st.permutations(range(5)), st.integers(4, 12))
 def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
-    """Once all have arrived, the newest is in force."""
     compensator = Compensator(terms())
     for made in order:
         compensator.offer(horizon(made, INPUTS * 0.1 * (made + 1)), 4, 0)
@@ -206,7 +203,6 @@ def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
 
 
 def test_horizon_from_the_future_is_refused() -> None:
-    """One more than H steps ahead could not be replaced for long; it changes nothing."""
     compensator = holding(100)
     with pytest.raises(ProtocolError, match=r"^from the future$"):
         compensator.offer(horizon(111 + H, INPUTS + 0.2), 110, 109)
@@ -215,7 +211,6 @@ def test_horizon_from_the_future_is_refused() -> None:
 
 
 def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
-    """The limit itself is not beyond it."""
     compensator = holding(100)
     compensator.offer(horizon(110 + H), 110, 109)
     assert compensator.in_force == 110 + H
@@ -229,7 +224,6 @@ def test_inputs_are_held_within_the_bounds() -> None:
 
 
 def test_chosen_input_is_the_caller_s_own() -> None:
-    """Writing to it does not write to the horizon."""
     for compensator in (holding(0), holding(0, scheme="none"), holding(0, exhausted="brake")):
         compensator.choose(0, HERE.tolist())[:] = [9.0, 9.0]
         np.testing.assert_allclose(chosen(compensator, 0, HERE), INPUTS[:, 0], rtol=1e-7)
@@ -371,7 +365,6 @@ def with_feedback(x: Array, disturbance: Array, gain: Array = GAIN) -> Horizon:
 
 @pytest.mark.parametrize("stage", [0, 1, 5, H - 1])
 def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
-    """K times what the state is away from there, onto the input of the stage."""
     flown = terms(scheme="committed", feedback=True)
     x, disturbance = np.array([[0.5, 0.25], [-1.0, 0.125]]), np.array([0.25, -0.5])
     compensator = Compensator(flown)
@@ -386,7 +379,6 @@ def test_feedback_leads_back_to_where_the_inputs_lead(stage: int) -> None:
 
 
 def test_feedback_stays_within_the_bounds() -> None:
-    """However far away the vehicle is."""
     compensator = Compensator(terms(scheme="committed", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     far = np.array([[1e6, 0.0], [-1e6, 0.0]])
@@ -394,7 +386,6 @@ def test_feedback_stays_within_the_bounds() -> None:
 
 
 def test_there_is_no_feedback_before_the_first_stage() -> None:
-    """Nothing says where the vehicle should be."""
     compensator, plain = Compensator(terms(exhausted="brake")), holding(100, exhausted="brake")
     compensator.offer(with_feedback(HERE, np.zeros(2)), 99, 98)
     near, far = (chosen(compensator, 99, HERE + away) for away in (0.0, 3.0))
@@ -450,7 +441,6 @@ def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
 
 
 def test_a_horizon_that_is_dropped_leaves_no_feedback() -> None:
-    """The last input is braked, whatever the state."""
     compensator = Compensator(terms(exhausted="brake", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     compensator.drop(104, np.array([0.6, 0.8]))
@@ -473,7 +463,6 @@ def test_a_horizon_that_is_dropped_covers_nothing_from_then_on() -> None:
 
 
 def test_feedback_ends_with_its_horizon() -> None:
-    """The next may come without."""
     compensator = Compensator(terms(scheme="committed", feedback=True))
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
     compensator.offer(horizon(101), 101, 100)

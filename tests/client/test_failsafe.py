@@ -5,7 +5,6 @@ A hand makes the server's messages, at a step of 20 ms each; the vehicle is the 
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -23,7 +22,6 @@ from skytether.client.endpoint import Client
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
 from skytether.client.link import PlainLink
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
-from skytether.lab.states import svg
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -53,7 +51,6 @@ from skytether.shared.wire.protocol import (
 )
 
 SERVER: Address = ("server", 0)
-DIAGRAM = Path(__file__).parents[2] / "docs/failsafe.svg"
 STEPS_PER_S = 50
 H = 100
 D = 5
@@ -272,11 +269,10 @@ def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
 
 
 def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
-    """It stays ready, says so, and tells the server that it takes no horizon."""
     hand = Hand(armed=False)
     hand.fly(3.0, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.READY, False, 0.0)
-    assert hand.changes[-1] == ("ready", "it is not armed")
+    assert hand.changes[-1] == ("ready", str(Reason.UNARMED))
 
 
 def test_a_client_that_was_restarted_begins_anew_and_disarmed_if_told() -> None:
@@ -312,8 +308,8 @@ def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() ->
     hand.fly(1.0)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, True, 0.0)
     assert hand.changes[-2:] == [
-        ("brake", "no newer horizon has come"),
-        ("hover", "no newer horizon has come"),
+        ("brake", str(Reason.OLD)),
+        ("hover", str(Reason.OLD)),
     ]
     hand.horizon()
     hand.fly(0.02)
@@ -362,7 +358,7 @@ def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
     assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
     hand.fly(0.6, beats=False)
     assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
-    assert hand.changes[-1] == ("hover", "the server is silent")
+    assert hand.changes[-1] == ("hover", str(Reason.LOST))
     hand.fly(0.9, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
     hand.fly(0.2)
@@ -382,11 +378,10 @@ def test_ten_seconds_of_hovering_alone_end_in_landing_for_good() -> None:
     hand.fly(5.0, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.LAND, False, 0.0)
     assert hand.rows()["state"][-1, 2, 0] == pytest.approx(0.0, abs=0.5)
-    assert hand.changes[-1] == ("land", "the server has been silent for long")
+    assert hand.changes[-1] == ("land", str(Reason.ALONE))
 
 
 def test_a_vehicle_that_never_lands_hovers_on() -> None:
-    """With `vehicle.land_after_s` 0; it flies again once the server is back."""
     hand = tracking(vehicle={"land_after_s": 0.0})
     hand.fly(40.0, beats=False)
     assert (hand.mode, hand.speed) == (Mode.HOVER, 0.0)
@@ -396,7 +391,6 @@ def test_a_vehicle_that_never_lands_hovers_on() -> None:
 
 
 def test_in_the_plane_landing_is_staying() -> None:
-    """There is no down."""
     hand = tracking()
     hand.fly(12.0, beats=False)
     assert (hand.mode, hand.speed) == (Mode.LAND, 0.0)
@@ -412,12 +406,11 @@ def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
         hand.fly(0.02)
         assert hand.step <= begun + 30
     assert hand.step == begun + 26
-    assert hand.changes[-1] == ("brake", "horizons come too late")
+    assert hand.changes[-1] == ("brake", str(Reason.LATE))
     comes_to_hover_and_takes_no_horizon(hand)
 
 
 def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
-    """A few stragglers say nothing."""
     hand = tracking()
     hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
     for _ in range(5):
@@ -427,7 +420,7 @@ def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
         hand.fly(0.3)
         hand.horizon(hand.step - D - 74)
         hand.fly(0.02)
-    assert ("brake", "horizons come too late") not in hand.changes
+    assert ("brake", str(Reason.LATE)) not in hand.changes
 
 
 def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
@@ -436,7 +429,7 @@ def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
     hand.session = 8
     hand.welcome(server_boot_id=2)
     comes_to_hover_and_takes_no_horizon(hand)
-    assert ("brake", "the server has restarted") in hand.changes
+    assert ("brake", str(Reason.RESTARTED)) in hand.changes
 
 
 def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
@@ -450,7 +443,7 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
     for _ in range(5):
         hand.say(with_input_out_of_range(hand))
     comes_to_hover_and_takes_no_horizon(hand)
-    assert ("brake", "the server sends malformed messages") in hand.changes
+    assert ("brake", str(Reason.MALFORMED)) in hand.changes
 
 
 def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
@@ -483,7 +476,6 @@ def with_input_out_of_range(hand: Hand) -> Horizon:
 
 
 def test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages() -> None:
-    """Nobody vouches for them."""
     hand = tracking()
     for _ in range(100):
         hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
@@ -502,7 +494,7 @@ def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
     hand.fly(0.02, plans=True)
     assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
     assert any(isinstance(each, Hello) for each in hand.out)
-    assert hand.changes[-1] == ("brake", "the server plans for impossible times")
+    assert hand.changes[-1] == ("brake", str(Reason.RESYNC))
     hand.welcome()
     comes_to_hover_and_takes_no_horizon(hand)
 
@@ -517,7 +509,7 @@ def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
     assert any(isinstance(each, Hello) for each in hand.out)
     hand.fly(3.0, plans=True)
     assert (hand.mode, hand.takes) == (Mode.HOVER, False)
-    assert hand.changes[-1] == ("hover", "the server has closed the session")
+    assert hand.changes[-1] == ("hover", str(Reason.CLOSED))
     hand.session = 8
     hand.welcome(server_boot_id=2)
     hand.fly(1.2)
@@ -525,7 +517,6 @@ def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
 
 
 def test_a_close_of_another_session_is_dropped() -> None:
-    """It may be of the life before."""
     hand = tracking()
     hand.say(Close(4, 6))
     hand.fly(0.02, plans=True)
@@ -539,7 +530,7 @@ def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon()
     hand.heartbeat()
     hand.fly(0.02)
     assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, True, NO_HORIZON)
-    assert hand.changes[-1] == ("brake", "its own computer woke it too late")
+    assert hand.changes[-1] == ("brake", str(Reason.STALLED))
     hand.horizon()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
@@ -552,7 +543,6 @@ def test_being_woken_late_is_not_said_to_be_sleep() -> None:
 
 
 def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
-    """A busy machine is no reason."""
     hand = tracking()
     hand.now_ns += 100_000_000
     hand.fly(0.02)
@@ -562,7 +552,7 @@ def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
 def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
     """The vehicle coasts, brakes, and says what the server said."""
     for idle, degraded, why in (
-        (Idle.UNSOLVED, 0, "the solver has found none"),
+        (Idle.UNSOLVED, 0, str(Idle.UNSOLVED)),
         (Idle.PLANS, 1, "the server misses its deadlines"),
     ):
         hand = tracking()
@@ -586,7 +576,7 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
         rows = hand.rows()[160:]
         assert (rows["mode"] == Mode.FAULT).all()
         assert not rows["input"].any()
-        assert hand.changes[-1] == ("fault", "its state or its input is not finite")
+        assert hand.changes[-1] == ("fault", str(Reason.NOT_FINITE))
 
 
 def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chosen() -> None:
@@ -596,10 +586,10 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
         hand.flies.plant.x = [(x + p, w + v) for x, w in hand.flies.plant.x]
         hand.fly(0.02, plans=True)
         assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
-        assert hand.changes[-1] == ("brake", "its state has jumped further than a vehicle can move")
+        assert hand.changes[-1] == ("brake", str(Reason.LEAPT))
         hand.fly(9.0, plans=True)
         assert (hand.mode, hand.takes) == (Mode.HOVER, False)
-        assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
+        assert hand.changes[-1] == ("hover", str(Reason.LEAPT))
         running = Running(hand.client, hand.scenario)
         with pytest.raises(ConfigError, match=r"^vehicle.after_leap: .*has not subtracted"):
             running.change({"vehicle.after_leap": "old"}, now_ns=hand.now_ns)
@@ -618,10 +608,10 @@ def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
     hand.flies.plant.x = [(x + 300.0, w) for x, w in hand.flies.plant.x]
     hand.fly(3.0, plans=True)
     hand.fly(2.0, beats=False)
-    assert hand.changes[-1] == ("hover", "the server is silent")
+    assert hand.changes[-1] == ("hover", str(Reason.LOST))
     hand.fly(3.0, plans=True)
     assert (hand.mode, hand.takes) == (Mode.HOVER, False)
-    assert hand.changes[-1] == ("hover", "its state has jumped further than a vehicle can move")
+    assert hand.changes[-1] == ("hover", str(Reason.LEAPT))
 
 
 @pytest.mark.parametrize(("slept_s", "mode"), [(0, Mode.TRACK), (30, Mode.TRACK), (31, Mode.BRAKE)])
@@ -649,7 +639,7 @@ def test_a_vehicle_that_holds_has_no_failsafe() -> None:
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
     hand.fly((D + H) / STEPS_PER_S + 0.1)
-    assert hand.changes[-1] == ("coast", "no newer horizon has come")
+    assert hand.changes[-1] == ("coast", str(Reason.OLD))
     hand.session = 8
     hand.welcome(server_boot_id=2)
     hand.say(Close(4, hand.session))
@@ -721,7 +711,6 @@ def test_no_mistake_of_the_compensator_reaches_the_plant(
 
 
 def test_a_slew_that_would_not_let_it_brake_is_refused() -> None:
-    """Braking is always allowed."""
     with pytest.raises(ConfigError, match=r"^test: vehicle.slew_mps2: got 1.5, expected at least"):
         scenario(vehicle={"slew_mps2": 1.5})
 
@@ -731,7 +720,6 @@ def test_a_slew_that_would_not_let_it_brake_is_refused() -> None:
 
 @pytest.mark.parametrize("table", [TABLE, HOLD])
 def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.Table) -> None:
-    """Somebody has to see to the vehicle first."""
     out = [(before, after) for (before, _), after in table.items()]
     assert {after for before, after in out if before is Mode.LAND} <= {Mode.FAULT}
     assert not [before for before, _ in out if before is Mode.FAULT]
@@ -761,11 +749,6 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         locked &= not (cause is Reason.GOOD and before[0] in (Mode.SYNC, Mode.HOVER))
         locked |= told[-1:] == [cause] and cause in failsafe.LOCKING
         assert not (locked and aboard.takes)
-
-
-def test_the_diagram_in_the_documents_is_that_of_the_table() -> None:
-    """`lab.states` draws the diagram of modes, and says how to draw it anew."""
-    assert DIAGRAM.read_text() == svg()
 
 
 # -- without its guards ----------------------------------------------------------------------------
@@ -841,7 +824,7 @@ def test_a_vehicle_whose_autopilot_stays_silent_lands(monkeypatch: pytest.Monkey
     assert hand.mode is Mode.HOVER
     hand.fly(1.2, plans=True)
     assert hand.mode is Mode.LAND
-    assert hand.changes[-1] == ("land", "its autopilot is silent")
+    assert hand.changes[-1] == ("land", str(Reason.MUTE))
 
 
 def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None:
@@ -995,7 +978,6 @@ ROWS: dict[Reason, Callable[[], None]] = {
 def test_without_the_rows_of_a_cause_its_scenario_goes_wrong(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every row is needed."""
     rows = {key: after for key, after in TABLE.items() if key[1] is not cause}
     monkeypatch.setattr(skytether.client.endpoint, "TABLE", rows)
     with pytest.raises(AssertionError):
@@ -1039,7 +1021,6 @@ GUARDS: dict[str, tuple[object, str, object, Callable[[], None]]] = {
 def test_without_a_guard_its_scenario_goes_wrong(
     guard: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every guard is needed."""
     where, name, off, goes_wrong = GUARDS[guard]
     monkeypatch.setattr(where, name, off)
     with pytest.raises(AssertionError):

@@ -43,12 +43,10 @@ class WithoutForesight(Fence):
 
 @pytest.mark.parametrize("fences", [WithoutMargin, WithoutForesight])
 def test_without_a_guard_the_fence_is_flown_over(fences: type[Fence]) -> None:
-    """Each is needed by some of the vehicles."""
     assert max(furthest_m(seed, fences=fences) for seed in range(12)) > 0.1
 
 
 def test_a_flight_that_stays_inside_is_the_same_with_a_fence() -> None:
-    """To the last bit."""
     free = fly(scenario()).trace_hash()
     assert fly(scenario(fence={"radius_m": 50.0, "speed_mps": 5.0})).trace_hash() == free
 
@@ -132,7 +130,6 @@ def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
     ],
 )
 def test_what_leads_over_the_fence_is_refused(fence: dict[str, Any], said: str) -> None:
-    """The line says where and how fast the trajectory is, and how far inside the fence keeps."""
     with pytest.raises(ConfigError, match=said):
         scenario(fence=fence)
 

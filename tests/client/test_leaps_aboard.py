@@ -57,7 +57,6 @@ def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
 
 @pytest.mark.parametrize("armed", [True, False])
 def test_without_a_choice_it_lands(*, armed: bool) -> None:
-    """`vehicle.land_after_s` of hovering and a second later, armed or not."""
     air, running = leapt()
     if not armed:
         change(air, running, armed=False)
@@ -98,7 +97,6 @@ def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
 
 
 def test_one_that_stays_hovers_on() -> None:
-    """Until another choice is made."""
     air, running = leapt()
     change(air, running, vehicle__after_leap="stay")
     air.run(20.0)
@@ -109,7 +107,6 @@ def test_one_that_stays_hovers_on() -> None:
 
 
 def test_the_next_leap_asks_again() -> None:
-    """What was chosen for one is chosen for that one alone."""
     air, running = leapt()
     air.run(2.0)
     change(air, running, vehicle__after_leap="old")

@@ -148,7 +148,6 @@ def test_a_word_counts_on_the_ground_alone() -> None:
 
 
 def test_a_first_life_takes_off_as_before() -> None:
-    """There is nothing that anybody has to say twice."""
     air = Air("ardupilot", duration=3.0)
     air.fly()
     assert air.of(Flying)

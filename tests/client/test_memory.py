@@ -115,7 +115,6 @@ def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_
     ],
 )
 def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object]) -> None:
-    """Nothing of it reaches the vehicle."""
     wrong_kept = msgspec.structs.replace(KEPT, **wrong)
     if wrong == {"boot_id": 2**64}:
         return  # msgpack cannot hold it

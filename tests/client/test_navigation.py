@@ -124,7 +124,6 @@ def test_a_sensor_without_imperfection_needs_no_filter() -> None:
 
 
 def test_noise_and_bias_are_those_that_were_asked_for() -> None:
-    """Positions and velocities, on every axis."""
     bias = {"position_bias_m": [0.3, -0.1], "velocity_bias_mps": [0.0, 0.2]}
     sensor = Sensor(scenario(sensor=NOISE | bias), np.random.default_rng(1))
     told = np.array([sensor.measure(np.ones((2, 2)))[1:] for _ in range(20_000)])
@@ -385,7 +384,6 @@ def test_a_vehicle_with_positions_alone_is_flown_through_steady_wind(feedback: b
 
 
 def test_noisy_observations_are_all_plausible() -> None:
-    """At 10 cm and 25 cm/s, filtered or not."""
     loud = {"position_noise_m": 0.1, "velocity_noise_mps": 0.25}
     for name in ("kalman", "none"):
         flight = fly(scenario(sensor=loud | {"filter": name}, duration=20.0, settle=1.0))
@@ -393,7 +391,6 @@ def test_noisy_observations_are_all_plausible() -> None:
 
 
 def test_the_same_seed_has_the_same_noise_and_vehicles_have_their_own() -> None:
-    """Two flights are alike to the last bit; two vehicles are not."""
     one, again = (fly(scenario(sensor=NOISE, duration=6.0, settle=1.0)) for _ in range(2))
     assert one.trace_hash() == again.trace_hash()
     two = fly(scenario(sensor=NOISE, duration=6.0, settle=1.0), vehicles=2).client
@@ -534,7 +531,6 @@ def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
 
 
 def test_a_vehicle_without_a_position_is_not_known() -> None:
-    """A velocity alone begins nothing."""
     known = Navigation(scenario())
     known.advance([Measurement(0, None, [1.0, 0.0])], np.zeros(2), now_ns=0)
     assert not known.is_known

@@ -62,7 +62,6 @@ def test_without_wind_the_plant_is_the_model() -> None:
 
 
 def test_true_time_constant_may_differ_from_the_model_s() -> None:
-    """The vehicle flies with its own τ, one for all axes or one each."""
     for told, true in (([1.0], [1.0, 1.0]), ([1.0, 0.2], [1.0, 0.2])):
         flown = plant(tau_s=told)
         model, x = discretise(np.array(true), 0.05), flown.state()
@@ -123,7 +122,6 @@ def test_a_part_of_a_step_is_not_rounded_away() -> None:
 
 
 def test_wind_is_never_late() -> None:
-    """Dead time is the input's alone."""
     late, prompt = (
         plant(1, dead_time_s=dead_time_s, steady_wind_mps=[0.3, 0.0], wind=0.2, gust_mps2=1.0)
         for dead_time_s in (5.0, 0.0)
@@ -138,13 +136,11 @@ def test_flight_starts_at_rest_at_the_start_of_the_reference() -> None:
 
 
 def test_flight_starts_where_the_scenario_says() -> None:
-    """At rest there too, also in the middle."""
     assert plant(start_m=[-3.0, 4.0]).state().tolist() == [[-3.0, 0.0], [4.0, 0.0]]
     assert plant(start_m=[0.0, 0.0]).state().tolist() == [[0.0, 0.0], [0.0, 0.0]]
 
 
 def test_plant_flies_in_space() -> None:
-    """The third axis is one like the others."""
     raw = {
         "model": {"axes": 3, "tau_s": [0.81]},
         "control": {"dt": 0.05},
@@ -159,7 +155,6 @@ def test_plant_flies_in_space() -> None:
 
 
 def test_state_is_the_caller_s_own() -> None:
-    """Writing to it moves no vehicle."""
     flown = plant()
     flown.state()[:] = 9.0
     assert flown.state().tolist() == [[1.5, 0.0], [0.0, 0.0]]
@@ -230,7 +225,6 @@ def test_wind_has_the_covariance_of_white_acceleration(tau_s: float, dt_s: float
 
 
 def test_axes_have_covariances_of_their_own() -> None:
-    """Each with its own τ."""
     both = white_acceleration(np.array([0.81, 0.3]), 0.05)
     for axis, tau_s in enumerate((0.81, 0.3)):
         np.testing.assert_array_equal(both[axis], white_acceleration(np.array([tau_s]), 0.05)[0])
@@ -252,7 +246,6 @@ def test_wind_over_many_steps_varies_as_stated() -> None:
 
 
 def test_same_chance_is_the_same_flight() -> None:
-    """Wind and gusts are those of the generator given, and of nothing else."""
     wild = {"wind": 0.3, "gust_mps2": 1.0, "gust_every_s": 0.5}
     first, again, other = (flight(plant(seed, **wild)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
@@ -260,7 +253,6 @@ def test_same_chance_is_the_same_flight() -> None:
 
 
 def test_calm_flight_needs_no_chance() -> None:
-    """Without wind and gusts the generator is left as it was."""
     rng = np.random.default_rng(3)
     flight(FirstOrderPlant(scenario(), Weather(scenario(), rng)))
     assert rng.random() == np.random.default_rng(3).random()

@@ -172,7 +172,6 @@ def test_the_body_moves_as_rotorpy_s_where_that_is_installed(name: str, frame: s
 
 
 def test_what_rotorpy_gave_is_what_it_gives() -> None:
-    """The numbers above."""
     for name, command in COMMANDS.items():
         np.testing.assert_allclose(rotorpy(UNEVEN, command), ROTORPY[name], rtol=0, atol=1e-8)
 
@@ -200,7 +199,6 @@ FLOWN = [(KG15, ARDUPILOT), (FRAMES["sih"], PX4), (CRAZYFLIE, FIRMWARE)]
 
 @pytest.mark.parametrize(("frame", "gains"), FLOWN)
 def test_it_hovers(frame: Frame, gains: Gains) -> None:
-    """Within a millimetre, level; the rotors push its weight."""
     flown_ = quadrotor(frame, gains)
     rows = response(flown_, (0.0, 0.0, 0.0), 10.0)
     assert np.abs(rows - [0.0, 0.0, 5.0, 0.0, 0.0, 0.0]).max() < 1e-3
@@ -295,7 +293,6 @@ def test_no_integral_grows_without_end(frame: Frame, gains: Gains) -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 30 * MS), min_size=1, max_size=12))
 def test_time_may_pass_in_any_pieces(pieces: list[int]) -> None:
-    """In turbulence too, to the last bit."""
     whole, parts = quadrotor(), quadrotor()
     for each in (whole, parts):
         each.blow((3.0, 1.0), 6.0)
@@ -385,7 +382,6 @@ def test_an_empty_battery_cannot_keep_it_up() -> None:
 
 
 def test_an_endless_battery_stays_full() -> None:
-    """It sags, and has as much left."""
     flown_ = quadrotor(charge="endless")
     flown_.advance(np.zeros(3), 20_000 * MS)
     assert flown_.battery().charge == 1.0
@@ -408,7 +404,6 @@ def test_it_stands_on_the_ground_and_leaves_it() -> None:
 
 
 def test_a_plant_in_the_plane_keeps_its_altitude() -> None:
-    """In space, it flies the third velocity."""
     command = np.array([1.0, -0.5, 0.5])
     for axes in (2, 3):
         scenario = check(

@@ -40,7 +40,6 @@ def now(off_m: float = 0.0, steps: int = 1, *, is_news: bool = False) -> Unrepor
     ],
 )
 def test_policies_say_when(text: str, sends: Unreported, silent: Unreported | None) -> None:
-    """Each, and with & before |."""
     report = make_report(text)
     assert report(sends)
     assert silent is None or not report(silent)
@@ -51,7 +50,6 @@ def test_policies_say_when(text: str, sends: Unreported, silent: Unreported | No
     [("often", "got 'often', expected a report; there are always"), ("deviation", "deviation(m")],
 )
 def test_what_is_no_report_is_refused(text: str, said: str) -> None:
-    """In words, with the key; a trigger's policy is none."""
     with pytest.raises(skytether.ConfigError) as raised:
         skytether.load("demo", **{"vehicle.report": text})
     assert "vehicle.report" in str(raised.value)
@@ -228,7 +226,6 @@ def test_a_longer_delay_is_found(report: str, within_s: float) -> None:
 
 
 def test_nobody_calls_a_quiet_vehicle_lost() -> None:
-    """Nothing is idle, doubted or begun anew, and the session is one."""
     for seed in (1, 2, 3):
         flight = fly(skytether.load("demo", seed=seed))
         names = [type(each.event).__name__ for each in flight.events]

@@ -163,7 +163,6 @@ def test_a_command_to_go_somewhere_counts_at_once() -> None:
     ],
 )
 def test_what_others_say_that_moves_nothing_is_left_to_them(message: Message) -> None:
-    """Another vehicle's set-points, sticks at rest, and questions."""
     air = flying()
     say(air, message, 2.0)
     assert air.client._failsafe.mode is Mode.TRACK
@@ -171,7 +170,6 @@ def test_what_others_say_that_moves_nothing_is_left_to_them(message: Message) ->
 
 
 def test_one_stray_set_point_is_none() -> None:
-    """Nor are two that are further apart than a second."""
     air = flying()
     say(air, velocity(), 2.4, every_s=1.2)
     assert air.client._failsafe.mode is Mode.TRACK

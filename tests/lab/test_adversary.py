@@ -121,7 +121,6 @@ def test_a_delay_is_of_one_vehicle_and_one_way_and_grows_as_it_says() -> None:
 
 
 def test_packets_are_cut_lost_and_copied() -> None:
-    """A cut takes all, a loss its share, and a copy comes later than the packet."""
     assert arrivals(move(Kind.CUTS, 2, "", 1.0, 1.0), at_s=1.5) == []
     lost = move(Kind.LOSSES, 2, "", 0.0, 9.0, 0.3)
     assert 600 < len(arrivals(lost, at_s=1.0, count=1000)) < 800
@@ -269,7 +268,6 @@ def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None
 
 
 def test_what_is_no_list_of_moves_is_refused() -> None:
-    """In a sentence that says what is wrong."""
     for line in ("[", '[{"kind":"rain"}]', dumps((replace(DIES, start_ns=-1),))):
         with pytest.raises(ConfigError, match="moves: "):
             loads(line)
@@ -306,7 +304,6 @@ def test_the_command_prints_what_flies_it_again(
 def test_the_command_ends_well_where_all_distances_are_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Moves drawn at random, too."""
     monkeypatch.setattr(commands, "crew", alone)
     assert main(["adversary", *SHORT, "--with", "losses,copies", "--tries", "2", "--random"]) == 0
     assert "2, losses,copies" in capsys.readouterr().out
@@ -324,7 +321,6 @@ def test_the_command_ends_well_where_all_distances_are_kept(
 def test_what_cannot_be_searched_is_refused(
     options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With the option and what was expected."""
     assert main(["adversary", *options]) == 2
     assert said in capsys.readouterr().err
 
@@ -332,7 +328,6 @@ def test_what_cannot_be_searched_is_refused(
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["sphere", "rings", "corridor", "warehouse"])
 def test_each_mission_can_be_searched(name: str) -> None:
-    """Every one that comes with Skytether is flown against moves of all kinds."""
     found = climb(Climb(replaced(reading.load(name), duration=30.0), tuple(Kind), 1, 2))
     assert math.isfinite(found.best.apart.distance_m)
     assert len(found.spares_m) == 2

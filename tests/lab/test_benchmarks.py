@@ -129,7 +129,6 @@ def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
 def test_the_flights_are_what_they_are_called(
     results: Mapping[str, Any], saturated: RecordedProblems
 ) -> None:
-    """Never at a bound, and often."""
     assert results["solvers"]["smooth"]["active"] == 0.0
     assert saturated.active() > 0.2
 
@@ -170,7 +169,6 @@ def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProbl
 def test_every_form_of_osqp_is_the_same_problem(
     tuning: Tuning, saturated: RecordedProblems
 ) -> None:
-    """Condensed by axis, jointly, and with states."""
     ours, theirs = (solvers.SolverEntry(make, saturated) for make in (ExactSolver, tuning.make))
     for i in range(5):
         ours.tick(i)
@@ -179,7 +177,6 @@ def test_every_form_of_osqp_is_the_same_problem(
 
 
 def test_what_is_not_installed_does_not_compete() -> None:
-    """Ours and OSQP always do."""
     names = contestants(TUNINGS[0])
     assert {OURS, TUNED} < names.keys()
     assert ("PIQP" in names) == (find_spec("piqp") is not None)
@@ -241,7 +238,6 @@ def test_a_checkout_is_compared_with_itself(
 def test_a_folder_that_is_no_checkout_is_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One line says which folder it is."""
     assert versions.main([str(tmp_path), "--quick"]) == 1
     expected = f"{tmp_path}: got a folder without benchmarks, expected a checkout\n"
     assert capsys.readouterr().err == expected
@@ -260,7 +256,6 @@ def test_a_commit_is_compared_in_a_folder_that_goes_at_the_end() -> None:
 
 
 def test_a_table_without_a_place_is_an_error() -> None:
-    """The document and the benchmarks have drifted apart."""
     table = TextTable(["a", "b"], [["1", "2"]])
     text = refresh("x\n<!-- table: one -->\nold\n<!-- end -->\ny\n", {"one": table})
     assert (

@@ -50,12 +50,10 @@ TENTH = SearchLimits(packets=0.1)
     ],
 )
 def test_a_free_key_that_is_none_is_refused(text: str, said: str) -> None:
-    """With what was given and what was expected."""
     assert refusal(lambda: Free.parse(text)) == f"--free: {said}"
 
 
 def test_a_free_key_is_read_as_it_is_meant() -> None:
-    """A number in a list goes by its place."""
     assert Free.parse("model.tau_s.0=0.2:2") == LAG
     assert put(PAPER, {LAG: 0.5, RADIUS: 2.0}) == replace(
         PAPER,
@@ -77,7 +75,6 @@ def test_a_free_key_is_read_as_it_is_meant() -> None:
     ],
 )
 def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
-    """Before anything is flown."""
     assert refusal(lambda: check_free([free], PAPER)).startswith(f"--free: {said}")
 
 
@@ -233,7 +230,6 @@ def flown(out: Path) -> list[SearchPoint]:
 
 
 def test_the_best_point_of_all_is_kept(searched: Path) -> None:
-    """The best point is written as a scenario that flies."""
     points = flown(searched)
     assert len(points) == 8
     best = min(points, key=lambda point: point.score)
@@ -291,7 +287,6 @@ def test_another_search_in_the_same_folder_is_refused(
 def test_a_journal_that_does_not_fit_the_search_is_refused(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its scores belong to other points."""
     shutil.copy(searched / "settings.toml", tmp_path)
     _, points = json.loads((searched / "journal.jsonl").read_text().splitlines()[0])
     points[2]["keys"]["reference.radius_m"] *= 1.1
@@ -371,6 +366,5 @@ def test_a_trajectory_edited_while_a_search_runs_ends_it(
 def test_an_impossible_search_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is written."""
     told = refused_before_writing(["calibrate", "paper", *argv], tmp_path, capsys)
     assert told == f"calibrate: {said}"

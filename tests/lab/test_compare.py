@@ -97,7 +97,6 @@ def test_every_case_has_weights_that_were_searched_for_or_those_of_one_that_has(
 
 
 def test_a_case_may_be_named() -> None:
-    """Another than those there are is refused."""
     assert contenders.cases([]) == CASES
     assert [case.name for case in contenders.cases(["gusts", "target"])] == ["gusts", "target"]
     with pytest.raises(ConfigError, match="--cases: got 'gust', expected others; did you mean"):
@@ -105,7 +104,6 @@ def test_a_case_may_be_named() -> None:
 
 
 def test_every_contender_in_every_case_comes_along() -> None:
-    """Under its name, in one file; with weights that were free, and nothing else changed."""
     pairs = {contenders.entry(*pair): pair for pair in SCALE.searched}
     assert {name.removeprefix("compare/") for name in reading.names(COMPARED)} == set(pairs)
     for name, (contender, case) in pairs.items():
@@ -501,7 +499,6 @@ def rows(file: Path) -> list[dict[str, str]]:
 
 
 def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None:
-    """Means over the seeds from 1 on, of the scenario in the file of weights."""
     table = rows(out / "budgets.csv")
     assert {row["case"] for row in table} == {"target", "loss-0.5"}
     row = next(
@@ -556,7 +553,6 @@ def test_where_the_reference_is_known_it_is_flown_without_packets(
 def test_the_second_time_it_only_draws(
     out: Path, tuned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second run flies nothing, and says what the first one said."""
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     weights = str(tuned / "weights.toml")
     assert main(["compare", "--quick", "--weights", weights, "--out", str(out)]) == 0
@@ -586,7 +582,6 @@ def test_other_weights_are_another_comparison(
 def test_weights_that_nobody_has_searched_for_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rather than the plant's own, in silence."""
     file = tmp_path / "mine.toml"
     argv = ["compare", "--quick", "--weights", str(file), "--out", str(tmp_path)]
     assert main(argv) == 2
@@ -643,6 +638,5 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
 def test_an_impossible_comparison_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is written."""
     told = refused_before_writing(["compare", *argv], tmp_path, capsys)
     assert told == f"compare: {said}"

@@ -49,7 +49,6 @@ def test_the_largest_number_that_flies_is_found(flies: int, most: int) -> None:
 
 
 def test_points_of_other_schemes_do_not_count() -> None:
-    """Each scheme has numbers of its own."""
     points = [point(1), point(2, 9.0), point(5, scheme="threshold")]
     assert FlownScheme.of(points, "budget", 1.0).flying == 1
     assert FlownScheme.of(points, "threshold", 1.0).flying == 5
@@ -130,7 +129,6 @@ def test_it_writes_a_table_and_a_picture_and_goes_on(
 def test_ctrl_c_keeps_what_was_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The table has what was flown, and the same command flies the rest."""
     whole, flown = command.flight.fly, []
 
     def interrupt(*args: Any, **keys: Any) -> Any:
@@ -163,7 +161,6 @@ def test_ctrl_c_keeps_what_was_done(
 def test_bad_options_are_one_line(
     flags: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is refused, and nothing is flown."""
     assert main(["crowd", "--out", str(tmp_path / "c"), *flags]) == 2
     err = capsys.readouterr().err
     assert said in err
@@ -172,7 +169,6 @@ def test_bad_options_are_one_line(
 
 
 def test_a_table_of_points_has_a_column_for_each_figure() -> None:
-    """The table is plain CSV, with a header of the fields' names."""
     lines = points_csv([point(3)]).splitlines()
     assert lines[0].split(",") == list(CrowdPoint.__struct_fields__)
     assert lines[1].startswith("budget,3,0.3,")
@@ -180,7 +176,6 @@ def test_a_table_of_points_has_a_column_for_each_figure() -> None:
 
 @pytest.mark.long
 def test_it_flies_over_udp(tmp_path: Path) -> None:
-    """Two vehicles for a few seconds; the figures are there."""
     out = tmp_path / "c"
     command = f"crowd --udp --out {out} --schemes budget --vehicles 2 --limit 5 --duration 6"
     run = warm.skytether(*command.split(), "--settle", "3")

@@ -68,7 +68,6 @@ def test_points_lie_within_their_bounds_and_fill_them() -> None:
 
 
 def test_a_point_is_the_same_whatever_else_is_flown() -> None:
-    """It follows from seed and number; another seed has other points."""
     assert draw(1, 5) == draw(1, 5)
     assert draw(1, 5) != draw(2, 5)
     scenario = DEMO.scenario_of(1)
@@ -190,7 +189,6 @@ def test_a_flight_beside_the_reference_is_astray() -> None:
 
 
 def test_a_flight_without_a_step_is_unanswered() -> None:
-    """No session, no record."""
     assert judge(SCENARIO, np.zeros(0, client_columns(2))) == PointVerdict("unanswered")
 
 
@@ -222,7 +220,6 @@ UNPLANNED = until(400)
     ids=["held", "too slow", "begun anew"],
 )
 def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, said: str) -> None:
-    """However near it still is."""
     verdict = judge(SCENARIO, rows)
     assert verdict.outcome == "flyaway"
     assert verdict.line.startswith(said)
@@ -286,7 +283,7 @@ def test_a_vehicle_that_plans_lead_away_is_a_flyaway() -> None:
     assert radius_m == pytest.approx(2.0, abs=1e-3)
     verdict = judge(SCENARIO, along(lambda *_: [1.0, 0.0]))
     assert verdict.outcome == "flyaway"
-    assert "m outside the reference's disc, where stopping may take 4.29 m" in verdict.line
+    assert "4.29 m" in verdict.line
 
 
 def swinging(step: int) -> Array:
@@ -300,7 +297,7 @@ def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
     state = np.array([swinging(step) for step in range(STEPS)])
     verdict = judge(SCENARIO, record(state, PATH[..., 1], YES))
     assert verdict.outcome == "flyaway"
-    assert "m from the reference, which 3 m would hold if it stood still" in verdict.line
+    assert " 3 m " in verdict.line
     # The same seen never, because no observation came through, is bad luck and no loop.
     blind = judge(SCENARIO, record(state, PATH[..., 1], YES, age_s=60.0))
     assert blind.outcome == "astray"
@@ -310,7 +307,9 @@ def test_a_state_that_is_no_number_is_a_flyaway() -> None:
     """A comparison with it would be false."""
     rows = record(PATH, PATH[..., 1], YES)
     rows["state"][-1, 0, 0] = np.nan
-    assert judge(SCENARIO, rows).line == "at 39.95 s its state is no number"
+    verdict = judge(SCENARIO, rows)
+    assert verdict.outcome == "flyaway"
+    assert "39.95 s" in verdict.line
 
 
 def test_wind_may_carry_a_vehicle_that_brakes() -> None:
@@ -382,7 +381,6 @@ def _able_whatever_the_delay(
 
 
 def test_no_point_of_the_demo_flies_away() -> None:
-    """Forty random points, each flown, hovering within the braking curve, or refused."""
     points = [DEMO.fly(number) for number in range(40)]
     assert [DEMO.command(point.number) for point in worst_first(points) if point.line] == []
     outcomes = [point.outcome for point in points]
@@ -390,7 +388,6 @@ def test_no_point_of_the_demo_flies_away() -> None:
 
 
 def test_a_refused_point_has_the_line_that_a_user_would_read() -> None:
-    """The scenario, the key, what was given and what was expected."""
     point = DEMO.fly(0)
     assert point.outcome == "refused"
     assert point.line.startswith(
@@ -399,8 +396,6 @@ def test_a_refused_point_has_the_line_that_a_user_would_read() -> None:
 
 
 def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the line of what was raised; the others are flown on."""
-
     def fail(_: Scenario) -> None:
         raise ZeroDivisionError("division by zero")
 
@@ -468,7 +463,6 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
 def test_another_seed_does_not_go_on_in_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its points are others."""
     Journal(tmp_path, DEMO.settings(), EnvelopePoint).close()
     assert (
         main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
@@ -488,7 +482,6 @@ def test_another_seed_does_not_go_on_in_the_folder(
 def test_an_impossible_envelope_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is written."""
     told = refused_before_writing(["envelope", "demo-committed", *argv], tmp_path, capsys)
     assert told == f"envelope: {line}"
 

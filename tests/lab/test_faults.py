@@ -26,7 +26,6 @@ DRAWN = [schedule(stream(seed, "faults"), MINUTE_NS) for seed in range(300)]
 
 
 def test_the_same_seed_draws_the_same_schedule() -> None:
-    """Another draws another."""
     again = [schedule(stream(seed, "faults"), MINUTE_NS) for seed in range(300)]
     assert again == DRAWN
     assert len(set(DRAWN)) == len(DRAWN)
@@ -58,7 +57,6 @@ def test_a_schedule_is_in_order_and_has_a_fault_every_five_seconds() -> None:
 
 
 def test_a_schedule_is_one_line_and_comes_back_as_it_was() -> None:
-    """To the last bit."""
     for drawn in DRAWN:
         trial = Trial(3, drawn)
         line = dumps(trial)
@@ -80,7 +78,6 @@ def test_a_schedule_is_one_line_and_comes_back_as_it_was() -> None:
     ],
 )
 def test_what_is_no_schedule_is_refused(line: str, said: str) -> None:
-    """In a sentence that says what is wrong."""
     with pytest.raises(ConfigError, match=said):
         loads(line)
 

@@ -117,7 +117,6 @@ PACKETS = {
 
 @linux
 def test_only_admitted_forms_come_through() -> None:
-    """To the byte at both ends of their lengths; without a filter, all do."""
     assert passes((ONE, OTHER), PACKETS) == list(PACKETS.values())
     assert passes((), PACKETS) == [True] * len(PACKETS)
 

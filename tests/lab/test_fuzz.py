@@ -66,7 +66,6 @@ def test_functions_of_a_module_are_its_own_and_those_of_its_classes() -> None:
 
 @BY_AXES
 def test_seeds_are_messages_of_every_type(scenario: Scenario) -> None:
-    """Each is decoded with its own terms; a scheme has horizons or trajectories."""
     terms = scenario.terms()
     found = {type(decode(seed, terms)) for seed in seeds(terms)}
     other = protocol.Horizon if terms.splines else protocol.Trajectory
@@ -178,7 +177,6 @@ class Fussy(Decoder):
 def test_a_fault_is_told_with_the_input_that_makes_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Target, seed, number and bytes; and without a fault the number of inputs and their rate."""
     monkeypatch.setattr(command, "TARGETS", {"fussy": Fussy, "calm": lambda _: Fussy(_, 255)})
     assert command.attack("calm", tmp_path, 1, 1050, 60.0).startswith("calm: 1050 inputs in ")
     with pytest.raises(ZeroDivisionError):

@@ -131,7 +131,6 @@ def test_what_is_no_first_order_is_said_to_be_none() -> None:
 
 
 def test_what_noise_hides_is_said_to_be_unknown() -> None:
-    """Neither refused nor accepted."""
     best = found(answered(Numbers(1.0, 0.4, 0.2), np.random.default_rng(3), noise=1.0, count=4))
     assert "cannot be told" in verdict(best)
 
@@ -147,7 +146,6 @@ def test_a_model_of_another_vehicle_is_off_by_as_much_as_the_vehicles_differ() -
 
 
 def test_too_few_steps_tell_nothing() -> None:
-    """One is none."""
     made = answered(Numbers(1.0, 0.4, 0.2), np.random.default_rng(0))
     assert fit(made[:1]) is None
     assert fit(made[:2]) is not None
@@ -268,8 +266,7 @@ def test_steps_without_room_are_not_flown() -> None:
     one, other = fits(endpoint)
     assert one is not None
     assert other is None
-    told = outcome.describe(outcome.AxisOutcome(1.0, 4, [], None))
-    assert told.startswith("too few steps (0, 4 cut), the fence leaves no room: expected a wider")
+    assert "(0, 4 cut)" in outcome.describe(outcome.AxisOutcome(1.0, 4, [], None))
 
 
 def test_a_step_down_needs_a_floor() -> None:
@@ -459,9 +456,7 @@ def test_what_is_identified_flies_at_once(
     changed = ["--vehicle.tau-s", "0.4", "--vehicle.dead-time-s", "0.2", "--vehicle.gain", "0.8"]
     changed += ["--duration", "20", "--vehicle.wind", "0", "--repeats", "1"]
     assert command.main(identify, ["simulated", *changed], "identify") == 0
-    told = capsys.readouterr()
-    assert "first order with dead time will do" in told.out
-    assert "no fence is given: it stays within 4 m of where it began" in told.err
+    assert "no fence is given" in capsys.readouterr().err
     written = reading.load("identified/scenario.toml")
     assert written.duration == 20.0
     assert written.model.tau_s == pytest.approx((0.4, 0.4), rel=1e-3)
@@ -484,13 +479,12 @@ def rmse(asked: Scenario) -> float:
 
 
 def test_other_sizes_of_step_and_files_for_programs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle of first order is the same at any size: a wrong one costs nothing."""
     monkeypatch.chdir(tmp_path)
     argv = ["simulated", "--speed", "0.5", "--also", "0.2", "--repeats", "1", "--hold", "3"]
     assert command.main(identify, [*argv, "--vehicle.wind", "0"], "identify") == 0
-    assert "largest difference from steps of the first row's" in capsys.readouterr().out
     told = json.loads(Path("identified/identified.json").read_text())
     assert (told["ended"], told["hold_s"]) == ("", 3.0)
     assert [each["steps"] for each in told["axes"]] == [4, 4]
@@ -504,7 +498,6 @@ def test_other_sizes_of_step_and_files_for_programs(
 def test_what_was_measured_until_ctrl_c_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The measurements are kept; no scenario is written."""
     monkeypatch.chdir(tmp_path)
     asked = iter(range(10**6))
 
@@ -515,10 +508,7 @@ def test_what_was_measured_until_ctrl_c_is_kept(
     monkeypatch.setattr(command_of.command, "interruptible", interruptible)
     argv = ["simulated", "--repeats", "1", "--vehicle.wind", "0"]
     assert command.main(identify, argv, "identify") == command.INTERRUPTED
-    told = capsys.readouterr()
-    assert "identify: ended early: interrupted; what was measured is in identified" in told.err
-    assert "x: first order with dead time will do" in told.out
-    assert "y: too few steps (0), fly it to its end" in told.out
+    assert "interrupted" in capsys.readouterr().err
     assert not Path("identified/scenario.toml").exists()
     assert len(Path("identified/measured.csv").read_text().splitlines()) > 400
 
@@ -548,7 +538,6 @@ def test_what_cannot_be_flown_is_refused(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In one line, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     assert command.main(identify, argv, "identify") == command.CONFIGURATION
     err = capsys.readouterr().err

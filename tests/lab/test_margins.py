@@ -237,7 +237,6 @@ def test_a_place_of_the_box_differs_as_it_says() -> None:
 def test_the_command_says_which_vehicles_are_stable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A row for each vehicle, the figures as JSON, and a map where it is asked for."""
     monkeypatch.setattr(margins, "FLIGHT_S", 20.0)
     monkeypatch.setattr(maps, "REST_S", 20.0)
     monkeypatch.setattr(maps, "RUNS", 1)
@@ -261,7 +260,6 @@ def test_the_command_says_which_vehicles_are_stable(
 def test_an_empty_box_is_refused_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A value that no vehicle can have is refused as a scenario's would be."""
     argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--gain", "0", "1"]
     assert main(argv) == 2
     assert "vehicle.gain[0]: got 0.0" in capsys.readouterr().err

@@ -75,7 +75,6 @@ def test_a_vehicle_that_brakes_in_time_is_inside() -> None:
 def test_a_vehicle_that_brakes_late_or_softly_or_never_flies_again_is_outside(
     flown: ProcessLife, figure: str
 ) -> None:
-    """The figure of each fault puts it outside."""
     found, good = verdict(flown), verdict(life())
     assert not found.is_inside
     assert getattr(found, figure) > getattr(good, figure) + 0.01
@@ -101,13 +100,11 @@ def test_a_process_that_is_back_at_once_leaves_no_curve() -> None:
 
 
 def test_a_vehicle_that_slept_has_to_brake_when_it_wakes() -> None:
-    """Its time counts from there."""
     woken = ProcessOutage("client", STOPPED, 8 * SECOND_NS, 11 * SECOND_NS)
     assert verdict(life(brakes_s=1.0), woken).brakes_s == pytest.approx(0.0)
 
 
 def test_a_new_life_has_to_stand_until_it_flies() -> None:
-    """From its first step on."""
     died = ProcessOutage("client", KILLED, 10 * SECOND_NS, 11 * SECOND_NS)
     old, born = life(), life(brakes_s=-10.0, flies_s=-2.0, brake_mps2=1e6)
     old = ProcessLife(*(getattr(old, name)[:200] for name in old.__annotations__))

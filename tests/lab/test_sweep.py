@@ -92,7 +92,6 @@ FORM = "expected KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
     ],
 )
 def test_a_grid_that_is_none_is_refused(text: str, said: str) -> None:
-    """With what was given and what was expected."""
     assert refusal(lambda: parse_axis(text)) == said
 
 
@@ -142,7 +141,6 @@ def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
 
 
 def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
-    """In the order of their seeds."""
     (task,) = Sweep("paper", PAPER, [parse_axis("control.trigger=periodic")], 3).tasks()
     done = fly(task)
     assert (done.cell, done.chunk) == (0, 0)
@@ -237,14 +235,12 @@ def journal_of(plan: Sweep, folder: Path) -> Journal[Done]:
 
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
 def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
-    """Naming the key, what was given and what the sweep began with."""
     journal_of(ONE, tmp_path).close()
     told = refusal(lambda: journal_of(other, tmp_path))
     assert told == f"{tmp_path}: {said}, to go on there; or another --out"
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It may fly otherwise."""
     journal_of(ONE, tmp_path).close()
     here = metadata.version("skytether")
     monkeypatch.setattr(metadata, "version", lambda _: "2")
@@ -253,7 +249,6 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
-    """The second is told; once the first is over, it may."""
     told = pytest.raises(OSError, match="another command is writing it")
     with closing(journal_of(ONE, tmp_path)), told:
         journal_of(ONE, tmp_path)
@@ -261,7 +256,6 @@ def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
 
 
 def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None:
-    """Nobody knows what they are of."""
     (tmp_path / "journal.jsonl").write_text("{}\n")
     said = "got journal.jsonl without settings.toml, expected both"
     with pytest.raises(ConfigError, match=said):
@@ -474,7 +468,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_tables_hold_every_run_and_every_cell(whole: Path) -> None:
-    """In order, with the values of the grid first."""
     runs, cells = (list(csv.DictReader((whole / name).read_text().splitlines())) for name in TABLES)
     assert len(runs) == 4 * 30
     assert [int(row["seed"]) for row in runs[30:60]] == list(range(1, 31))
@@ -489,7 +482,6 @@ def test_the_tables_hold_every_run_and_every_cell(whole: Path) -> None:
 
 
 def test_two_keys_make_maps(whole: Path) -> None:
-    """One of the error, one of the events."""
     for name in ("rmse_xy.png", "event_ratio.png"):
         assert (whole / name).read_bytes().startswith(b"\x89PNG")
 
@@ -596,7 +588,6 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_pat
 def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line."""
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "nowhere"]
     assert main(argv) == 1
     said = "sweep: --scheduler: nowhere cannot be reached: missing port number in address 'nowhere'"
@@ -606,7 +597,6 @@ def test_a_scheduler_that_is_not_there_is_named(
 def test_without_dask_a_scheduler_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Saying what to install."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "tcp://h:1"]
     assert main(argv) == 2

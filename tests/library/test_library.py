@@ -135,7 +135,6 @@ def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
 
 
 def test_a_scenario_is_loaded_from_a_path(tmp_path: Path) -> None:
-    """A `Path` or its text."""
     file = tmp_path / "mine.toml"
     file.write_text('extends = "demo"\nduration = 12\n')
     assert skytether.load(file) == skytether.load(str(file)) == skytether.load("demo", duration=12)
@@ -151,7 +150,6 @@ def test_a_key_may_end_a_contradiction_of_the_file(tmp_path: Path) -> None:
 
 
 def test_a_scenario_made_by_hand_is_checked() -> None:
-    """It may be an object or tables, and is also checked before a flight."""
     assert skytether.check({"duration": 3, "model": {"axes": 3}}).model.axes == 3
     assert skytether.check(skytether.Scenario(seed=4), duration=3).steps == 60
     wrong = skytether.Scenario(title="mine", duration=-1.0)
@@ -259,7 +257,6 @@ def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
 
 
 def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
-    """Its path, over the reference."""
     plane, sent = flown.plot().axes
     assert plane.get_title() == "demo, seed 1"
     assert np.array_equal(plane.lines[1].get_xydata(), flown["position_m"])
@@ -286,7 +283,6 @@ def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
 def test_without_pandas_it_says_what_to_install(
     flown: skytether.Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one line."""
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'$"):
         flown.to_pandas()
@@ -514,7 +510,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_what_cannot_be_is_refused_in_words(case: str) -> None:
-    """Before anything flies."""
     attempt, kind, said = REFUSALS[case]
     with pytest.raises(kind) as refused:
         attempt()
@@ -522,7 +517,6 @@ def test_what_cannot_be_is_refused_in_words(case: str) -> None:
 
 
 def test_a_flight_refuses_in_words(flown: skytether.Flight, tmp_path: Path) -> None:
-    """Unknown arrays, parts and figures, and files that are none."""
     refusals: list[tuple[Callable[[], object], type[Exception], str]] = [
         (
             lambda: flown["positon_m"],

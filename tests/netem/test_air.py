@@ -76,7 +76,6 @@ def test_what_a_law_says_of_itself_is_so(text: str) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_papers_delays_follow_a_poisson_law(seed: int) -> None:
-    """A chi-square test over the numbers of slots compares them."""
     slots = np.rint((delays_s("paper(0.4, 0.02, 2)", seed) - 0.4) / 0.02).astype(int)
     counts = np.bincount(np.minimum(slots, 7), minlength=8)
     shares = [*stats.poisson.pmf(range(7), 2), stats.poisson.sf(6, 2)]
@@ -123,7 +122,6 @@ def test_shares_are_those_asked_for(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_flipped_bits_lie_anywhere(seed: int) -> None:
-    """Uniformly over the packet."""
     places = [fate.flipped for fate in fates("corrupt(0.5)", seed) if fate.flipped is not None]
     assert stats.kstest(places, stats.uniform.cdf).pvalue > P_MIN
 
@@ -147,7 +145,6 @@ def test_bursts_last_as_long_as_asked_for(text: str, share: float, burst_s: floa
 
 
 def test_an_outage_keeps_its_schedule() -> None:
-    """From at_s on for for_s seconds, again every every_s, or once."""
     once = [fate.lost for fate in fates("outage(2, 0.5)", every=100, count=100)]
     assert np.flatnonzero(once).tolist() == [20, 21, 22, 23, 24]
     again = [fate.lost for fate in fates("outage(2, 0.5, every_s=3)", every=100, count=100)]
@@ -217,7 +214,6 @@ def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float
     ],
 )
 def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
-    """The line has the given value, and the expected one."""
     with pytest.raises(PolicyError) as raised:
         path(text)
     assert said in str(raised.value)
@@ -226,13 +222,11 @@ def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
 
 @given(st.text("()&,=.\"' -0123456789alosrtequnif_\n", max_size=60))
 def test_no_text_does_anything_but_be_refused(text: str) -> None:
-    """Any text is either an impairment, or refused with the documented error."""
     with suppress(PolicyError):
         path(text)
 
 
 def test_arguments_may_have_names_and_defaults() -> None:
-    """In any order, and left out from the end."""
     expected = (Part("rate", (12500, 20000, "codel", "fair")),)
     assert parse("rate(12500, queue=20000, serve=fair, drop=codel)") == expected
     assert parse("rate(12500,20000,codel,fair)") == expected
@@ -240,7 +234,6 @@ def test_arguments_may_have_names_and_defaults() -> None:
 
 
 def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
-    """Any file name is possible."""
     assert with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
         'trace("/x/a.csv", loop, auto) & loss(0.1)'
     )

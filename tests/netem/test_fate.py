@@ -91,7 +91,6 @@ def test_no_delay_is_none_whatever_the_minimum() -> None:
 
 @pytest.mark.parametrize("loss", [0.02, 0.1, 0.5])
 def test_the_share_of_lost_packets_is_as_asked(loss: float) -> None:
-    """A binomial test compares it."""
     drawn = first_fates(replace(PAPER, loss=loss), 17, count=SAMPLES)
     lost = sum(fate.lost for fate in drawn)
     assert stats.binomtest(lost, SAMPLES, loss).pvalue > 0.001
@@ -99,7 +98,6 @@ def test_the_share_of_lost_packets_is_as_asked(loss: float) -> None:
 
 @pytest.mark.parametrize(("loss", "lost"), [(0.0, 0), (1.0, COUNT)])
 def test_certain_losses_are_certain(loss: float, lost: int) -> None:
-    """No packet is lost at a rate of 0, and every packet at a rate of 1."""
     assert sum(fate.lost for fate in first_fates(replace(PAPER, loss=loss))) == lost
 
 
@@ -112,7 +110,6 @@ def test_losses_are_independent_of_delays() -> None:
 
 
 def test_fates_are_the_same_again() -> None:
-    """Same seed, direction and flow: same network."""
     assert first_fates() == first_fates()
 
 
@@ -210,7 +207,6 @@ def test_in_a_burst_everything_is_lost() -> None:
 @pytest.mark.parametrize("burst_s", [1e-9, 1e-3, 3600.0])
 @pytest.mark.parametrize(("loss", "share"), [(0.0, 0.0), (1.0, 1.0)])
 def test_certain_losses_are_certain_in_bursts(loss: float, share: float, burst_s: float) -> None:
-    """Bursts of any length are tested."""
     drawn = first_fates(replace(PAPER, loss=loss, burst_s=burst_s))
     assert np.mean([fate.lost for fate in drawn]) == share
 
@@ -222,7 +218,6 @@ def test_bursts_shorter_than_a_slot_are_none() -> None:
 
 
 def test_bursts_change_no_delay() -> None:
-    """Delays have draws of their own."""
     drawn = first_fates(replace(PAPER, loss=0.5, burst_s=1.0))
     assert [fate.delay_ns for fate in drawn] == [fate.delay_ns for fate in first_fates()]
 
@@ -232,7 +227,6 @@ def test_bursts_change_no_delay() -> None:
 
 @pytest.mark.parametrize("other", [{"seed": 2}, {"name": "downlink"}, {"flow": 1}])
 def test_another_seed_direction_or_flow_meets_another_network(other: dict[str, object]) -> None:
-    """In its delays as well as in its losses."""
     ours, theirs = first_fates(), first_fates(**other)  # type: ignore[arg-type]
     assert [fate.delay_ns for fate in ours] != [fate.delay_ns for fate in theirs]
     assert [fate.lost for fate in ours] != [fate.lost for fate in theirs]

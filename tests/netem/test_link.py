@@ -105,21 +105,18 @@ def test_what_leaves_is_what_a_sorted_list_would_give(
 
 
 def test_a_packet_leaves_as_it_came() -> None:
-    """Payload, peer and socket are those that it was given."""
     link, datagram = make_link(), Datagram(b"\x00\xff", PEER, 7)
     link.take(datagram, make_lane(5), now_ns=0)
     assert link.give(now_ns=5) == [datagram]
 
 
 def test_a_packet_leaves_once() -> None:
-    """Asking again gives nothing."""
     link = make_link()
     take(link, make_lane(5), "a")
     assert [give(link, now_ns=5), give(link, now_ns=5)] == ["a", ""]
 
 
 def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
-    """Nothing is due of an empty link."""
     link = make_link()
     assert link.next_due_ns() is None
     take(link, make_lane(30, 10), "ab", now_ns=100)
@@ -216,7 +213,6 @@ def test_figures_tell_delays_between_edges_and_how_late_packets_have_left() -> N
 
 
 def test_the_greatest_depth_is_remembered() -> None:
-    """After the queue has emptied as well."""
     link = make_link()
     take(link, make_lane(1, 1, 1), "abc")
     give(link, now_ns=1)
@@ -249,7 +245,6 @@ def test_a_lost_packet_overtakes_nobody() -> None:
 
 
 def test_the_bytes_of_all_packets_are_counted() -> None:
-    """Lost packets count as well: they were sent."""
     link, lane = make_link(), make_lane(0, 0, lost=[0])
     link.take(Datagram(bytes(600), PEER), lane, now_ns=0)
     link.take(Datagram(b"", PEER), lane, now_ns=0)

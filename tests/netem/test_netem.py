@@ -200,7 +200,6 @@ def test_changes_and_recordings(
 def test_a_wrong_direction_is_told_in_a_line(
     flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is refused, and nothing is started."""
     assert main(["netem", "--bind", "127.0.0.1:0", *flags]) == 2
     told = capsys.readouterr().err
     assert said in told

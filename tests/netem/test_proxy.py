@@ -84,7 +84,6 @@ def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
 
 
 def test_the_servers_answers_find_their_client() -> None:
-    """Answers are assigned by the socket that they arrive at, and leave by the bound one."""
     proxy = make_proxy()
     socket_of = {client: pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL)}
     for client in (BOB, ALICE, CAROL):
@@ -102,7 +101,6 @@ def test_a_stranger_at_a_flows_socket_is_refused() -> None:
 
 
 def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
-    """Such a packet is refused even if the server sent it."""
     proxy = make_proxy()
     hear(proxy, b"!", SERVER, 1)
     assert (proxy.outbox(), proxy.refused) == ([], 1)
@@ -326,7 +324,7 @@ def no_bound_for_a_host(patch: pytest.MonkeyPatch) -> None:
 def test_if_places_were_earned_otherwise_newcomers_would_be_shut_out(
     monkeypatch: pytest.MonkeyPatch, ablation: Callable[[pytest.MonkeyPatch], None], rate_hz: int
 ) -> None:
-    """Ablation: by one answer, as in an early version; or by one host without a bound."""
+    """Ablation: by one answer; or by one host without a bound."""
     ablation(monkeypatch)
     siege = Siege(make_proxy(flows=128), [ATTACKER], 128, rate_hz)
     siege.run(13)
@@ -469,7 +467,6 @@ def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
 
 
 def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
-    """Nothing is left to be woken for."""
     proxy = make_proxy()
     pass_on(proxy, b"?", ALICE, at=123)
     assert proxy.next_wake_ns() is None
@@ -484,7 +481,6 @@ def test_a_duplicate_is_a_packet_of_its_own() -> None:
 
 
 def test_it_wants_to_be_woken_for_the_next_packet_of_either_direction() -> None:
-    """Once woken it forwards what is due, and no more."""
     slower = replace(IN_20_MS, minimum_s=0.03)
     proxy, ms = make_proxy(uplink=slower, downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)
@@ -497,7 +493,6 @@ def test_it_wants_to_be_woken_for_the_next_packet_of_either_direction() -> None:
 
 
 def test_being_woken_early_does_no_harm() -> None:
-    """Drivers may be."""
     proxy = make_proxy(IN_20_MS)
     hear(proxy, b"?", ALICE, at=0)
     proxy.wake(now_ns=20 * MILLISECOND_NS - 1)
@@ -521,7 +516,6 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
 
 
 def test_what_is_sent_is_handed_out_once() -> None:
-    """The driver empties the outbox."""
     proxy = make_proxy()
     hear(proxy, b"?", ALICE)
     assert [len(proxy.outbox()), len(proxy.outbox())] == [1, 0]

@@ -113,7 +113,6 @@ def test_formats_are_told_apart_by_their_content(
     ],
 )
 def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, said: str) -> None:
-    """With its name and the row."""
     name = file(tmp_path, text)
     with pytest.raises(ConfigError) as raised:
         reading.check({"network": {"uplink": f'trace("{name}")'}})
@@ -124,7 +123,6 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, said: str) -> N
 
 @pytest.mark.parametrize("text", ["", "x\n", "5\n3\n", "-1\n", "nan\n", "0\n0\n"])
 def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> None:
-    """Times that fall, none at all, or only the time 0."""
     name = file(tmp_path, text)
     with pytest.raises(ConfigError, match="a file of mahimahi") as raised:
         reading.check({"network": {"downlink": f'deliveries("{name}")'}})
@@ -139,7 +137,6 @@ def test_too_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
 
 
 def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
-    """While a process goes on."""
     name = file(tmp_path, "time_s,delay_s\n0,0.1\n")
     assert path(f"trace({name})").mean_s == 0.1
     file(tmp_path, "time_s,delay_s\n0,0.25\n")

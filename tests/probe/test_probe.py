@@ -71,7 +71,6 @@ TIMES = st.integers(0, 2**63 - 1)
 def test_a_probe_has_the_size_that_was_asked_for(
     session: bytes, number: int, train: int, held: int, size: int
 ) -> None:
-    """Within one byte, and it is what was encoded."""
     probe = Probe(session, number, train, held)
     payload = encode(probe, size)
     assert size - 1 <= len(payload) <= size
@@ -98,14 +97,12 @@ def test_an_answer_tells_of_as_many_arrivals_as_have_room(
 
 @given(st.binary(max_size=200))
 def test_garbage_is_none_of_these_packets(payload: bytes) -> None:
-    """It is refused with a reason."""
     with pytest.raises(ProtocolError):
         decode(payload)
 
 
 @given(st.integers(0, 3), st.data())
 def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> None:
-    """Every byte is changed in turn."""
     session = bytes(range(SESSION_BYTES))
     messages = (
         ProbeHello(b"12345678"),
@@ -362,7 +359,6 @@ def test_the_law_of_delays_is_recognised(law: str) -> None:
 
 
 def test_an_interval_of_a_share_is_wilsons() -> None:
-    """The interval equals scipy's."""
     for lost, count in ((0, 50), (3, 100), (50, 100), (999, 1000)):
         known = stats.binomtest(lost, count).proportion_ci(method="wilson")
         low, high = analysis.wilson(lost / count, count)
@@ -451,7 +447,6 @@ def test_who_is_not_answered_gives_up() -> None:
 
 
 def test_strangers_and_forgers_change_nothing() -> None:
-    """Packets from elsewhere, of other sessions, and of probes that were never sent are counted."""
     near = Prober(
         PlainLink(), LISTENER, bytes(NONCE_BYTES), probes=10, period_ns=SECOND_NS, size=200
     )
@@ -499,7 +494,6 @@ def test_bad_options_are_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is refused, and nothing is sent."""
     monkeypatch.chdir(tmp_path)
     assert main(["probe", *flags]) == 2
     told = capsys.readouterr().err

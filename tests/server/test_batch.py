@@ -119,7 +119,6 @@ phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, ma
 def test_a_run_in_a_batch_equals_the_same_run_alone(
     changes: dict[str, Any], seeds: list[int], phases: list[int] | None
 ) -> None:
-    """Every kind of flight in a batch equals the flight alone, also with simultaneous events."""
     with pytest.MonkeyPatch.context() as patch:
         if phases:
             given_ns = {
@@ -146,7 +145,6 @@ class Drawn:
 
 
 def test_runs_are_equal_in_another_order_and_in_a_larger_batch() -> None:
-    """Five seeds are flown, then the same with three more, in reverse order."""
     flown = scenario(vehicle={"wind": 0.3})
     few = fly_batch(flown, range(3, 8))
     many = fly_batch(flown, range(9, 1, -1))

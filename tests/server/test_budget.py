@@ -302,7 +302,6 @@ def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
 
 
 def test_a_budget_is_told_among_the_figures() -> None:
-    """Without the key there is no budget."""
     record = fly(crowd({**AUTO, "duration": 3.0, "settle": 1.0}), vehicles=2)
     assert record.figures["server"]["budget"]["bytes_per_s"] >= rates.LEAST
     record = fly(crowd({"duration": 1.0, "settle": 0.5}))
@@ -331,6 +330,5 @@ def test_vehicles_of_a_fleet_start_one_after_the_other() -> None:
 
 
 def test_a_rate_below_nothing_is_refused() -> None:
-    """In one line."""
     with pytest.raises(ConfigError, match=r"control\.shared_bytes_per_s: got -1"):
         crowd({"control.shared_bytes_per_s": -1.0})

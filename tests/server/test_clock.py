@@ -246,7 +246,6 @@ def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
 
 
 def test_vehicles_have_clocks_of_their_own() -> None:
-    """One steps, one drifts away, one is forgotten; each is seen as if it were alone."""
     clock, rows = ClockMap(4, DT_NS), np.array([3, 0, 2])
     for now in times(0, 20):
         stepped = HOUR if now >= 10 * S else 0

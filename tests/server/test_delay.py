@@ -179,7 +179,6 @@ def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) 
 
 
 def test_every_vehicle_has_a_bound_of_its_own() -> None:
-    """Many together are as each alone, in whatever order and however many of them are heard."""
     rng, vehicles = np.random.default_rng(2), 6
     bound, heard = estimated(vehicles), [list[int]() for _ in range(vehicles)]
     for row in range(vehicles):
@@ -196,7 +195,6 @@ def test_every_vehicle_has_a_bound_of_its_own() -> None:
 
 
 def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
-    """The forgotten vehicle's neighbour keeps what is known of it."""
     bound = estimated(2)
     for row in (0, 1):
         for _ in range(200):

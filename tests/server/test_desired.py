@@ -114,7 +114,6 @@ def test_a_dead_time_lets_nobody_see_further_ahead(preview_s: float) -> None:
 
 
 def test_a_live_point_is_led_on_over_the_dead_time() -> None:
-    """With the velocity that is told."""
     live = {"shape": "live", "points_m": [[1.0, 2.0]], "velocity_mps": [0.5, -1.0]}
     desired = make(late(**live))
     desired.tick(0)
@@ -200,7 +199,6 @@ def test_a_window_is_true_as_far_as_the_preview_reaches(
 
 
 def test_a_preview_longer_than_any_window_is_a_full_one() -> None:
-    """To the last bit."""
     rows, ahead = np.array([5, 70, 200]), np.array([0, 7, 20])
     np.testing.assert_array_equal(
         window(make(scenario(preview=3600.0)), rows, ahead), window(make(), rows, ahead)
@@ -493,7 +491,6 @@ def test_the_record_tells_what_was_known_of_the_reference() -> None:
 
 
 def test_a_live_velocity_has_a_number_for_each_axis() -> None:
-    """The refusal is worded as for a key of a scenario."""
     with pytest.raises(
         ConfigError, match=r"reference.velocity_mps: got \[1.0\], expected 2 numbers"
     ):

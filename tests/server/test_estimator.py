@@ -141,7 +141,6 @@ def test_newest_observation_wins_after_reordering() -> None:
 @quick
 @given(st.permutations(range(6)))
 def test_order_of_arrival_does_not_matter(order: list[int]) -> None:
-    """Once all have arrived."""
     estimator = make()
     for step in order:
         estimator.observe(0, seen(step, np.full((2, 2), float(step))))
@@ -149,7 +148,6 @@ def test_order_of_arrival_does_not_matter(order: list[int]) -> None:
 
 
 def test_estimate_keeps_its_own_copy_of_the_state() -> None:
-    """Later changes of the caller's array have no effect."""
     estimator, x = make(compensate=False), np.ones((2, 2))
     estimator.observe(0, seen(0, x))
     x[:] = 9.0
@@ -193,7 +191,6 @@ def test_estimate_right_after_a_gap_knows_no_input_of_a_ring_ago() -> None:
 
 
 def test_asking_for_estimates_changes_no_later_one() -> None:
-    """The trigger may ask at every step, also where nothing is computed after all."""
     asked, silent = make(), make()
     for estimator in (asked, silent):
         remember(estimator, np.full((15, 2), 7.0))
@@ -225,7 +222,6 @@ def test_without_compensation_the_observation_is_the_estimate() -> None:
 
 
 def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
-    """The old observation, inputs and step are gone; those of its neighbour are not."""
     estimator = make(2)
     both, x = np.array([0, 1]), np.array([[1.0, 2.0], [3.0, 4.0]])
     for row in both:
@@ -246,7 +242,6 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
 def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:
-    """Estimates of vehicles with different steps, gaps and ages equal those made one by one."""
     rng = np.random.default_rng(seed)
     rows = rng.permutation(8)[:vehicles]
     together = make(8, compensate=compensate)
@@ -331,7 +326,6 @@ def test_the_disturbance_is_flown_on_with_every_input() -> None:
 
 
 def test_what_was_learned_is_forgotten_with_the_vehicle() -> None:
-    """Another vehicle's estimate is kept."""
     estimator, found = learning(), foresight(2, 2, H, 1)
     for row in (0, 1):
         watch(estimator, WIND, row=row)
@@ -343,7 +337,6 @@ def test_what_was_learned_is_forgotten_with_the_vehicle() -> None:
 
 
 def test_without_compensation_nothing_is_learned() -> None:
-    """The newest observation is taken for the present, and that is all."""
     assert not watch(learning("none"), WIND).any()
 
 
@@ -414,14 +407,12 @@ def test_old_observations_are_out_of_reach(
 
 
 def test_vehicle_that_was_never_observed_is_out_of_reach(controller: Controller) -> None:
-    """No step of such a vehicle is within reach, step 0 included; nor of a forgotten one."""
     controller.observe(0, seen(7, np.zeros((2, 2))))
     controller.forget(0)
     assert [is_able(controller, step) for step in (0, 7)] == [False, False]
 
 
 def test_every_step_is_decided_once(controller: Controller) -> None:
-    """Neither the step that was decided last, nor one before it, is decided again."""
     controller.forget(0)
     controller.observe(0, seen(5, np.zeros((2, 2))))
     controller.decide(ROW, np.array([7]))

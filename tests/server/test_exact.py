@@ -110,7 +110,6 @@ def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
 def test_every_answer_is_optimal_and_within_its_box(
     seed: int, scale: float, horizon: int, *, input_reference: bool, change_weight: float
 ) -> None:
-    """The conditions of optimality, on random problems."""
     problem = make(horizon=horizon, input_reference=input_reference, change_weight=change_weight)
     gradient, guess = problems(problem, 10, scale, seed)
     inputs, solved = ExactSolver(problem).solve(gradient, guess)
@@ -177,7 +176,6 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 
 
 def test_a_problem_that_is_not_finite_fails_alone() -> None:
-    """NaN and infinity for one vehicle each; the third is solved as if it were alone."""
     problem = make()
     gradient, guess = problems(problem, 3, 1.0, seed=2)
     alone, _ = ExactSolver(problem).solve(gradient[2:], guess[2:])
@@ -189,7 +187,6 @@ def test_a_problem_that_is_not_finite_fails_alone() -> None:
 
 
 def test_a_batch_equals_its_singles_on_every_run() -> None:
-    """Every problem in a batch has the same solution as alone, to the last bit."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=3)
     solver = ExactSolver(problem)
@@ -200,7 +197,6 @@ def test_a_batch_equals_its_singles_on_every_run() -> None:
 
 
 def test_the_guess_decides_nothing_but_the_time() -> None:
-    """Every initial set leads to the one optimum."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=4)
     solver = ExactSolver(problem)
@@ -233,7 +229,6 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
 
 
 def test_osqp_agrees_to_its_tolerance() -> None:
-    """Both solvers, the same problems."""
     problem = make()
     gradient, guess = problems(problem, 50, 2.0, seed=5)
     exactly, _ = ExactSolver(problem).solve(gradient, guess)
@@ -243,7 +238,6 @@ def test_osqp_agrees_to_its_tolerance() -> None:
 
 
 def test_a_scenario_names_its_solver() -> None:
-    """Exact is the default; osqp is the reference."""
     assert PAPER.control.solver == "exact"
     kinds = {"exact": ExactSolver, "osqp": OsqpSolver}
     for name, kind in kinds.items():

@@ -277,7 +277,6 @@ def test_plan_is_exactly_what_can_be_sent() -> None:
 
 @pytest.mark.parametrize("solver", ["exact", "osqp"])
 def test_batch_is_planned_as_its_singles(solver: str) -> None:
-    """Three vehicles at steps of their own, with gaps of their own, one of them new each time."""
     control = msgspec.structs.replace(SCENARIO.control, solver=solver)
     scenario = msgspec.structs.replace(SCENARIO, control=control)
     together, singles = make(5, scenario), [make(scenario=scenario) for _ in range(3)]

@@ -23,7 +23,7 @@ from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Reason, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_ns
@@ -130,7 +130,6 @@ def test_an_odd_observation_is_not_believed_and_changes_nothing(
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
-    """An observation that is odd for one vehicle may be the first of another."""
     expected = Belief.JUMP if row == 0 else Belief.BELIEVED
     assert judge(after(), elsewhere(105), row=row) == expected
 
@@ -155,7 +154,6 @@ def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
 
 
 def test_three_that_do_not_agree_are_not_believed() -> None:
-    """Each contradicts the one before it."""
     plausibility = after()
     for n, step in enumerate(range(105, 125)):
         assert judge(plausibility, elsewhere(step, 100.0 * (n + 1))) == Belief.JUMP
@@ -163,7 +161,6 @@ def test_three_that_do_not_agree_are_not_believed() -> None:
 
 
 def test_two_among_believed_ones_are_not_in_a_row() -> None:
-    """However many there are of them."""
     plausibility = after()
     for step in range(105, 205, 3):
         assert judge(plausibility, elsewhere(step)) == Belief.JUMP
@@ -197,7 +194,6 @@ def test_a_late_observation_tells_of_the_clocks_alone() -> None:
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
-    """It is treated as one that was never heard; its neighbour is not forgotten."""
     plausibility = after()
     assert judge(plausibility, seen(100), row=1) == Belief.BELIEVED
     plausibility.forget(0)
@@ -457,6 +453,6 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]
-    why = "its state has jumped further than a vehicle can move"
+    why = str(Reason.LEAPT)
     assert changes[-2:] == [("brake", why), ("hover", why)]
     assert np.abs(flight.client["input"][-1]).max() == 0.0

@@ -227,7 +227,6 @@ def test_an_observation_from_ahead_is_taken_as_it_is(ahead: int, *, feedback: bo
 
 
 def test_many_horizons_are_kept_and_no_more() -> None:
-    """The ring turns; one that has fallen out is not known any more."""
     sent = plans(3, *[BOUND + H] * 40)
 
     def told(in_force: int) -> list[float]:

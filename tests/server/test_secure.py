@@ -119,7 +119,6 @@ def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
 
 
 def test_the_bytes_of_a_handshake() -> None:
-    """The bytes are those of the table in docs/security.md; the header names vehicle and key."""
     client, server = link(), gate()
     first = client.hello(HELLO, now_ns=0)
     assert first[:5].hex() == "0101010005"
@@ -143,7 +142,6 @@ def test_the_bytes_of_a_handshake() -> None:
 
 
 def test_the_forms_that_are_admitted_are_those_on_the_wire() -> None:
-    """Packets of a channel, INITIATIONs, and HELLOs in plaintext, which the operator is told of."""
     client, _ = joined()
     plain = encode(Hello(1, 5, reading.load("demo").terms()))
     sent = [client.seal(OBSERVATION), link().hello(HELLO, now_ns=0), plain]
@@ -287,7 +285,6 @@ def test_who_has_no_key_is_met_with_silence() -> None:
 
 
 def test_the_key_of_another_vehicle_opens_nothing() -> None:
-    """A vehicle that has a key is that vehicle, and no other."""
     server = gate()
     renamed = link(key=VehicleKey.of(1, 5, SECRETS[2]))
     assert refusal(server, renamed.hello(HELLO, now_ns=0)) == "forged"
@@ -498,7 +495,6 @@ def test_without_cookies_a_recorded_hello_draws_handshakes_from_anywhere(
 
 
 def test_a_vehicle_gets_five_handshakes_a_second() -> None:
-    """More are dropped; another vehicle is not concerned."""
     client, server = link(), gate()
     challenged(client, server)
     hello = client.hello(HELLO, now_ns=0)
@@ -859,7 +855,6 @@ def test_the_shortest_and_the_longest_response_are_read() -> None:
 
 
 def test_a_response_with_another_message_opens_no_channel() -> None:
-    """The vehicle has nothing to adopt, and goes on with its attempt."""
     client, server = link(), gate()
     challenged(client, server)
     call = called(server, client.hello(HELLO, now_ns=0))
@@ -903,7 +898,6 @@ def test_a_flood_of_initiations_takes_no_memory() -> None:
 
 
 def test_hostile_datagrams_give_protocol_errors_alone() -> None:
-    """Random bytes, and all packets of a flight with something changed, at either end."""
     flight, rng = recorded(3), random.Random(4)
     flight.client.hello(HELLO, now_ns=flight.now_ns)
     reasons, accepted = Counter[str](), 0
@@ -933,7 +927,6 @@ def test_hostile_datagrams_give_protocol_errors_alone() -> None:
 
 
 def test_no_secret_is_shown_by_an_end() -> None:
-    """Neither in a `repr`, nor in the message of an error."""
     client, server = joined()
     call = called(server, client.seal(OBSERVATION))
     shown = repr((client, server, call.line, server._vehicles, client._current))

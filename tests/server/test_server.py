@@ -514,7 +514,6 @@ def test_no_estimate_without_a_recent_observation() -> None:
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
-    """The vehicle's row is free again, and the server comes to rest."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     vehicles.now_ns += SESSION_NS + vehicles.dt_ns
@@ -628,8 +627,6 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
 
 
 def test_two_vehicles_fly_as_each_would_alone() -> None:
-    """One batch equals its singles, to the last bit of every horizon."""
-
     def horizons(numbers: tuple[int, ...]) -> dict[int, list[bytes]]:
         vehicles = Vehicles(scenario())
         sent: dict[int, list[bytes]] = {number: [] for number in numbers}
@@ -695,7 +692,6 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
 
 
 def test_figures_of_many_vehicles_stay_readable() -> None:
-    """Sixteen of them, and how many more."""
     vehicles = Vehicles(scenario())
     for number in range(20):
         vehicles.observe(vehicles.open(vehicle=number), 0)
@@ -704,7 +700,6 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
 
 
 def test_figures_tell_what_was_counted() -> None:
-    """For the operator, with how well each vehicle's clock is known."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     vehicles.tick()

@@ -51,7 +51,6 @@ def test_problems_of_these_tests_touch_the_box_and_leave_it() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1e4))
 def test_answers_never_leave_the_box(seed: int, size: float) -> None:
-    """No input leaves it, not even by a rounding error."""
     u, solved = OsqpSolver(PROBLEM).solve(*problems(seed, 2, size))
     assert solved.all()
     assert (np.abs(u) <= U_MAX[:, None]).all()
@@ -60,7 +59,6 @@ def test_answers_never_leave_the_box(seed: int, size: float) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_bad_gradient_fails_its_own_vehicle_alone(axis: int, bad: float) -> None:
-    """That vehicle gets its guess back on every axis, the others their answers."""
     gradient, guess = problems(1, 3)
     healthy, _ = OsqpSolver(PROBLEM).solve(gradient, guess)
     gradient[1, axis, 7] = bad
@@ -106,7 +104,6 @@ def test_iteration_limit_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_caller_keeps_its_arrays() -> None:
-    """Neither problem nor guess is written to."""
     gradient, guess = problems(5, 2)
     before = gradient.copy(), guess.copy()
     u, _ = OsqpSolver(PROBLEM).solve(gradient, guess)
@@ -118,7 +115,6 @@ def test_caller_keeps_its_arrays() -> None:
 @quick
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.floats(0.0, 1e4)), max_size=5))
 def test_answer_depends_on_problem_and_guess_alone(history: list[tuple[int, float]]) -> None:
-    """Earlier problems have no effect: equal questions have equal answers, to the last bit."""
     gradient, guess = problems(6, 1)
     used = OsqpSolver(PROBLEM)
     for seed, size in history:
@@ -141,7 +137,6 @@ def test_answer_does_not_lean_on_its_guess() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
 def test_batch_is_solved_as_its_singles(seed: int, vehicles: int) -> None:
-    """Answers have equal bits, alone and in company."""
     gradient, guess = problems(seed, vehicles)
     solver = OsqpSolver(PROBLEM)
     u, _ = solver.solve(gradient, guess)

@@ -75,7 +75,6 @@ def test_a_clock_that_goes_on_is_passed_on_as_it_is() -> None:
 
 
 def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
-    """All that an endpoint can be asked goes on to the one inside: the base has answers to some."""
     asked = {name for name in vars(Endpoint) if name[0] != "_"}
     own = {
         "changeable",
@@ -148,7 +147,6 @@ def test_a_wake_that_was_asked_for_late_is_no_jump() -> None:
 
 
 def test_all_else_is_the_endpoints_own() -> None:
-    """Datagrams, events, figures and `finished` are passed on unchanged."""
     server = Server(reading.load("demo"), boot_id=1, entropy=stream(1, "entropy").bytes)
     steady = Steady(server)
     hear(steady, [1])

@@ -148,7 +148,6 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
 
 
 def test_what_cannot_be_has_no_solution() -> None:
-    """Two constraints that contradict each other."""
     columns = np.array([[1.0, -1.0], [0.0, 0.0]])
     assert DualSolver(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
 
@@ -545,7 +544,6 @@ def test_a_motion_is_not_taken_aboard_before_its_first_knot() -> None:
 
 
 def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
-    """The motion of this step counts once, also when it is already in force."""
     known = Known()
     first, sent, new = (resting(step, np.zeros(2)) for step in (100, 104, 108))
     known.in_force, known.next = Sent(100, first), new
@@ -1205,7 +1203,6 @@ def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Pat
 
 
 def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
-    """Where vehicles may land."""
     table = in_space(tmp_path, "1,0,0,0,1\n2,0,5,0,1\n", goals="goal(2, 0.5, 0, 9)")
     said = "expected a place 0.93 m to the side from the goal of vehicle 1"
     with pytest.raises(ConfigError, match=re.escape(said)):
@@ -1248,7 +1245,6 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
     ],
 )
 def test_a_goal_that_cannot_be_is_refused(goals: str, said: str) -> None:
-    """With the one that is wrong, and what is expected."""
     table = reading.to_table(scenario(2))
     table["mission"] |= {"goals": goals, "zones": "box(-1, 1, -1, 1)"}
     with pytest.raises(ConfigError, match=re.escape(said)):
@@ -1291,7 +1287,6 @@ def test_goals_as_near_as_they_may_be_are_reached(
 
 
 def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
-    """Each vehicle is at its own goal at any time, and begins at its first."""
     file = tmp_path / "goals.csv"
     file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,3,1\n2,0,4,0\n")
     table = reading.to_table(reading.load("swap"))
@@ -1316,7 +1311,6 @@ def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
-    """In a line that names the key."""
     file = tmp_path / "goals.csv"
     file.write_text(text)
     table = reading.to_table(reading.load("swap"))
@@ -1338,7 +1332,6 @@ def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
 def test_what_would_end_the_guarantee_is_refused(
     section: str, key: str, value: Any, said: str
 ) -> None:
-    """Before anything flies."""
     table = reading.to_table(reading.load("swap"))
     table[section][key] = value
     with pytest.raises(ConfigError) as refused:
@@ -1349,7 +1342,6 @@ def test_what_would_end_the_guarantee_is_refused(
 def test_the_fleet_tells_how_near_they_came(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Beside what was asked for; and a mission says how many fly."""
     file = tmp_path / "s.json"
     shape = ["--reference.shape", "swap(4)", "--duration", "12", "--settle", "1"]
     assert main(["fleet", "swap", "--virtual", *shape, "--json", str(file)]) == 0

@@ -327,7 +327,6 @@ def test_gap_is_the_mean_over_what_may_be_followed() -> None:
 
 
 def test_gap_of_what_is_in_force_is_certain() -> None:
-    """An observation has acknowledged it."""
     flown = scenario()
     server = Server(flown)
     server.observe(0)
@@ -413,7 +412,6 @@ def test_a_vehicle_that_takes_nothing_holds_nothing() -> None:
 
 
 def test_a_new_life_forgets_what_the_old_one_was_sent() -> None:
-    """Its steps count from 0 again."""
     server = Server(scenario(), capacity=2)
     server.observe(1000)
     server.at(1001, send=True)
@@ -444,7 +442,6 @@ def test_as_few_knots_are_sent_as_keep_near_enough() -> None:
 
 
 def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
-    """A square wave."""
     count, spacing, _ = fitted(lambda t: np.sign(np.sin(9 * t)), 0.02)
     assert (count, spacing) == (KNOTS_MAX, 4)
 
@@ -536,7 +533,6 @@ def test_a_packet_is_small(axes: int, count: int) -> None:
 
 
 def test_what_is_sent_is_what_is_read() -> None:
-    """To the last bit."""
     flown = scenario()
     knots = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
     read = decode(encode(message(77, knots)), flown.terms())
@@ -571,7 +567,6 @@ def wire(**fields: Any) -> bytes:
     ],
 )
 def test_hostile_fields_are_refused(fields: dict[str, Any], reason: str) -> None:
-    """They are the peer's mistake."""
     terms = scenario().terms()
     assert isinstance(decode(wire(), terms), Trajectory)
     with pytest.raises(ProtocolError, match=rf"^{reason}$"):
@@ -579,7 +574,6 @@ def test_hostile_fields_are_refused(fields: dict[str, Any], reason: str) -> None
 
 
 def test_each_scheme_takes_its_own_messages_alone() -> None:
-    """A plan is no trajectory, and a trajectory no plan."""
     splines, plans = scenario().terms(), scenario().terms()._replace(scheme="committed")
     inputs = bytes(8 * plans.horizon)
     plan = msgpack.packb([VERSION, 4, 1, 2, 5, 9, 9, inputs, b"", 4, 300])
@@ -705,7 +699,6 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
 
 
 def test_a_key_stands_in_for_the_number_of_the_policy() -> None:
-    """A search can therefore change it."""
     flown = scenario(control={"trigger": "expected_gap", "cost_gap": 0.55})
     assert set(fly(flown).server["threshold"]) == {0.55}
 

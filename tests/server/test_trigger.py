@@ -105,7 +105,6 @@ def test_threshold_decays_per_second() -> None:
 
 
 def test_threshold_depends_on_time_and_not_on_how_it_is_cut() -> None:
-    """Ten steps of 0.05 s are five of 0.1 s."""
     fine = ControlConfig(
         trigger="state_gap", dt=0.05, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
     )
@@ -201,7 +200,6 @@ def test_more_tolerance_means_a_higher_threshold(
 
 
 def test_always_sends_even_without_an_error() -> None:
-    """At every step, whatever was sent before."""
     trigger = trigger_of("always")
     for step in range(3):
         verdict = ask(trigger, step, 0.0)
@@ -236,14 +234,12 @@ def test_periodic_counts_from_what_was_sent() -> None:
 
 
 def test_periodic_begins_anew_with_a_new_life() -> None:
-    """Step 0 owes nothing to step 5000 of before."""
     trigger = trigger_of("periodic(4)")
     assert events(trigger, 5000, 5001) == [5000]
     assert events(trigger, 0, 5) == [0, 4]
 
 
 def test_periodic_counts_for_each_vehicle_by_itself() -> None:
-    """Two vehicles, last sent to at steps 3 and 5, both at step 7."""
     trigger = trigger_of("periodic(4)", capacity=6)
     rows = np.array([5, 2])
     told = figures_of(2)
@@ -320,7 +316,6 @@ def test_budget_binds_a_vehicle_that_begins_anew_too() -> None:
 
 @pytest.mark.parametrize("text", [name for name in TRIGGERS if name != "budget"] + ["budget(5, 2)"])
 def test_a_forgotten_vehicle_is_as_one_that_was_never_there(text: str) -> None:
-    """A new life owes nothing to events, packets and tokens of the old one; others keep theirs."""
     text = {"silence": "silence(1)"}.get(text, text)
     new, old = trigger_of(text, capacity=2), trigger_of(text, capacity=2)
     rows = np.array([0, 1])
@@ -395,7 +390,6 @@ def test_without_the_budget_its_cap_is_broken() -> None:
 
 
 def test_deviation_is_a_distance_above_the_threshold() -> None:
-    """In metres; its own key stands in for the argument."""
     for text in ("deviation(0.05)", "deviation"):
         for metres, event in ((0.05, False), (0.051, True)):
             verdict = trigger_of(text).test(facing(ROW, figures_of(deviation_m=metres)))
@@ -403,7 +397,6 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_fires_above_the_threshold() -> None:
-    """The cost gap exceeds its key or argument; a fresh vehicle is always sent a horizon."""
     for text in ("cost_gap(1)", "cost_gap"):
         trigger = trigger_of(text)
         assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
@@ -470,7 +463,6 @@ def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) 
 
 
 def test_scenario_names_its_trigger() -> None:
-    """Every policy that a scenario may name is made, with the scenario's keys for its arguments."""
     control = ControlConfig(period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0)
     thresholds = {
         "state_gap": 2.0,
@@ -520,7 +512,6 @@ def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures
 @quick
 @given(trees, st.integers(0, 2**32 - 1))
 def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:
-    """At every step of a flight; asked again at the same step, it says the same."""
     rng, rows = np.random.default_rng(seed), np.array([2, 0, 3])
     whole = trigger_of(written(tree), capacity=4)
     parts = {leaf: trigger_of(leaf, capacity=4) for leaf in LEAVES}
@@ -545,7 +536,6 @@ def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:
 @quick
 @given(trees, st.integers(0, 2**32 - 1))
 def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
-    """Vehicles of one batch have their own last events, tokens, steps and first steps."""
     rng, rows = np.random.default_rng(seed), np.array([5, 1, 2])
     together = trigger_of(written(tree), capacity=6)
     singles = [trigger_of(written(tree)) for _ in rows]

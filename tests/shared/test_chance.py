@@ -17,7 +17,6 @@ def numbers(seed: int, *names: str | int) -> list[int]:
 
 
 def test_the_same_names_give_the_same_stream() -> None:
-    """The caller, and the number of calls, have no effect."""
     assert numbers(3, *NAMES) == numbers(3, *NAMES)
 
 

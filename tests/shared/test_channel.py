@@ -136,7 +136,6 @@ def test_a_window_lets_the_oldest_in_and_nothing_older() -> None:
 
 
 def test_the_bytes_of_a_packet() -> None:
-    """The bytes are those of the table in docs/security.md."""
     vehicle, _ = ends(vehicle=0x0201, number=0x06050403)
     vehicle.seal(b"")
     packet = vehicle.seal(b"message")
@@ -221,7 +220,6 @@ def test_without_expiry_an_old_packet_is_opened(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_an_end_shows_no_key() -> None:
-    """Not in its `repr`."""
     assert "x01" not in repr(ends()[0])
 
 

@@ -97,7 +97,6 @@ def test_no_command_writes_through_a_link_or_to_a_device(
 def test_tables_are_not_written_through_a_link(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The folder may be anybody's."""
     (tmp_path / "client.csv").symlink_to(tmp_path / "elsewhere")
     assert command.main(export, [str(flight), "--csv", str(tmp_path)], "export") == 2
     assert "client.csv: cannot be written: it is a link" in capsys.readouterr().err
@@ -118,7 +117,6 @@ def test_recover_in_place_leaves_a_link_and_its_file_alone(
 
 
 def test_journals_and_keys_are_not_written_through_a_link(tmp_path: Path) -> None:
-    """The link may lead anywhere."""
     at, elsewhere = tmp_path / "it", tmp_path / "elsewhere"
     at.symlink_to(elsewhere)
     for write in (files.appending, files.Growing):
@@ -130,7 +128,6 @@ def test_journals_and_keys_are_not_written_through_a_link(tmp_path: Path) -> Non
 
 
 def test_a_file_that_is_there_is_written_anew(tmp_path: Path) -> None:
-    """All of the old content is gone, and its mode is as it was."""
     at = tmp_path / "it"
     files.write(at, b"long content")
     at.chmod(0o600)

@@ -106,7 +106,6 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def test_a_scenario_s_gain_is_for_its_model_but_for_the_dead_time() -> None:
-    """There is none without feedback."""
     known = scenario(model={"gain": 0.8, "dead_time_s": 0.3})
     expected = gain_for(discretise([0.84, 0.84], 0.05, 0.8), known.control)
     np.testing.assert_array_equal(feedback_gain(known), expected)

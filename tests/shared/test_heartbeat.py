@@ -133,7 +133,6 @@ def test_of_a_burst_no_more_than_its_rest_by_the_modulus_is_seen(burst: int) -> 
 
 
 def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
-    """`link.heartbeat_s` as a number."""
     hearing = Hearing(2 * SECOND_NS, DT_NS, SECOND_NS // 4)
     assert hearing.silence == 10  # of half a step of 50 ms
     hear(hearing, 100)

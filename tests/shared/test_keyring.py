@@ -59,7 +59,6 @@ def test_a_vehicle_uses_its_key_with_the_highest_number() -> None:
 
 
 def test_a_key_that_is_missing_is_named() -> None:
-    """With the file, and what there is."""
     keys = keyring(write(1, 7, A), write(1, 9, B))
     with pytest.raises(ConfigError, match=r"^keys: no key of vehicle 3, expected one$"):
         keys.of(3)
@@ -175,7 +174,6 @@ def test_what_is_no_file_of_keys_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_no_secret_is_shown_by_a_repr() -> None:
-    """Neither the secret nor what is derived from it; a worker gets all of it nevertheless."""
     keys = keyring(write(1, 7, A))
     key = keys.of(1)
     assert repr(key) == "VehicleKey(vehicle=1, number=7)"
@@ -239,7 +237,6 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
 def test_keygen_refuses_in_one_line_and_changes_nothing(
     argv: list[str], message: str, tmp_path: Path
 ) -> None:
-    """With exit code 2."""
     path = put(tmp_path / "k", write(4, 255, A).encode())
     run = keygen(*argv, cwd=tmp_path)
     assert (run.returncode, run.stderr) == (2, f"keygen: {message}\n")
@@ -256,7 +253,6 @@ def test_keygen_adds_nothing_to_a_file_that_others_can_read(tmp_path: Path) -> N
 
 
 def test_the_documented_commands_make_keys(tmp_path: Path) -> None:
-    """Those of docs/security.md, one after another."""
     text = (ROOT / "docs" / "security.md").read_text()
     lines = re.findall(r"^skytether keygen (.*?)(?: *#.*)?$", text, re.MULTILINE)
     assert lines

@@ -102,7 +102,6 @@ def test_very_short_time_constant_follows_at_once() -> None:
 
 
 def test_a_roll_is_its_steps() -> None:
-    """To the last bit, from the state that it begins with on."""
     model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(2)
     x, inputs = rng.normal(size=(3, 2)), rng.normal(size=(3, 7))
     states = model.roll(x, inputs)

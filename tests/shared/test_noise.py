@@ -180,7 +180,6 @@ def test_a_message_is_48_bytes_longer_than_its_payload() -> None:
 
 
 def test_no_key_is_shown() -> None:
-    """Neither keys nor states have a `repr` with what they hold."""
     initiator, responder = shake(PSK)
     keys = responder.answer(fixed("b"), b"")[1]
     assert isinstance(keys, Keys)

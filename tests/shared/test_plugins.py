@@ -144,7 +144,6 @@ def test_the_documented_reference_moves_as_fast_as_it_says(tmp_path: Path) -> No
 
 
 def test_the_documented_policies_are_those_that_there_are() -> None:
-    """A row each."""
     rows = re.findall(r"^\| `(\w+)", TRIGGERS_MD.read_text(), re.MULTILINE)
     assert set(TRIGGERS) <= set(rows)
 
@@ -155,7 +154,6 @@ def test_the_documented_policies_are_those_that_there_are() -> None:
 def test_triggers_are_listed_with_a_sentence_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ours and a plug-in's, the latter with its file."""
     path, about = tmp_path / "mine.py", '    """Sends nothing.\n\n    More."""\n'
     path.write_text(HEAD + NEVER.replace("    return", f"{about}    return"))
     assert main(["triggers", "--plugin", str(path)]) == 0
@@ -166,7 +164,6 @@ def test_triggers_are_listed_with_a_sentence_each(
 
 
 def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixture[str]) -> None:
-    """Those that come with Skytether."""
     assert main(["references"]) == 0
     said = capsys.readouterr().out
     assert "figure-eight\n    Lemniscate, 2 `radius_m` wide" in said
@@ -259,7 +256,6 @@ def test_every_other_field_is_known_with_every_scheme(scheme: str, tmp_path: Pat
 def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
     tmp_path: Path,
 ) -> None:
-    """Once, and with nothing after it."""
     plug(tmp_path, NEVER)
     assert flown("never").server["event"].sum() == 1
 
@@ -320,7 +316,6 @@ SLIP = "slip(mps, N) with 0 <= mps <= 5 and 1 <= N (whole)"
 def test_arguments_of_a_plugin_are_checked_like_ours(
     written: str, expected: str, tmp_path: Path
 ) -> None:
-    """Bounds, whole numbers, names."""
     code = """
         from typing import Annotated
         from msgspec import Meta
@@ -403,7 +398,6 @@ def test_every_bound_of_a_text_holds(
 
 
 def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) -> None:
-    """All numbers are written, or none."""
     code = """
         @trigger
         def slip(now, a: float = -2.0, b: int = 3):
@@ -430,7 +424,6 @@ def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) ->
 
 
 def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path) -> None:
-    """With what its class says."""
     code = """
         @trigger(name="between")
         class Between(Trigger):
@@ -493,7 +486,6 @@ WRONG = {
 def test_a_file_that_is_no_plugin_is_refused_in_one_line(
     code: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With exit code 2."""
     path = tmp_path / "mine.py"
     path.write_text(HEAD + code)
     assert main(["fly", "demo", "--virtual", "--plugin", str(path)]) == 2
@@ -501,7 +493,6 @@ def test_a_file_that_is_no_plugin_is_refused_in_one_line(
 
 
 def test_a_file_that_fails_adds_nothing(tmp_path: Path) -> None:
-    """Not even what stands before the mistake."""
     assert "line 6: ZeroDivisionError" in refusal(lambda: plug(tmp_path, NEVER + "1 / 0\n"))
     assert "never" not in TRIGGERS
     assert plugins.flags() == []
@@ -510,7 +501,6 @@ def test_a_file_that_fails_adds_nothing(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_read_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """So is a folder."""
     for path, why in (
         (tmp_path / "no.py", "No such file or directory"),
         (tmp_path, "Is a directory"),
@@ -530,7 +520,6 @@ def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
 
 
 def test_a_flag_without_its_file_is_told_by_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """The command exits with code 2 and names the flag on stderr."""
     with pytest.raises(SystemExit) as caught:
         main(["triggers", "--plugin"])
     assert caught.value.code == 2
@@ -607,7 +596,6 @@ def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> 
 
 
 def test_a_reference_of_a_plugin_is_flown(tmp_path: Path) -> None:
-    """Along x at 0.4 m/s, or at its default."""
     plug(tmp_path, SLOPE)
     asked = scenario(reference={"shape": "slope(0.4)"}, vehicle={"wind": 0.0})
     assert fly(asked).client[-1]["state"][0, 1] == pytest.approx(0.4, abs=0.05)
@@ -639,7 +627,6 @@ UNFLYABLE = {
 
 @pytest.mark.parametrize(("body", "said"), UNFLYABLE.values(), ids=UNFLYABLE)
 def test_a_reference_that_cannot_be_flown_is_refused(body: str, said: str, tmp_path: Path) -> None:
-    """Before a flight, in one line."""
     plug(tmp_path, f"@reference\ndef mine(scenario):\n    {body}\n")
     told = refusal(lambda: scenario(reference={"shape": "mine"}))
     expected = f"expected a trajectory that can be flown ({said})"
@@ -798,7 +785,6 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
 def test_a_package_whose_entry_point_leads_nowhere_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line."""
     info = tmp_path / "broken-2.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
@@ -813,7 +799,6 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
 
 
 def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
-    """An impairment of an installed package is listed, and flies in a command."""
     listed = run("impairments", folder=tmp_path, path=installed)
     assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed
     network = ("--network.uplink", "constant(0.2) & dark(2)")

@@ -115,12 +115,10 @@ def test_what_is_written_is_read(text: str, read: policies.Expression) -> None:
 
 @pytest.mark.parametrize(("text", "said"), REFUSED.items(), ids=REFUSED)
 def test_what_is_no_trigger_is_refused_in_one_line(text: str, said: tuple[str, str]) -> None:
-    """With the part that is wrong, and what was expected."""
     assert refusal(text) == f"mine: control.trigger: got {said[0]!r}, expected {said[1]}"
 
 
 def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
-    """However deep it is."""
     deep = "(" * 97 + "always" + ")" * 97
     assert len(deep) == TEXT_MAX
     assert policies.parse(deep) == ALWAYS
@@ -139,7 +137,6 @@ def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     ],
 )
 def test_what_is_compared_needs_a_scheme_that_has_it(name: str, needed: str, given: str) -> None:
-    """Deep in an expression, too."""
     text = f"silence(1) | {name} & budget(5, 2)"
     control: dict[str, Any] = {"trigger": text, "scheme": given, "feedback": given != "none"}
     said = helpers.refusal(lambda: reading.check({"control": control}, "mine"))
@@ -217,5 +214,4 @@ def written(tree: policies.Expression) -> str:
 
 @given(trees)
 def test_every_combination_can_be_written(tree: policies.Expression) -> None:
-    """Each combination is read as it was meant."""
     assert policies.parse(written(tree)) == tree

@@ -103,7 +103,6 @@ def test_a_part_begins_with_its_columns_in_a_line() -> None:
 
 
 def test_one_value_is_broadcast_to_all_rows() -> None:
-    """A value for each row keeps its place."""
     sink = io.BytesIO()
     Recorder(PACKET_COLUMNS, sink).append(3, flow=7, number=[4, 5, 6], lost=True)
     rows = parse(sink.getvalue())
@@ -113,7 +112,6 @@ def test_one_value_is_broadcast_to_all_rows() -> None:
 
 
 def test_a_column_left_out_is_zero() -> None:
-    """Nothing of an earlier row shows through."""
     sink = io.BytesIO()
     recorder = Recorder(client_columns(2), sink)
     recorder.append(1, **some_rows(client_columns(2), 1))
@@ -124,7 +122,6 @@ def test_a_column_left_out_is_zero() -> None:
 
 
 def test_rows_stay_in_the_order_in_which_they_were_appended() -> None:
-    """Over several calls."""
     sink = io.BytesIO()
     recorder = Recorder(PACKET_COLUMNS, sink)
     for numbers in ([0, 1], [], [2], [3, 4, 5]):
@@ -139,7 +136,6 @@ def test_a_misspelt_column_is_our_own_mistake() -> None:
 
 
 def test_a_part_is_read_from_its_file(tmp_path: Path) -> None:
-    """A part read from its file equals the part parsed in memory."""
     path = tmp_path / "netem"
     path.write_bytes(written(PACKET_COLUMNS))
     np.testing.assert_array_equal(read(path), parse(written(PACKET_COLUMNS)))
@@ -149,7 +145,6 @@ def test_a_part_is_read_from_its_file(tmp_path: Path) -> None:
     "content", [b"", b"a diary\n", b"\xff\x00", b"3\n", b"null\n", b"[]\n", b'[["a", "zzz"]]\n']
 )
 def test_a_file_that_is_no_part_is_a_value_error(tmp_path: Path, content: bytes) -> None:
-    """`read` raises nothing but ValueError, whatever the file contains."""
     path = tmp_path / "netem"
     path.write_bytes(content)
     with pytest.raises(ValueError):  # noqa: PT011 - the words are those of json or numpy

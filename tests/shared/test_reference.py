@@ -162,7 +162,6 @@ def test_looped_waypoints_fly_home_and_on() -> None:
 
 
 def test_hover_stays_where_it_is() -> None:
-    """One point, no velocity, at any time."""
     states = reference.hover(np.array([1.0, -2.0, 3.0]))(np.array([0.0, 1.0, 1e6]))
     np.testing.assert_array_equal(states[..., 0], [[1.0, -2.0, 3.0]] * 3)
     np.testing.assert_array_equal(states[..., 1], np.zeros((3, 3)))
@@ -259,7 +258,6 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("text", "message"), BAD_FILES)
 def test_bad_file_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
-    """The error names the line, if one line is at fault."""
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
@@ -285,7 +283,6 @@ def test_file_that_is_no_table_is_refused_in_words(tmp_path: Path, lines_before:
 
 
 def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> None:
-    """The user hears which key of which scenario led to it."""
     path = tmp_path / "path.csv"
     path.write_text("t,x,y\n0,0,0\n1,one,1\n")
     with pytest.raises(ConfigError) as caught:

@@ -48,7 +48,6 @@ def test_no_input_is_flown_for_longer_than_the_age_bound_allows(observed: int, c
 
 @pytest.mark.parametrize(("horizon", "steps"), [(1, 2), (11, 2), (12, 3), (40, 10), (120, 30)])
 def test_a_horizon_may_be_late_by_a_quarter_of_itself(horizon: int, steps: int) -> None:
-    """By two steps at least."""
     assert late_max(horizon) == steps
 
 
@@ -59,7 +58,6 @@ def test_the_nearest_input_counts_where_a_horizon_has_none(stage: int, index: in
 
 
 def test_an_input_is_kept_within_the_bound() -> None:
-    """On both sides; what lies within is left as it is."""
     assert [bounded(u, 1.8) for u in (-5.0, -1.8, 0.1, 1.8, 1.8015)] == [-1.8, -1.8, 0.1, 1.8, 1.8]
 
 
@@ -85,7 +83,6 @@ def test_feedback_is_added_within_the_bound_from_the_first_stage_on(
     ("stage", "brake"), [(-1, 0.0), (-1, 0.2), (9, 0.2), (10, 0.0), (10**12, 0.0)]
 )
 def test_an_input_is_told_in_full_until_it_is_braked(stage: int, brake: float) -> None:
-    """For ever, where nothing is braked."""
     assert remaining(stage, 10, 1.0, brake) == 1.0
 
 
@@ -165,7 +162,6 @@ COMPILED = {
 def test_compiled_it_says_the_same(
     stage: int, length: int, numbers: tuple[float, float, float, float, float]
 ) -> None:
-    """To the last bit, each function."""
     told, back, speed, brake, bound = numbers
     share = remaining(stage, length, speed, brake)
     for function, *given_ in (
@@ -322,6 +318,5 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
 
 def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
-    """There is one source of the rule."""
     for name in ("lasting", "bounded", "lead_to", "step", "advance"):
         assert getattr(law, name) is getattr(rule, name)

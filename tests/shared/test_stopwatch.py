@@ -17,7 +17,6 @@ def test_laps_follow_each_other_and_add_up_by_name() -> None:
 
 
 def test_without_a_clock_nothing_takes_time() -> None:
-    """Virtual time has none to lend."""
     watch = Stopwatch()
     watch.start()
     assert watch.lap("plan") == 0

@@ -175,7 +175,6 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
 
 @pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values() - keys_of(InFlight.LEAP)))
 def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
-    """The vehicle flies."""
     ours, theirs = differing(key, tmp_path)
     assert ours != theirs
     _, client = shake_hands(ours, theirs)
@@ -185,7 +184,6 @@ def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
 
 
 def test_a_trajectory_is_compared_by_what_stands_in_its_file(tmp_path: Path) -> None:
-    """Wherever it lies on either machine."""
     scenarios = []
     for name in ("here", "there"):
         file = tmp_path / f"{name}.csv"
@@ -214,7 +212,6 @@ def test_the_longest_terms_fit_one_datagram() -> None:
 
 
 def test_the_documented_table_names_every_term() -> None:
-    """In the order on the wire."""
     text = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
     table = text.split("## Terms")[1].split("## Rules")[0]
     named = re.findall(r"^\| `([a-z_.0-9]+)` \|", table, re.MULTILINE)

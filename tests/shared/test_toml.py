@@ -74,7 +74,6 @@ def test_a_text_that_takes_too_much_is_refused(text: str, said: str) -> None:
     ],
 )
 def test_points_in_texts_and_numbers_are_no_parts(text: str) -> None:
-    """Nor are brackets in texts."""
     assert isinstance(toml.loads(text), dict)
 
 
@@ -124,7 +123,6 @@ def test_no_file_takes_much_memory(name: str, tmp_path: Path) -> None:
 
 
 def test_the_limit_itself_is_one() -> None:
-    """A command that takes more memory fails."""
     code = "bytearray(800 * 2**20)"
     program = LIMITED.replace("sys.exit(main(sys.argv[1:]))", code)
     run = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, check=False)

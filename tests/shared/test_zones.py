@@ -54,7 +54,6 @@ def away_m(text: str, *points: tuple[float, ...]) -> list[float]:
     ],
 )
 def test_distances(text: str, point: tuple[float, ...], distance_m: float) -> None:
-    """Outside they are positive, within negative."""
     assert away_m(text, point)[0] == pytest.approx(distance_m, abs=0.01)
 
 
@@ -156,7 +155,6 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
     ],
 )
 def test_what_is_no_zone_is_told(text: str, said: str) -> None:
-    """With the part of it that is wrong."""
     with pytest.raises(PolicyError) as refused:
         zones.parse(text, 2)
     assert said in str(refused.value)
@@ -247,7 +245,6 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
     ],
 )
 def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
-    """In one line."""
     file = tmp_path / "map.geojson"
     file.write_text(content)
     with pytest.raises(PolicyError) as refused:
@@ -316,7 +313,6 @@ def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n
     ],
 )
 def test_goals_that_cannot_be_reached(text: str, goals: str, said: str, tmp_path: Path) -> None:
-    """Before anything flies."""
     table = mission(tmp_path, text, *([goals] if goals else []))
     with pytest.raises(ConfigError) as refused:
         reading.check(table, "mission")
@@ -332,7 +328,6 @@ def test_zones_are_of_missions_alone() -> None:
 
 
 def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
-    """The path of a zones file is relative to the scenario's folder."""
     (tmp_path / "map.json").write_text(geojson([polygon([[9, 9], [10, 9], [9, 10]])]))
     file = tmp_path / "mine.toml"
     file.write_text('extends = "swap"\n[mission]\nzones = "geojson(map.json)"\n')

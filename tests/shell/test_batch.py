@@ -151,7 +151,6 @@ def test_nothing_is_sent_that_is_too_long_or_of_another_family() -> None:
 def test_addresses_keep_their_value_in_the_kernels_form(
     address: tuple[str, int], length: int
 ) -> None:
-    """Scope included."""
     raw = pack_address(address)
     assert (len(raw), unpack_address(raw)) == (length, address)
 
@@ -562,7 +561,6 @@ def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
 def test_an_endpoint_without_patience_hears_each_as_it_comes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """However many there are."""
     crowd = Crowd(Answering(60, lambda _: []), monkeypatch)
     crowd.send((30, 30))
     assert crowd.read == []

@@ -200,7 +200,6 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
 
 
 def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) -> None:
-    """Nobody listens there."""
     path = tmp_path / "netem"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))
@@ -225,7 +224,6 @@ def occupied(path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["a file", "a folder", "a link", "a pipe"])
 def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
-    """It stays, as it is."""
     path = tmp_path / "netem"
     occupied(path, kind)
     before = path.lstat()
@@ -240,7 +238,6 @@ def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [socket.SOCK_DGRAM, socket.SOCK_STREAM])
 def test_a_socket_at_which_somebody_listens_stays(kind: int, tmp_path: Path) -> None:
-    """Another process of ours, or of whatever else."""
     path = tmp_path / "netem"
     with socket.socket(socket.AF_UNIX, kind) as other:
         other.bind(str(path))
@@ -268,7 +265,6 @@ def test_at_the_end_only_its_own_socket_is_removed(tmp_path: Path) -> None:
 def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
     name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With the flag, the path and the reason."""
     from skytether.netem.__main__ import emulate
 
     path = tmp_path / name
@@ -319,7 +315,6 @@ def test_a_value_is_toml_or_else_a_text(text: str, expected: object) -> None:
 def test_what_is_no_change_is_refused_before_anybody_is_asked(
     changes: list[str], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With exit code 2."""
     assert command.main(set_keys, ["nowhere", *changes], "set") == 2
     assert capsys.readouterr().err == f"set: {line}\n"
 
@@ -327,7 +322,6 @@ def test_what_is_no_change_is_refused_before_anybody_is_asked(
 def test_where_nobody_listens_is_said_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With exit code 1."""
     path = tmp_path / "netem"
     assert command.main(set_keys, [str(path)], "set") == 1
     assert capsys.readouterr().err == f"set: {path}: No such file or directory\n"

@@ -167,7 +167,6 @@ def test_columns_survive_the_round_trip() -> None:
     ],
 )
 def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
-    """`columns_of` raises nothing but FeedError."""
     with pytest.raises(FeedError, match="no columns"):
         columns_of(text)
 
@@ -365,7 +364,6 @@ def flooded(driven: Driven) -> tuple[int, int]:
 
 
 def test_who_does_not_read_is_dropped_and_all_else_goes_on(driven: Driven) -> None:
-    """No more waits for him than may; others miss nothing."""
     dropped, waiting = flooded(driven)
     assert dropped == 1
     assert waiting <= WAITING_BYTES_MAX
@@ -461,7 +459,6 @@ def test_at_the_end_readers_get_the_rest(driven: Driven) -> None:
 def test_the_end_does_not_wait_long_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of them share the time."""
     monkeypatch.setattr(skytether.shell.feed, "PATIENCE_S", 0.01)
     for _ in range(READERS_MAX):
         driven.look()
@@ -499,7 +496,6 @@ def test_another_user_is_refused_by_the_system() -> None:
 def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With the flag, the path and the reason."""
     from skytether.netem.__main__ import emulate
 
     path = tmp_path / "none" / "feed"

@@ -64,8 +64,6 @@ def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> None:
-    """All that was set so far, in a file that only its owner may read."""
-
     def ask(caller: Caller) -> Any:
         caller.ask({"network.uplink.loss": 0.25})
         caller.ask({"network.downlink.loss": 0.5})
@@ -77,7 +75,6 @@ def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> N
 
 
 def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path) -> None:
-    """Later settings are added to it."""
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
     _, scenario, news = begun(tmp_path)
     assert scenario.network.uplink.loss == 0.25
@@ -91,21 +88,18 @@ def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path)
 
 
 def test_what_is_refused_is_not_kept(tmp_path: Path) -> None:
-    """Nothing has changed."""
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 2}))
     assert not kept(tmp_path).exists()
     assert begun(tmp_path).news == []
 
 
 def test_a_person_begins_a_new_flight_without_it(tmp_path: Path) -> None:
-    """It is gone for good."""
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
     assert begun(tmp_path, new_flight=True).scenario == DEMO
     assert not kept(tmp_path).exists()
 
 
 def test_without_a_control_socket_there_is_none() -> None:
-    """Nothing can be set, either."""
     assert take_up(None, DEMO, new_flight=False) == (None, DEMO, [])
 
 
@@ -150,7 +144,6 @@ def test_one_of_another_flight_is_refused_in_words(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Another scenario, or another day."""
     first = begun(tmp_path)
     assert first.journal
     first.journal.write({"network.uplink.loss": 0.25})

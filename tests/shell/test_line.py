@@ -36,7 +36,6 @@ def test_a_line_is_what_is_written(text: str, line: Line, peer: Address | None) 
     "text", ["", "udp", "udp:14550", "http:h:1", "tcp:h:70000", "serial:57600", "serial:/dev/x:0"]
 )
 def test_what_is_no_line_is_refused_with_its_key(text: str) -> None:
-    """The line says what was expected, too."""
     with pytest.raises(ConfigError, match=r"^vehicle.address: got .*, expected udp:HOST:PORT"):
         parse_line("vehicle.address", text)
 
@@ -130,7 +129,6 @@ def test_a_serial_port_carries_bytes_as_they_are() -> None:
 
 
 def test_a_rate_that_no_port_has_is_refused() -> None:
-    """Before anything is opened."""
     with pytest.raises(AddressError, match="no serial port runs at 57601 bit/s"):
         shell(Echo(b""), "serial:/dev/ttyACM0:57601")
 

@@ -38,7 +38,6 @@ def test_a_flood_of_one_kind_hides_no_other() -> None:
 
 
 def test_the_end_tells_what_was_left_out_though_its_second_is_not_over() -> None:
-    """Nothing is left out in silence."""
     limit = Limit()
     told(limit, [Flying(vehicle=n) for n in range(6)], 0)
     assert limit.omitted(now_ns=None) == [Omitted(kind="Flying", count=1)]

@@ -133,7 +133,6 @@ def test_a_file_made_with_another_secret_is_refused(path: Path) -> None:
 
 
 def test_a_file_that_others_may_write_is_refused(path: Path) -> None:
-    """As a key is."""
     put(path, a_file(path))
     path.chmod(0o666)
     kept = MemoryFile(path, IDENTITY, SECRET)

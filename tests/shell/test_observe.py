@@ -185,7 +185,6 @@ def test_panels_lie_side_by_side() -> None:
 
 
 def test_what_is_scraped_is_what_the_services_serve() -> None:
-    """Name by name, at one port."""
     settings = yaml.safe_load((OBSERVE / "prometheus.yml").read_text())
     targets = {
         job["job_name"]: target

@@ -37,7 +37,6 @@ def holding() -> "subprocess.Popen[str]":
 
 
 def test_a_folder_is_gone_at_the_end(tmp_path: Path) -> None:
-    """With all that is in it, and however the block ends."""
     outside = tmp_path / "outside"
     outside.mkdir()
     with suppress(KeyError), folder() as made:
@@ -103,7 +102,6 @@ def test_what_is_written_while_it_is_removed_is_cleared_by_the_next(
 
 
 def test_a_flight_clears_what_a_killed_one_has_left(tmp_path: Path) -> None:
-    """SIGKILL gives `fly` no time to."""
     short = ("fly", "demo", "--no-page", "--duration", "0.1")
     with Command("fly", "demo", "--no-page", "--duration", "30") as killed:
         while not list(tmp_path.glob("skytether-*/client.feed")) and not list(

@@ -25,7 +25,6 @@ def pipe() -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 
 
 def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
-    """All of it, and it is counted."""
     pieces = [b"%d\n" % number for number in range(10_000)]
     with (tmp_path / "file").open("wb") as file:
         writer = Writer(file, room=10**6, together=100, pause_s=0.001)
@@ -77,7 +76,6 @@ def test_a_pipe_that_does_not_block_loses_nothing(pipe: tuple[IO[bytes], IO[byte
 
 
 def test_a_full_disk_ends_the_writing_and_nothing_else() -> None:
-    """The system's reason is kept."""
     with Path("/dev/full").open("wb", buffering=0) as full:
         writer = Writer(full, room=100, together=100)
         for _ in range(1000):

@@ -11,10 +11,17 @@ import skytether.sim.flight
 from helpers import packaged
 from skytether.server import reception
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
+from skytether.shared.core.events import (
+    Finished,
+    FlowOpened,
+    Flying,
+    ModeChanged,
+    NoAnswer,
+    SessionOpened,
+)
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, client_columns
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Record, client_columns
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shell.terminal import summary_rows
 from skytether.sim.flight import fly, fly_batch
@@ -41,7 +48,6 @@ print(fly(flown).trace_hash())
 
 
 def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None:
-    """To the last bit of the record."""
     environment = os.environ | {"PYTHONHASHSEED": "1"}
     run = subprocess.run(
         [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
@@ -228,7 +234,7 @@ def test_a_network_that_loses_everything_is_no_flight() -> None:
     """The client gives up, and says why."""
     lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
     flight = fly(packaged("paper", settle=0.0, network=lost))
-    assert str(flight.failure) == "vehicle 1: no answer from netem 1:0 in 121 s"
+    assert flight.failure == NoAnswer(vehicle=1, host="netem 1", port=0, waited_s=121.0)
     assert len(flight.client) == 0
 
 
@@ -247,8 +253,8 @@ def test_a_flight_keeps_what_everybody_said() -> None:
         **{
             f"client 7.{n}": [
                 Flying(vehicle=n),
-                ModeChanged(vehicle=n, before="init", after="ready", reason="its session is open"),
-                ModeChanged(vehicle=n, before="ready", after="track", reason="a horizon has come"),
+                ModeChanged(vehicle=n, before="init", after="ready", reason=str(Reason.OPENED)),
+                ModeChanged(vehicle=n, before="ready", after="track", reason=str(Reason.HORIZON)),
                 Finished(vehicle=n, steps=40, missed=0),
             ]
             for n in (1, 2)
@@ -258,7 +264,6 @@ def test_a_flight_keeps_what_everybody_said() -> None:
 
 
 def test_wind_and_gusts_push_but_do_not_break() -> None:
-    """Tracking gets worse, and stays bounded."""
     calm = packaged("paper-every-step", duration=30.0)
     windy = packaged(
         "paper-every-step",

@@ -12,7 +12,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import Finished, ModeChanged, NotFlown
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Reason, Record
 from skytether.shared.wire.protocol import Heartbeat, Horizon, Idle, decode, encode
 from skytether.sim.flight import MIDNIGHT_NS, fly
 
@@ -102,7 +102,7 @@ def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
 ) -> None:
     """The server answers, and sends heartbeats: that is no flight."""
     flight = interrupted(monkeypatch, scenario(), 0.0, mute=True)
-    why = "no newer horizon has come"
+    why = str(Reason.OLD)
     assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
     assert said(flight)[-1] == flight.failure
     assert not flight.client["input"].any()
@@ -114,7 +114,7 @@ def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
 ) -> None:
     """The server dies after a heartbeat, or sends nothing but heartbeats from then on."""
     flight = interrupted(monkeypatch, scenario(), 10.6, mute=mute)
-    why = "no newer horizon has come" if mute else "the server is silent"
+    why = str(Reason.OLD if mute else Reason.LOST)
     assert isinstance(flight.failure, NotFlown)
     assert flight.failure.why == why
     assert flight.failure.covered == np.count_nonzero(flight.client["covered"])
@@ -143,11 +143,11 @@ def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> Non
     *changes, finished = said(flight)[-6:]
     assert isinstance(finished, Finished)
     assert [(each.after, each.reason) for each in changes] == [
-        ("brake", "the server is silent"),
-        ("hover", "the server is silent"),
-        ("hover", "the server has restarted"),
-        ("hover", "the link has been good for a second"),
-        ("track", "a horizon has come"),
+        ("brake", str(Reason.LOST)),
+        ("hover", str(Reason.LOST)),
+        ("hover", str(Reason.RESTARTED)),
+        ("hover", str(Reason.GOOD)),
+        ("track", str(Reason.HORIZON)),
     ]
     assert not flight.client["covered"].all()
     assert flight.client["covered"][-100:].all()

@@ -212,7 +212,6 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
 
 @pytest.mark.parametrize("limit_ns", [49, 50])
 def test_time_stops_at_its_limit(limit_ns: int) -> None:
-    """Nothing later than the limit happens."""
     world, probe = World(), Probe([50])
     world.add("host", probe)
     world.run(never, limit_ns=limit_ns)
@@ -271,8 +270,6 @@ def test_a_host_at_work_can_be_restarted_at_once() -> None:
 
 
 def test_the_end_of_a_later_life_is_told() -> None:
-    """Once, as that of the first would have been."""
-
     class Finite(Probe):
         @property
         def finished(self) -> bool:
@@ -346,7 +343,6 @@ def test_another_rate_holds_from_now_on() -> None:
 
 
 def test_a_host_can_be_given_more_to_compute() -> None:
-    """From its next wake on."""
     world, hearer = World(), Probe([])
     there = world.add("there", hearer)
     world.add("here", Probe([50, 60], answer_to=there))

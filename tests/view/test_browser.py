@@ -91,8 +91,6 @@ def test_moving_data_is_drawn_within_three_seconds_and_nobody_outside_is_asked(
 def test_the_loss_slider_changes_the_measured_loss(
     browser: "sync_api.Browser", flight: str
 ) -> None:
-    """Both ways, as netem counts it."""
-
     def measured() -> list[int]:
         return [int(each) for each in re.findall(r"(\d+) % (?:up|down)", status(page))]
 
@@ -321,7 +319,6 @@ def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
 
 
 def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path) -> None:
-    """Forwards, backwards, and paused."""
     file = tmp_path / "demo.mcap"
     record = [sys.executable, "-P", "-m", "skytether", "fly", "demo", "--virtual"]
     subprocess.run([*record, "--record", str(file)], check=True, capture_output=True)
@@ -344,7 +341,6 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
 
 
 def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
-    """Words, plots and vehicles of both, by name."""
     names = "demo", "demo-no-compensation"
     with served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address:
         page = browser.new_page(viewport={"width": 1400, "height": 900})

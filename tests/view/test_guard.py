@@ -386,7 +386,6 @@ def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
 def test_nothing_is_drawn_for_who_does_not_read(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Browsers that read get everything."""
     with closing(opened(page.port)) as sock, joined(page) as reader:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         until(lambda: any(each.paused for each in page._connections.values()))
@@ -485,7 +484,6 @@ def test_a_page_is_not_served_where_viser_would_listen_without_the_guard() -> No
 
 
 def test_the_first_the_tenth_and_the_hundredth_are_told() -> None:
-    """Nobody fills a log by knocking."""
     refuses = guard.Guard("")
     said = []
     for _ in range(1000):

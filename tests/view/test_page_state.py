@@ -287,7 +287,6 @@ def test_another_flight_of_the_same_processes_begins_anew() -> None:
 
 
 def test_several_vehicles_are_shown_and_no_more_than_a_bound() -> None:
-    """Those beyond it are counted."""
     assert sorted(demo(vehicles=3).state.vehicles) == [1, 2, 3]
     state = State()
     columns = client_columns(2)

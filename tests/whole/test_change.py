@@ -99,18 +99,12 @@ def test_a_value_that_a_key_has_already_is_passed_on_and_no_news() -> None:
     [
         (
             {"control.epsilon": 1, "control.dt": 0.1},
-            (
-                "control.dt: cannot be changed in flight; expected one of control.epsilon, "
-                "network.uplink.loss, vehicle.steady_wind_mps"
-            ),
+            "control.dt: cannot be changed in flight",
         ),
         ({"control.epsilom": 1}, "control.epsilom: no such key; did you mean control.epsilon?"),
         (
             {"control": {}},
-            (
-                "control: cannot be changed in flight; expected one of control.epsilon, "
-                "network.uplink.loss, vehicle.steady_wind_mps"
-            ),
+            "control: cannot be changed in flight",
         ),
         (
             {"control.epsilon": 1, "network.uplink.loss": 1.5},
@@ -130,14 +124,13 @@ def test_what_cannot_be_is_refused_with_one_line_and_nothing_changes(
     endpoint, running = probe()
     with pytest.raises(ConfigError) as refused:
         running.change(values, now_ns=5)
-    assert str(refused.value) == reason
-    assert endpoint.events() == (ChangeRefused(reason=reason),)
+    assert str(refused.value).startswith(reason)
+    assert endpoint.events() == (ChangeRefused(reason=str(refused.value)),)
     assert endpoint.changes == []
     assert answer(running, b"{}").values["control.epsilon"] == 3.6
 
 
 def test_a_request_without_keys_is_answered_with_what_may_change() -> None:
-    """Each key with its present value."""
     _, running = probe()
     running.change({"vehicle.steady_wind_mps": [0.5, 0]}, now_ns=5)
     assert answer(running, b"{}").values == {
@@ -164,7 +157,6 @@ def test_the_trajectory_s_file_is_not_read_again(
 
 
 def test_what_is_no_request_is_refused_and_changes_nothing() -> None:
-    """Garbage, what is almost right, too long, or nested too deeply; always with an answer."""
     rng = random.Random(1)
     letters = string.printable + "é\ud800\0"
     deep = b'{"control.epsilon":' + b"[" * 2000 + b"]" * 2000 + b"}"
@@ -274,7 +266,6 @@ def test_every_trigger_may_follow_every_other_in_flight() -> None:
 
 
 def test_a_threshold_changes_without_its_trigger() -> None:
-    """`control.period` alone, of the trigger `periodic`."""
     flown = scenario(control={"trigger": "periodic"})
     events = fly(flown, changes=[(5.0, {"control.period": 2})]).server["event"]
     assert np.diff(np.flatnonzero(events)[-20:]).tolist() == [2] * 19
@@ -335,14 +326,10 @@ def test_a_live_point_is_led() -> None:
 
 
 def test_only_a_live_point_can_be_led() -> None:
-    """A circle goes where it goes."""
     flight = fly(scenario(), changes=[(3.0, {"reference.points_m": [[1.0, 2.0]]})])
     ((_, host, refused),) = told(flight, ChangeRefused)
     assert host == "server"
-    assert str(refused).startswith(
-        "a change is refused: reference.points_m: cannot be changed in flight; expected one of "
-        "control.cost_gap, "
-    )
+    assert refused.reason.startswith("reference.points_m: ")
 
 
 def arming(*changes: tuple[float, bool], armed: bool = True) -> Record:
@@ -354,13 +341,13 @@ def arming(*changes: tuple[float, bool], armed: bool = True) -> Record:
 def test_a_vehicle_that_waits_is_armed_in_flight() -> None:
     """It stays where it is until then, and flies the first horizon that is made for it."""
     flight = arming((5.0, True), armed=False)
-    modes = [str(event) for _, _, event in told(flight, ModeChanged)]
+    modes = [(event.after, event.reason) for _, _, event in told(flight, ModeChanged)]
     assert modes == [
-        "vehicle 1 waits for a good link: its session is open",
-        "vehicle 1 waits for a plan: the link has been good for a second",
-        "vehicle 1 waits for a plan: it is not armed",
-        "vehicle 1 waits for a plan: the link has been good for a second",
-        "vehicle 1 flies a plan: a horizon has come",
+        ("sync", str(Reason.OPENED)),
+        ("ready", str(Reason.GOOD)),
+        ("ready", str(Reason.UNARMED)),
+        ("ready", str(Reason.GOOD)),
+        ("track", str(Reason.HORIZON)),
     ]
     assert not flight.client["input"][:80].any()
     assert flight.failure is None
@@ -369,12 +356,14 @@ def test_a_vehicle_that_waits_is_armed_in_flight() -> None:
 def test_a_vehicle_that_is_disarmed_brakes_at_once_and_flies_again_when_armed() -> None:
     """It drops its plan, hovers, takes no other meanwhile, and needs no new session."""
     flight = arming((5.0, False), (8.0, True))
-    modes = [(round(at, 1), str(event)) for at, _, event in told(flight, ModeChanged)][3:]
-    assert [text for _, text in modes] == [
-        "vehicle 1 brakes: it is not armed",
-        "vehicle 1 hovers: it is not armed",
-        "vehicle 1 hovers: the link has been good for a second",
-        "vehicle 1 flies a plan: a horizon has come",
+    modes = [
+        (round(at, 1), event.after, event.reason) for at, _, event in told(flight, ModeChanged)
+    ][3:]
+    assert [mode for _, *mode in modes] == [
+        ["brake", str(Reason.UNARMED)],
+        ["hover", str(Reason.UNARMED)],
+        ["hover", str(Reason.GOOD)],
+        ["track", str(Reason.HORIZON)],
     ]
     assert modes[0][0] == 5.0
     hovering = flight.client["mode"] == Mode.HOVER
@@ -388,8 +377,9 @@ def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
     """The guard of the test above: it would fly its plan to the end."""
     rows = {key: mode for key, mode in TABLE.items() if key[1] is not Reason.UNARMED}
     monkeypatch.setattr("skytether.client.endpoint.TABLE", rows)
-    modes = [str(event) for *_, event in told(arming((5.0, False)), ModeChanged)]
-    assert "vehicle 1 brakes: it is not armed" not in modes
+    flight = arming((5.0, False))
+    modes = [(event.after, event.reason) for *_, event in told(flight, ModeChanged)]
+    assert ("brake", str(Reason.UNARMED)) not in modes
 
 
 def test_what_is_refused_in_flight_is_an_event_and_the_flight_is_the_same() -> None:

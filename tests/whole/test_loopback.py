@@ -380,7 +380,6 @@ def test_a_look_up_that_takes_long_does_not_keep_a_patient_process(
 
 
 def test_addresses_of_no_use_are_named() -> None:
-    """A port in use, and a name that nobody has."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(LOOPBACK)
         host, port = taken.getsockname()
@@ -450,7 +449,6 @@ async def test_a_flight_over_real_sockets() -> None:
 
 
 async def test_two_vehicles_in_space_on_one_server() -> None:
-    """3-D, two flows through netem, two sessions that tick together."""
     flown = packaged("paper-every-step", settle=0.0, duration=3.0, network=FAST, model={"axes": 3})
     flight = await fly(flown, vehicles=2)
     for vehicle in (1, 2):

@@ -167,7 +167,6 @@ def strangers(folder: Path, *packages: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["server", "netem", "client"])
 def test_rooms_of_a_checkout_run_as_processes(name: str) -> None:
-    """By their short names, where they lie."""
     run = [sys.executable, "-m", name, "--help"]
     done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

@@ -111,7 +111,6 @@ def test_each_way_to_write_is_seen(code: str) -> None:
 
 @pytest.mark.parametrize("code", ["open(path)", "path.open()", "figure.savefig(png)"])
 def test_what_only_reads_is_no_way_to_write(code: str) -> None:
-    """Nor is a picture in memory."""
     (call,) = (each for each in ast.walk(ast.parse(code)) if isinstance(each, ast.Call))
     assert not writes(call)
 
