@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.controller import Controller
+from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
 from skytether.server.sessions import Sessions

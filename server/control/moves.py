@@ -4,10 +4,9 @@ Between the moves somebody solves: the compiled pass of `server.control.planner`
 A move works on one vehicle of a block, and reads and fills the draft of its plan.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skytether.server.control.desired import Window
 from skytether.server.control.law import advance, axis_at
@@ -22,41 +21,11 @@ from skytether.server.control.mpc import (
     lead,
     slope,
 )
-from skytether.server.control.scheme import Foresight
-from skytether.shared.base.kernel import B1, F1, F2, F3, I1, S4, inline, lanes, record, records
+from skytether.server.control.scheme import Foresight, PlanFigures
+from skytether.shared.base.kernel import B1, F1, F2, F3, I1, S4, inline, lanes
 
 GENERATOR, TRACKER, CONCLUDE = 0, 1, 2
 """Moves of a plan; GENERATOR and TRACKER are also the first index of what both MPCs have."""
-
-
-class PlanFigures:
-    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
-
-    row: int
-    """Row of the vehicle."""
-    step: int
-    """Step k."""
-    start: int
-    """Step k + d, where planning starts."""
-    gap: int
-    """Steps since planning started before."""
-    state_gap: float
-    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
-    cost_gap: float
-    """Cost of flying on with what was sent above that of the plan [cost]."""
-    expected_gap: float
-    """Mean of that cost where packets in flight may be lost [cost]."""
-    deviation_m: float
-    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
-    fresh: bool
-    """Whether it is at its first step, or behind a gap that no plan reached over."""
-    solved: bool
-    """Whether the plan is new and right, so that it may be sent."""
-
-
-FIGURES = record(PlanFigures)
-Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
-"""Shape (n,)."""
 
 
 class PlanMemory(NamedTuple):

@@ -21,12 +21,9 @@ from skytether.server.control.exact import FREE, ExactSolver, Workspace, active_
 from skytether.server.control.lanes import LANES, Lanes, lanes_in, make_room
 from skytether.server.control.moves import (
     CONCLUDE,
-    FIGURES,
     GENERATOR,
     TRACKER,
     Draft,
-    Figures,
-    PlanFigures,
     PlanMemory,
     begin,
     conclude,
@@ -37,7 +34,7 @@ from skytether.server.control.moves import (
     pose_tracker,
 )
 from skytether.server.control.mpc import FIRST, LATER, MPC, Inputs, Problem, make_mpc, pose, shifted
-from skytether.server.control.scheme import Foresight
+from skytether.server.control.scheme import FIGURES, Figures, Foresight, PlanFigures
 from skytether.server.control.solver import Solver
 from skytether.shared.base.kernel import B1, F1, F2, F3, I1, inline, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch

@@ -45,8 +45,8 @@ from skytether.lab.benchmarks.harness import (
 )
 from skytether.lab.benchmarks.problems import RecordedProblems, listening, record
 from skytether.lab.benchmarks.reference import Reference
-from skytether.server.control.controller import BLOCK
 from skytether.server.control.exact import ExactSolver
+from skytether.server.controller import BLOCK
 
 pytestmark = pytest.mark.long
 

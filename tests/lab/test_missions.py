@@ -8,7 +8,7 @@ import pytest
 from skytether.lab.benchmarks import missions
 from skytether.lab.benchmarks.missions import MissionsOptions
 from skytether.server.control import aside
-from skytether.server.control.aims import Aims
+from skytether.server.missions.waypoints import Waypoints
 
 
 def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
     """
     assert missions.fly(MissionsOptions(), 31463).late == 0
     assert missions.fly(MissionsOptions(), 104503).late == 0
-    monkeypatch.setattr(Aims, "close", lambda *_: False)
+    monkeypatch.setattr(Waypoints, "close_way", lambda *_: False)
     assert missions.fly(MissionsOptions(), 104503).late == 1
 
 

@@ -6,7 +6,7 @@ import pytest
 from skytether.lab.benchmarks import motions, together
 from skytether.lab.benchmarks.motions import MotionsOptions
 from skytether.lab.benchmarks.together import ALL, BRAKING, SWAP, TogetherOptions
-from skytether.server.control.together import Together
+from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.shared.law.motion import SPACING, Motion
 
 
@@ -32,7 +32,7 @@ def test_a_vehicle_may_brake_from_each_knot_on() -> None:
 @pytest.mark.long
 def test_vehicles_that_may_brake_anywhere_take_longer() -> None:
     """They block their whole ways for the others; afterwards the usual planner is back."""
-    before = Together._hit
+    before = MissionPlanner._conflicts
     options = TogetherOptions(vehicles=6, duration=60.0)
     usual, braked = (
         together.fly(options, ("no loss", planner, 1)).arrived_s for planner in (ALL, BRAKING)
@@ -40,7 +40,7 @@ def test_vehicles_that_may_brake_anywhere_take_longer() -> None:
     assert usual is not None
     assert braked is not None
     assert braked > 1.2 * usual
-    assert Together._hit is before
+    assert MissionPlanner._conflicts is before
 
 
 def test_solvers_agree_on_the_problems_of_a_flight() -> None:

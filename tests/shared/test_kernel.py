@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 
@@ -233,7 +233,7 @@ import os
 import sys
 import msgspec
 from numba.core import event
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 from skytether.sim import flight

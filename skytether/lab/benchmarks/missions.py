@@ -25,7 +25,7 @@ import tyro
 from skytether.lab.benchmarks.harness import TextTable
 from skytether.lab.benchmarks.kept import flights
 from skytether.lab.benchmarks.together import ARRIVED_M, MortalServer, deaths
-from skytether.server.control.routes import Routes
+from skytether.server.missions.routes import Routes
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array

@@ -27,7 +27,7 @@ import tyro
 
 from skytether.lab.benchmarks.harness import TextTable, progress
 from skytether.server.control.scheme import Foresight
-from skytether.server.control.together import Together
+from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
@@ -155,18 +155,18 @@ def scenario(task: Task, network: str, duration: float, seed: int, folder: Path)
 @contextmanager
 def timed() -> Iterator[list[float]]:
     """Time that servers plan meanwhile [s], one item a tick."""
-    real, spent = Together.plan, list[float]()
+    real, spent = MissionPlanner.plan, list[float]()
 
-    def plan(self: Together, rows: Indices, step: Indices, found: Foresight) -> None:
+    def plan(self: MissionPlanner, rows: Indices, step: Indices, found: Foresight) -> None:
         began = time.perf_counter()
         real(self, rows, step, found)
         spent.append(time.perf_counter() - began)
 
-    Together.plan = plan  # type: ignore[method-assign]
+    MissionPlanner.plan = plan  # type: ignore[method-assign]
     try:
         yield spent
     finally:
-        Together.plan = real  # type: ignore[method-assign]
+        MissionPlanner.plan = real  # type: ignore[method-assign]
 
 
 def fly(task: Task, network: str, duration: float, seed: int) -> TaskFlight:

@@ -24,11 +24,11 @@ import tyro
 
 from skytether.lab.benchmarks.harness import TextTable
 from skytether.lab.benchmarks.kept import flights
-from skytether.server.control.apart import KNOTS
-from skytether.server.control.direct import Direct
-from skytether.server.control.known import Known
-from skytether.server.control.together import Together
 from skytether.server.endpoint import Server
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.possible_motions import KNOTS
+from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
+from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
@@ -186,37 +186,37 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 @contextmanager
 def planning(planner: str) -> Iterator[None]:
     """Have the server keep apart from some motions alone."""
-    motions, clearances = Known.motions, cast(property, Scenario.clearances)
-    hits, straight = Together._hit, Direct.motions
+    motions, clearances = VehicleMotions.motions, cast(property, Scenario.clearances)
+    hits, straight = MissionPlanner._conflicts, UnconstrainedPlanner.motions
 
-    def newest(self: Known) -> list[Motion]:
+    def newest(self: VehicleMotions) -> list[Motion]:
         return motions(self)[-1:]
 
-    def braked_too(self: Known) -> list[Motion]:
+    def braked_too(self: VehicleMotions) -> list[Motion]:
         found, since = motions(self), self.in_force.step if self.in_force else 0
         return found + [stop for motion in found for stop in stops(motion, since)]
 
-    def also_braked(self: Together, row: int, motion: Motion, k: int) -> Flags:
+    def also_braked(self: MissionPlanner, row: int, motion: Motion, k: int) -> Flags:
         each = (motion, *stops(motion, k))
         return np.logical_or.reduce([hits(self, row, flown, k) for flown in each])
 
     def touching(self: Scenario) -> Clearances:
         return cast(Clearances, clearances.__get__(self))._replace(apart_m=-1.0)
 
-    known, scenario = cast(Any, Known), cast(Any, Scenario)
-    together, direct = cast(Any, Together), cast(Any, Direct)
+    vehicle, scenario = cast(Any, VehicleMotions), cast(Any, Scenario)
+    planner_type, unconstrained = cast(Any, MissionPlanner), cast(Any, UnconstrainedPlanner)
     if planner == BRAKING:
-        known.motions, together._hit = braked_too, also_braked
-        direct.motions = lambda *_: []  # of a vehicle that is not braked
+        vehicle.motions, planner_type._conflicts = braked_too, also_braked
+        unconstrained.motions = lambda *_: []  # of a vehicle that is not braked
     if planner == NEWEST:
-        known.motions = newest
+        vehicle.motions = newest
     if planner == NOTHING:
         scenario.clearances = property(touching)
     try:
         yield
     finally:
-        known.motions, scenario.clearances = motions, clearances
-        together._hit, direct.motions = hits, straight
+        vehicle.motions, scenario.clearances = motions, clearances
+        planner_type._conflicts, unconstrained.motions = hits, straight
 
 
 def stops(motion: Motion, since: int) -> list[Motion]:

@@ -92,7 +92,7 @@ WAY: tuple[DrawnPart, ...] = (
                     DrawnCall("server/plausibility.py: Plausibility.judge", "believed?"),
                     DrawnCall("server/control/clock.py: ClockMap.observe", "clocks compared"),
                     DrawnCall(
-                        "server/control/controller.py: Controller.observe",
+                        "server/controller.py: Controller.observe",
                         "",
                         (DrawnCall(f"{SCHEME}.observe", "kept if it is the newest"),),
                     ),
@@ -111,7 +111,7 @@ WAY: tuple[DrawnPart, ...] = (
                 (
                     DrawnCall("server/control/clock.py: ClockMap.steps", "step aboard"),
                     DrawnCall(
-                        "server/control/controller.py: Controller.decide",
+                        "server/controller.py: Controller.decide",
                         "",
                         (
                             DrawnCall(f"{SCHEME}.foresee", "x̂(k), x̂(k+d), eq. (13)"),
