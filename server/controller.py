@@ -4,8 +4,8 @@
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
 With the schemes "predictive" and "none" d is 0; with "trajectory" nothing is planned, and
-`trajectory` stands in place of estimator and planner. Every vehicle is planned for at every step,
-for planning is a small part of what a step costs.
+`trajectory`, or on a mission `mission_planner`, stands in place of estimator and planner. Every
+vehicle is planned for at every step, for planning is a small part of what a step costs.
 """
 
 from collections import Counter

@@ -318,16 +318,14 @@ class MissionPlanner:
         if max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M:
             vehicle.turned_rad = 0.0
             if vehicle.yielding:
-                vehicle.waits_for = (
-                    f"vehicle {self._state.number_of(vehicle.yielding.asker)} to pass"
-                )
+                asker = self._state.number_of(vehicle.yielding.asker)
+                vehicle.waits_for = f"vehicle {asker} to pass"
             return
         self._state.update_possible()
         way = self._way(row, goal) if self._zones else np.array([place, goal])
         is_stuck = vehicle.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:])))
-        roams = (
-            vehicle.turned_rad or vehicle.yielding or (vehicle.detour and k < vehicle.detour_until)
-        )
+        is_on_detour = vehicle.detour and k < vehicle.detour_until
+        roams = vehicle.turned_rad or vehicle.yielding or is_on_detour
         if not (is_stuck or roams or self._zones):
             direct.append(DirectFlight(row, vehicle, k, goal))
             return
@@ -336,11 +334,8 @@ class MissionPlanner:
         asked = is_stuck and self._ask_to_yield(row, way)
         self._plan_motion(row, vehicle, k, goal)
         if is_stuck:
-            if (
-                vehicle.zone_blocks
-                and not asked
-                and self._waypoints.close_way(vehicle, k, place, goal)
-            ):
+            is_blocked = vehicle.zone_blocks and not asked
+            if is_blocked and self._waypoints.close_way(vehicle, k, place, goal):
                 self.counts["closed"] += 1
             vehicle.zone_blocks = False
 
@@ -382,7 +377,7 @@ class MissionPlanner:
                 self._plan_motion(*direct.pop(0))
 
     def _plan_motion(self, row: int, vehicle: VehicleMotions, k: int, goal: Array) -> None:
-        """Find a motion toward a goal, around others that are in the way."""
+        """Find a motion towards a goal, around others that are in the way."""
         vehicle.next = self._motion_toward(row, vehicle, k, goal)
         if vehicle.next is None:
             self.counts["stuck"] += 1
@@ -400,30 +395,23 @@ class MissionPlanner:
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
         """Whether a vehicle has yet to pass the home of one that yields to it."""
         way = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
-        return bool(
-            yielding.distance_from_way(home[None] * self._scale, way)[0]
-            < self._clearances.planned_apart_m
-        )
+        (away_m,) = yielding.distance_from_way(home[None] * self._scale, way)
+        return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
         """Ask the first vehicle that rests at its goal in another vehicle's way to yield;
         whether it does.
         """
-        keep_m, ends, homes = (
-            self._clearances.planned_apart_m,
-            list[tuple[int, Array]](),
-            list[int](),
-        )
+        keep_m = self._clearances.planned_apart_m
+        ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
             if other == row or each.in_force is None or not self._state.rows.aligned[other]:
                 continue
             motions = each.motions()
             ends += [(other, motion.position[-1]) for motion in motions]
             rests = each.in_force.step >= 0 and len(motions) == 1 and each.yielding is None
-            if (
-                rests
-                and np.abs(motions[0].position[-1] - self._state.goal(other)).max() < ARRIVED_M
-            ):
+            left_m = motions[0].position[-1] - self._state.goal(other)
+            if rests and np.abs(left_m).max() < ARRIVED_M:
                 homes.append(other)
         places = np.array([self._state.goal(other) for other in homes]).reshape(-1, way.shape[1])
         first = yielding.first_on(way * self._scale, places * self._scale, keep_m)
@@ -460,9 +448,8 @@ class MissionPlanner:
         kept = states(base, k, self._kept_steps // SPACING + 1, self._dt_s)
         p0 = kept[0][-1]
         planes, violated = None, np.zeros(self._state.possible.count + 1, dtype=np.bool_)
-        for waypoint in self._waypoints.candidates(
-            vehicle, k, p0, goal, partial(self._state.resting_places, row)
-        ):
+        rests = partial(self._state.resting_places, row)
+        for waypoint in self._waypoints.candidates(vehicle, k, p0, goal, rests):
             for _ in range(ROUNDS):
                 constraints = planes.from_some(violated) if planes else None
                 solved = qp.solve(*kept, waypoint, constraints)
@@ -531,12 +518,15 @@ class MissionPlanner:
         """Which motions of others one comes too near to, ever, and last whether it does a zone."""
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
-        planned, in_force = (
-            self._state.possible_motion(row, each) for each in (motion, vehicle.in_force.motion)
+        ahead, in_force = self._state.ahead(row), vehicle.in_force.motion
+        conflicts = too_near(
+            self._state.possible_motion(row, motion),
+            in_force._replace(first=in_force.first - ahead),
+            k - ahead,
+            row,
+            self._state.possible,
+            self._clearances.apart_m + vehicle.outside_m,
         )
-        distance_m = self._clearances.apart_m + vehicle.outside_m
-        begin, possible = k - self._state.ahead(row), self._state.possible
-        conflicts = too_near(planned, in_force.motion, begin, row, possible, distance_m)
         if self._zones:
             points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
             conflicts[-1] = self._enters_zone(points)

@@ -7,7 +7,7 @@ import pytest
 
 from skytether.lab.benchmarks import missions
 from skytether.lab.benchmarks.missions import MissionsOptions
-from skytether.server.control import aside
+from skytether.server.missions import yielding
 from skytether.server.missions.waypoints import Waypoints
 
 
@@ -43,7 +43,9 @@ def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
 
 @pytest.mark.long
 def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them steps aside, though it is nearer than plans keep. Ablation: else nobody does."""
+    """One of them yields, though it is nearer than plans keep. Ablation: else nobody does."""
     assert missions.fly(MissionsOptions(), 31906).late == 0
-    monkeypatch.setattr(aside, "_least", lambda places, _, apart_m: np.full(len(places), apart_m))
+    monkeypatch.setattr(
+        yielding, "_kept_distance", lambda places, _, apart_m: np.full(len(places), apart_m)
+    )
     assert missions.fly(MissionsOptions(), 31906).late == 1
