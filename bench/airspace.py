@@ -8,10 +8,10 @@ from collections import deque
 
 import numpy as np
 
-from skytether.server.control.controller import BLOCK
 from skytether.server.control.desired import Desired
 from skytether.server.control.planner import Planner
 from skytether.server.control.scheme import foresight
+from skytether.server.controller import BLOCK
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS

@@ -43,10 +43,10 @@ import tyro
 from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, crew, writing
 from skytether.lab.journal import Journal
-from skytether.server.control.routes import Routes
 from skytether.server.control.scheme import Foresight
-from skytether.server.control.together import Together
 from skytether.server.endpoint import Server
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.routes import Routes
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
@@ -236,18 +236,18 @@ def fly_mission(
 @contextmanager
 def timed() -> Iterator[list[float]]:
     """Time that servers plan meanwhile [s], one item a tick."""
-    real, spent = Together.plan, list[float]()
+    real, spent = MissionPlanner.plan, list[float]()
 
-    def plan(self: Together, rows: Indices, step: Indices, found: Foresight) -> None:
+    def plan(self: MissionPlanner, rows: Indices, step: Indices, found: Foresight) -> None:
         began = time.perf_counter()
         real(self, rows, step, found)
         spent.append(time.perf_counter() - began)
 
-    Together.plan = plan  # type: ignore[method-assign]
+    MissionPlanner.plan = plan  # type: ignore[method-assign]
     try:
         yield spent
     finally:
-        Together.plan = real  # type: ignore[method-assign]
+        MissionPlanner.plan = real  # type: ignore[method-assign]
 
 
 class MortalServer(Endpoint):

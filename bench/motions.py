@@ -36,11 +36,11 @@ from scipy import sparse
 
 from bench.harness import TextTable, progress
 from bench.problems import derive
-from skytether.server.control.apart import HalfPlanes
-from skytether.server.control.direct import Direct
-from skytether.server.control.dual import DualSolver
-from skytether.server.control.motionplan import MotionPlan
-from skytether.server.control.together import Together
+from skytether.server.missions.dual_active_set import DualActiveSet
+from skytether.server.missions.half_planes import HalfPlanes
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.trajectory_qp import TrajectoryQP
+from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -87,9 +87,9 @@ FULL, QUICK = MotionsCounts(), MotionsCounts((16,), (0.5,), 12.0)
 
 
 class MotionProblem(NamedTuple):
-    """A QP, as `DualSolver` takes it."""
+    """A QP, as `DualActiveSet` takes it."""
 
-    solver: DualSolver
+    solver: DualActiveSet
     linear: Array
     columns: Array
     least: Array
@@ -99,23 +99,23 @@ class MotionProblem(NamedTuple):
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
     """Keep every QP that is solved, of vehicles far from all others as well."""
-    real, straight = MotionPlan.solve, Direct.motions
+    real, straight = TrajectoryQP.solve, UnconstrainedPlanner.motions
 
     def solve(
-        self: MotionPlan, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
+        self: TrajectoryQP, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
     ) -> Any:
-        linear, columns, least = self.posed(p[-1], v[-1], goal, planes)
+        linear, columns, least = self.problem(p[-1], v[-1], goal, planes)
         problems.append(MotionProblem(self.solver, linear, columns, least, p.shape[1]))
         return real(self, p, v, goal, planes)
 
-    plan, direct = cast(Any, MotionPlan), cast(Any, Direct)
+    plan, unconstrained = cast(Any, TrajectoryQP), cast(Any, UnconstrainedPlanner)
     plan.solve = solve
     # Vehicles that could fly straight are planned for one by one, with the same result.
-    direct.motions = lambda *_: []
+    unconstrained.motions = lambda *_: []
     try:
         yield
     finally:
-        plan.solve, direct.motions = real, straight
+        plan.solve, unconstrained.motions = real, straight
 
 
 def filled_up(problem: MotionProblem) -> tuple[Any, Array]:
@@ -258,36 +258,36 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
         plan_us: filled with the time of each tick, unless problems are kept.
         problems: filled with those of each tick.
     """
-    plan, toward = Together.plan, Together._toward
+    plan, toward = MissionPlanner.plan, MissionPlanner._motion_toward
     of_tick: list[MotionProblem] = []
 
-    def timed(self: Together, *given: Any) -> None:
+    def timed(self: MissionPlanner, *given: Any) -> None:
         began = time.thread_time_ns()
         plan(self, *given)
         plan_us.append((time.thread_time_ns() - began) / 1e3)
 
-    def collected(self: Together, *given: Any) -> None:
+    def collected(self: MissionPlanner, *given: Any) -> None:
         of_tick.clear()
         plan(self, *given)
         assert problems is not None
         problems.append(list(of_tick))
 
-    def last_of(self: Together, *given: Any) -> Any:
+    def last_of(self: MissionPlanner, *given: Any) -> Any:
         before = len(of_tick)
         found = toward(self, *given)
         del of_tick[before:-1]
         return found
 
-    own: Any = Together
+    own: Any = MissionPlanner
     if problems is None:
         own.plan = timed
     else:
-        own.plan, own._toward = collected, last_of
+        own.plan, own._motion_toward = collected, last_of
     try:
         with kept(of_tick) if problems is not None else nullcontext():
             yield
     finally:
-        own.plan, own._toward = plan, toward
+        own.plan, own._motion_toward = plan, toward
 
 
 def measure(counts: MotionsCounts) -> dict[str, Any]:

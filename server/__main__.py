@@ -16,7 +16,7 @@ from pathlib import Path
 from socket import socket
 from typing import Annotated
 
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import kernel

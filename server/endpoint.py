@@ -1,7 +1,7 @@
 """The server as an endpoint: datagrams in, datagrams out, and a tick on its own grid of Δt.
 
 `reception` hears what vehicles say, `sessions` knows who flies, `tick` decides for all of them,
-with `control`. Here they are put together.
+with `controller`. Here they are put together.
 """
 
 from collections import Counter
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.controller import Controller
+from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
 from skytether.server.sessions import Sessions

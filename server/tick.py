@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.controller import BLOCK, Controller, Decisions
 from skytether.server.control.knots import inputs_along
 from skytether.server.control.law import axes_of
 from skytether.server.control.scheme import Packing
+from skytether.server.controller import BLOCK, Controller, Decisions
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
@@ -189,7 +189,7 @@ class Ticker:
         if controller.faults:
             self._events += [Fault(traceback=said) for said in controller.faults]
             controller.faults.clear()
-        if left := controller.left:
+        if left := controller.left_tube:
             self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
             left.clear()
         if inside := controller.inside:

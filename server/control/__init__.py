@@ -1,1 +1,1 @@
-"""The algorithm of the server: clock maps, estimates, plans, solvers and triggers."""
+"""The schemes of the server: clock maps, estimates, plans and solvers."""

@@ -1,47 +1,16 @@
 """Begin of a plan, and its appraisal once it is solved; `server.control.planner` calls both."""
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skytether.server.control.law import advance, axis_at
 from skytether.server.control.mpc import MPC, Inputs, add_cost
-from skytether.server.control.scheme import Foresight
-from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes, record, records
+from skytether.server.control.scheme import Foresight, PlanFigures
+from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes
 
 GENERATOR, TRACKER = 0, 1
 """First index of what both MPCs have."""
-
-
-class PlanFigures:
-    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
-
-    row: int
-    """Row of the vehicle."""
-    step: int
-    """Step k."""
-    start: int
-    """Step k + d, where planning starts."""
-    gap: int
-    """Steps since planning started before."""
-    state_gap: float
-    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
-    cost_gap: float
-    """Cost of flying on with what was sent above that of the plan [cost]."""
-    expected_gap: float
-    """Mean of that cost where packets in flight may be lost [cost]."""
-    deviation_m: float
-    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
-    fresh: bool
-    """Whether it is at its first step, or behind a gap that no plan reached over."""
-    solved: bool
-    """Whether the plan is new and right, so that it may be sent."""
-
-
-FIGURES = record(PlanFigures)
-Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
-"""Shape (n,)."""
 
 
 class PlanMemory(NamedTuple):

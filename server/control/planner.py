@@ -17,11 +17,9 @@ import numpy as np
 from skytether.server.control.desired import Desired, Window
 from skytether.server.control.exact import ExactSolver, Workspace, active_sets
 from skytether.server.control.moves import (
-    FIGURES,
     GENERATOR,
     TRACKER,
     Draft,
-    Figures,
     PlanMemory,
     begin,
     conclude,
@@ -47,7 +45,7 @@ from skytether.server.control.mpc import (
     simd_memory,
     slope,
 )
-from skytether.server.control.scheme import Foresight
+from skytether.server.control.scheme import FIGURES, Figures, Foresight
 from skytether.server.control.solver import Solver
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch

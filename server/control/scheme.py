@@ -5,11 +5,12 @@
 """
 
 from collections import Counter
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import F2, F3, F4, I1, I2, S1, S3, kernel
+from skytether.shared.base.kernel import F2, F3, F4, I1, I2, S1, S3, kernel, record, records
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
@@ -66,6 +67,36 @@ class Foresight(NamedTuple):
     """Feedback columns of a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
     told: Splines
     """Trajectories that are sent, with the scheme "trajectory"."""
+
+
+class PlanFigures:
+    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
+
+    row: int
+    """Row of the vehicle."""
+    step: int
+    """Step k."""
+    start: int
+    """Step k + d, where planning starts."""
+    gap: int
+    """Steps since planning started before."""
+    state_gap: float
+    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
+    cost_gap: float
+    """Cost of flying on with what was sent above that of the plan [cost]."""
+    expected_gap: float
+    """Mean of that cost where packets in flight may be lost [cost]."""
+    deviation_m: float
+    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
+    fresh: bool
+    """Whether it is at its first step, or behind a gap that no plan reached over."""
+    solved: bool
+    """Whether the plan is new and right, so that it may be sent."""
+
+
+FIGURES = record(PlanFigures)
+Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
+"""Shape (n,)."""
 
 
 DOUBTS = 4

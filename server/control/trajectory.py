@@ -41,9 +41,8 @@ from skytether.server.control.committed import LEARNED, LOSS, MARGIN
 from skytether.server.control.delay import SAMPLES, DelayBound, acknowledge, at_least, begin
 from skytether.server.control.desired import Desired, Window
 from skytether.server.control.knots import fewest_knots, spline_at
-from skytether.server.control.moves import FIGURES, Figures
 from skytether.server.control.nominal import Nominal, make_nominal, plan_nominal
-from skytether.server.control.scheme import Foresight, Splines
+from skytether.server.control.scheme import FIGURES, Figures, Foresight, Splines
 from skytether.shared.base.kernel import (
     B1,
     F1,

@@ -13,7 +13,7 @@ import msgspec
 from skytether.cli import page_process, processes
 from skytether.client import vehicles
 from skytether.figures import flights as figures
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import (

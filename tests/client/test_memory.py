@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skytether.client.memory import FlownMotion, Kept, Memory, age_max_ns, recall
 from skytether.client.vehicle import Frame
 from skytether.lab.lives import Lives, Restart
-from skytether.server.control.roster import Roster
+from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import BegunAnew, ModeChanged
 from skytether.shared.scenario import reading
@@ -175,5 +175,5 @@ def test_others_keep_away_from_all_of_a_motion_whose_client_has_begun_anew(
     flight = flown(restart)
     assert flight.least_m() > SWAP.mission.separation_m
     assert BegunAnew(vehicle=7) in [event for _, _, event in flight.events]
-    monkeypatch.setattr(Roster, "restart", lambda *_: False)
+    monkeypatch.setattr(MissionState, "restart", lambda *_: False)
     assert flown(restart).least_m() < SWAP.mission.separation_m

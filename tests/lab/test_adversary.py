@@ -29,9 +29,9 @@ from skytether.lab.adversary import (
 )
 from skytether.lab.commands.adversary import Kept
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.known import Known
-from skytether.server.control.roster import Roster
-from skytether.server.control.together import Together
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.mission_state import MissionState
+from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Datagram
@@ -150,23 +150,23 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
 
 def newest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the server keep apart from the newest motion alone."""
-    motions = Known.motions
+    motions = VehicleMotions.motions
 
-    def last(self: Known) -> list[Motion]:
+    def last(self: VehicleMotions) -> list[Motion]:
         return motions(self)[-1:]
 
-    monkeypatch.setattr(Known, "motions", last)
+    monkeypatch.setattr(VehicleMotions, "motions", last)
 
 
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a new server plan before it has heard all vehicles."""
-    init = Roster.__init__
+    init = MissionState.__init__
 
-    def begin(self: Roster, *args: Any) -> None:
+    def begin(self: MissionState, *args: Any) -> None:
         init(self, *args)
         self.absent.clear()
 
-    monkeypatch.setattr(Roster, "__init__", begin)
+    monkeypatch.setattr(MissionState, "__init__", begin)
 
 
 def certain(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,7 +185,7 @@ def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the server accept zones that vehicles may fly into."""
-    monkeypatch.setattr(Together, "objection", lambda *_: "")
+    monkeypatch.setattr(MissionPlanner, "objection", lambda *_: "")
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
         move(Kind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
     )
     assert spare_m(FOUR, fly(FOUR, moves)) > 0.0
-    monkeypatch.setattr(Roster, "unknown", lambda _: None)
+    monkeypatch.setattr(MissionState, "unknown", lambda _: None)
     assert spare_m(FOUR, fly(FOUR, moves)) < 0.0
 
 

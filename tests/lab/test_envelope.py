@@ -27,7 +27,7 @@ from skytether.lab.envelope import (
     worst_first,
 )
 from skytether.lab.journal import Journal
-from skytether.server.control.controller import Controller
+from skytether.server.controller import Controller
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading

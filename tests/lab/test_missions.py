@@ -9,8 +9,8 @@ import pytest
 from bench import missions, motions
 from bench.missions import RandomOptions, flights
 from bench.motions import MotionsOptions
-from skytether.server.control import aside
-from skytether.server.control.aims import Aims
+from skytether.server.missions import yielding
+from skytether.server.missions.waypoints import Waypoints
 from skytether.shared.base.errors import ConfigError
 
 
@@ -40,15 +40,17 @@ def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
     """
     assert missions.fly_random(RandomOptions(), 31463).late == 0
     assert missions.fly_random(RandomOptions(), 104503).late == 0
-    monkeypatch.setattr(Aims, "close", lambda *_: False)
+    monkeypatch.setattr(Waypoints, "close_way", lambda *_: False)
     assert missions.fly_random(RandomOptions(), 104503).late == 1
 
 
 @pytest.mark.long
 def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them steps aside, though it is nearer than plans keep. Ablation: else nobody does."""
+    """One of them yields, though it is nearer than plans keep. Ablation: else nobody does."""
     assert missions.fly_random(RandomOptions(), 31906).late == 0
-    monkeypatch.setattr(aside, "_least", lambda places, _, apart_m: np.full(len(places), apart_m))
+    monkeypatch.setattr(
+        yielding, "_kept_distance", lambda places, _, apart_m: np.full(len(places), apart_m)
+    )
     assert missions.fly_random(RandomOptions(), 31906).late == 1
 
 

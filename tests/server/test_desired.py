@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
-from skytether.server.control.controller import BLOCK
 from skytether.server.control.desired import EMPTY, PAGE, PAGES, Desired, _led
 from skytether.server.control.live import MEMORY_S, REST_S, LivePoint
+from skytether.server.controller import BLOCK
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.controller import Controller
 from skytether.server.control.predictive import Estimator
 from skytether.server.control.scheme import Foresight, foresight
+from skytether.server.controller import Controller
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario import reading

@@ -14,14 +14,14 @@ from scipy.optimize import lsq_linear
 
 import skytether.server.control.planner
 from bench.problems import gradients, listening, solving
-from skytether.server.control.controller import BLOCK
 from skytether.server.control.desired import Desired
 from skytether.server.control.exact import ExactSolver, Workspace
-from skytether.server.control.moves import FIGURES, GENERATOR, TRACKER, Figures
+from skytether.server.control.moves import GENERATOR, TRACKER
 from skytether.server.control.mpc import FIRST, LATER, Problem, make_mpc, pose
 from skytether.server.control.osqp_solver import OsqpSolver
 from skytether.server.control.planner import Batch, Planner
-from skytether.server.control.scheme import Foresight, foresight
+from skytether.server.control.scheme import FIGURES, Figures, Foresight, foresight
+from skytether.server.controller import BLOCK
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.reading import check

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
-from skytether.server.control import apart
-from skytether.server.control.apart import NEVER, FlownMotions
 from skytether.server.control.clock import EXACT, ClockMap, Contradiction, StepError
+from skytether.server.missions.half_planes import half_planes
+from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
+from skytether.server.missions.separation import too_near
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 from skytether.shared.core.events import ClockContradicted
@@ -76,10 +77,10 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
     rng, keep_m = np.random.default_rng(seed), 1.5
     scale = np.array([1.0, 0.7, 0.5])[:axes]
     motion, *others = (drawn(rng, axes) for _ in range(9))
-    flown, far = FlownMotions(scale, DT_S), resting(0, np.full(axes, 100.0))
+    flown, far = PossibleMotions(scale, DT_S), resting(0, np.full(axes, 100.0))
     for row, other in enumerate(others, start=1):
-        flown.add(row, other, 0, NEVER, 0.0, its)
-    hit = apart.too_near(motion, far, begin, 0, NEVER, flown, keep_m, mine)
+        flown.add(row, PossibleMotion(other, error=its))
+    hit = too_near(PossibleMotion(motion, error=mine), far, begin, 0, flown, keep_m)
     for other, is_hit in zip(others, hit, strict=False):
         least = least_m(motion, other, begin, mine, its, scale)
         # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.
@@ -97,15 +98,16 @@ def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     one, other, far = drawn(rng), drawn(rng), resting(0, np.array([100.0, 0.0]))
     there = resting(0, other.position[-1])
     for second, mine, its in ((other, error, EXACT), (other, EXACT, error), (there, error, error)):
-        flown = FlownMotions(SCALE, DT_S)
-        flown.add(1, second, 0, NEVER, 0.0, its)
-        hit = apart.too_near(one, far, 0, 0, NEVER, flown, keep_m, mine)[0]
+        flown = PossibleMotions(SCALE, DT_S)
+        flown.add(1, PossibleMotion(second, error=its))
+        hit = too_near(PossibleMotion(one, error=mine), far, 0, 0, flown, keep_m)[0]
         least = least_m(one, second, 0, mine, its)
         assert (least < keep_m) <= hit <= (least < keep_m + 0.06)
-    flown = FlownMotions(SCALE, DT_S)
-    flown.add(1, there, 0, NEVER, 0.0, StepError(1e4, 1e4))
+    flown = PossibleMotions(SCALE, DT_S)
+    flown.add(1, PossibleMotion(there, error=StepError(1e4, 1e4)))
     known = least_m(resting(0, one.position[-1]), there, 0, EXACT, EXACT)
-    hit = apart.too_near(resting(0, one.position[-1]), far, 0, 0, NEVER, flown, known - 1e-6)
+    at_rest = PossibleMotion(resting(0, one.position[-1]))
+    hit = too_near(at_rest, far, 0, 0, flown, known - 1e-6)
     assert not hit[0]
 
 
@@ -117,12 +119,12 @@ def test_half_planes_are_in_front_of_all_that_another_may_be_at_a_time(
     """The motion in force, which is the way out, is never behind one."""
     rng, times, apart_m = np.random.default_rng(seed), np.arange(0.0, 121.0, 5.0), 0.9
     other, base = drawn(rng), drawn(rng)
-    flown, held = FlownMotions(np.ones(2), DT_S), base.at(times, DT_S)[0]
-    flown.add(1, other, 0, NEVER, 0.0, its)
+    flown, held = PossibleMotions(np.ones(2), DT_S), base.at(times, DT_S)[0]
+    flown.add(1, PossibleMotion(other, error=its))
     reach_m = np.full(len(times), 9.0)
-    found = apart.half_planes(times, held, reach_m, 0, NEVER, flown, apart_m, mine)
-    assert len(found.at) > 0
-    for at, normal, least in zip(found.at, found.normal, found.least, strict=True):
+    found = half_planes(times, held, reach_m, 0, NEVER, flown, apart_m, mine)
+    assert len(found.time) > 0
+    for at, normal, least in zip(found.time, found.normal, found.bound, strict=True):
         shifts = np.arange(-its.late - mine.early, its.early + mine.late, 0.25)
         ways = other.at(times[at] + shifts, DT_S)[0] if len(shifts) else np.zeros((0, 2))
         own = float(normal @ held[at])
@@ -144,9 +146,9 @@ def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
         (StepError(60.0, 0.0), True),
         (StepError(0.0, 60.0), False),
     ):
-        flown = FlownMotions(np.ones(3), DT_S)
-        flown.add(1, above, 0, 100, 0.0, error)
-        assert apart.too_near(passes, far, 0, 0, NEVER, flown, 0.9)[0] == is_hit
+        flown = PossibleMotions(np.ones(3), DT_S)
+        flown.add(1, PossibleMotion(above, 100, error))
+        assert too_near(PossibleMotion(passes), far, 0, 0, flown, 0.9)[0] == is_hit
 
 
 def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> None:
@@ -154,12 +156,12 @@ def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> N
     rng, far = np.random.default_rng(5), resting(0, np.array([100.0, 0.0]))
     for _ in range(200):
         base, other = drawn(rng), drawn(rng)
-        flown = FlownMotions(np.ones(2), DT_S)
-        flown.add(1, other, 0, NEVER, 0.0)
+        flown = PossibleMotions(np.ones(2), DT_S)
+        flown.add(1, PossibleMotion(other))
         low, high = 0.0, 20.0
         for _ in range(40):  # the largest distance that is kept
             keep_m = 0.5 * (low + high)
-            is_hit = apart.too_near(base, far, 0, 0, NEVER, flown, keep_m)[0]
+            is_hit = too_near(PossibleMotion(base), far, 0, 0, flown, keep_m)[0]
             low, high = (low, keep_m) if is_hit else (keep_m, high)
         nearer = base._replace(
             position=base.position + 0.02 * np.sign(other.position[-1] - base.position[-1])
@@ -167,7 +169,7 @@ def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> N
         for begin in range(0, 10, 3):
             least = least_m(nearer, other, begin, EXACT, EXACT, np.ones(2))
             if least < low - 1e-3:
-                assert apart.too_near(nearer, base, begin, 0, NEVER, flown, low)[0]
+                assert too_near(PossibleMotion(nearer), base, begin, 0, flown, low)[0]
 
 
 def above_ground(motion: Motion) -> Motion:
@@ -204,9 +206,9 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
         place = other.position[len(other.position) // 2] + rng.uniform([-1, -1, 1], [1, 1, 4])
         base = resting(0, place)
         motion = Motion(0, motion.position - motion.position[0] + place, motion.velocity)
-        flown = FlownMotions(np.ones(3), DT_S)
-        flown.add(1, other, 0, lands[1], 0.0, its)
-        if apart.too_near(motion, base, 0, 0, lands[0], flown, keep_m, mine)[0]:
+        flown = PossibleMotions(np.ones(3), DT_S)
+        flown.add(1, PossibleMotion(other, lands[1], its))
+        if too_near(PossibleMotion(motion, lands[0], mine), base, 0, 0, flown, keep_m)[0]:
             continue
         accepted += 1
         # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.

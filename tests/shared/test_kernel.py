@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 
@@ -233,7 +233,7 @@ import os
 import sys
 import msgspec
 from numba.core import event
-from skytether.server.control.controller import other_schemes
+from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 from skytether.sim import flight
@@ -266,7 +266,7 @@ def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies() -> N
     assert done.stdout.splitlines() == [f"{name} 0" for name in names]
 
 
-ALWAYS = {"clock", "controller", "desired", "known", "plausibility", "scheme"}
+ALWAYS = {"clock", "controller", "desired", "plausibility", "scheme"}
 """Modules of the server whose kernels are called with every scheme."""
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.server.control.clear import touches
-from skytether.server.control.routes import Routes
+from skytether.server.missions.routes import Routes
+from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.policies import PolicyError
@@ -73,11 +73,11 @@ def test_a_straight_piece_is_no_nearer_than_it_says(
     share = np.linspace(0.0, 1.0, 201)[:, None]
     points = ends[0] + share * (ends[1] - ends[0])
     least = float(kept.clearance(points).min())
-    assert touches(kept, ends, max(least, 0.0) + 1e-6)
-    assert bool(kept.in_the_way(ends, least)) == touches(kept, ends, least)
+    assert comes_near(kept, ends, max(least, 0.0) + 1e-6)
+    assert bool(kept.in_the_way(ends, least)) == comes_near(kept, ends, least)
     gap_m = float(np.linalg.norm(ends[1] - ends[0])) / 200.0
     if least > gap_m:
-        assert not touches(kept, ends, least - gap_m - 1e-9)
+        assert not comes_near(kept, ends, least - gap_m - 1e-9)
 
 
 @given(
@@ -104,9 +104,9 @@ def test_straight_pieces_in_space(
     for piece, is_level in ((given, False), (level, True)):
         least = float(kept.clearance(piece[0] + share * (piece[1] - piece[0])).min())
         if least < room_m - 1e-9:
-            assert touches(kept, piece, room_m)
+            assert comes_near(kept, piece, room_m)
         elif is_level and least > room_m + float(np.linalg.norm(piece[1] - piece[0])) / 200.0:
-            assert not touches(kept, piece, room_m)
+            assert not comes_near(kept, piece, room_m)
 
 
 @given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
@@ -355,7 +355,7 @@ def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) 
     kept, begin = zones.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
     way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
     assert len(way) > 2
-    assert not touches(kept, way, 0.2 - 1e-6)
+    assert not comes_near(kept, way, 0.2 - 1e-6)
     assert least_m < length_m(way) < 1.5 * least_m + 1.0
 
 

@@ -20,19 +20,21 @@ from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.server import sessions
-from skytether.server.control import aims, apart, aside, motionplan
-from skytether.server.control import known as known_vehicles
-from skytether.server.control.aims import Aims
-from skytether.server.control.apart import NEVER, FlownMotions, HalfPlanes
 from skytether.server.control.clock import ClockMap
-from skytether.server.control.direct import Direct
-from skytether.server.control.dual import DualSolver
-from skytether.server.control.known import PROMPT, Known, Sent
-from skytether.server.control.motionplan import MotionPlan
-from skytether.server.control.roster import LONGEST, Roster
-from skytether.server.control.routes import Routes
-from skytether.server.control.together import Together
 from skytether.server.endpoint import Server
+from skytether.server.missions import trajectory_qp, vehicle_motions, waypoints, yielding
+from skytether.server.missions.compiled_motion import pieces_of
+from skytether.server.missions.dual_active_set import DualActiveSet
+from skytether.server.missions.half_planes import HalfPlanes, half_planes
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.mission_state import LONGEST, MissionState
+from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
+from skytether.server.missions.routes import Routes
+from skytether.server.missions.separation import too_near
+from skytether.server.missions.trajectory_qp import TrajectoryQP
+from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
+from skytether.server.missions.vehicle_motions import PROMPT_COUNT, SentMotion, VehicleMotions
+from skytether.server.missions.waypoints import Waypoints
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
@@ -120,7 +122,7 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
     least = rows @ inside - rng.uniform(0, 1, m) * (rng.random(m) < 0.8)
     least[:equal] = rows[:equal] @ inside
     columns = np.ascontiguousarray(rows.T)
-    found = DualSolver(hessian).solve(linear, columns, least, equal)
+    found = DualActiveSet(hessian).solve(linear, columns, least, equal)
     assert found is not None
     assert (rows @ found - least).min() > -1e-8
     assert np.abs(rows[:equal] @ found - least[:equal]).max() < 1e-8
@@ -149,7 +151,7 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
 
 def test_what_cannot_be_has_no_solution() -> None:
     columns = np.array([[1.0, -1.0], [0.0, 0.0]])
-    assert DualSolver(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
+    assert DualActiveSet(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
 
 
 @given(
@@ -161,7 +163,7 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
 ) -> None:
     """Under inputs that leave a tenth of the bound to the regulator aboard."""
     terms = scenario(4).terms()
-    found = MotionPlan(terms, 0.6, 0.0).solve(
+    found = TrajectoryQP(terms, 0.6, 0.0).solve(
         np.zeros((1, 2)), np.array([velocity]), np.array(goal)
     )
     assert found is not None
@@ -186,16 +188,16 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 ) -> None:
     """The QP of all axes at once has the same knots."""
     terms = reading.load(name).terms()
-    axes, plan = terms.axes, MotionPlan(terms, 0.6, speed_mps)
+    axes, plan = terms.axes, TrajectoryQP(terms, 0.6, speed_mps)
     p, v = np.array([[0.3, -2.0, 1.0][:axes]]), np.array([velocity[:axes]])
     found = plan.solve(p, v, np.array(goal[:axes]))
-    x = plan.solver.solve(*plan.posed(p[0], v[0], np.array(goal[:axes]), None), axes)
+    x = plan.solver.solve(*plan.problem(p[0], v[0], np.array(goal[:axes]), None), axes)
     assert (found is None) == (x is None)
     if found is None or x is None:
         return
     knots = np.empty((2, INTERVALS + 1, axes))
     knots[:, :1] = p, v
-    motionplan._fly(plan.posing, x, 1, knots[0], knots[1])
+    trajectory_qp._integrate(plan.constants, x, 1, knots[0], knots[1])
     assert np.array(found).tobytes() == knots.tobytes()
 
 
@@ -211,16 +213,16 @@ def test_planned_together_or_one_by_one_motions_are_the_same(
     flown = reading.check(table, name)
     vehicles = len(flown.make_reference().vehicles)  # type: ignore[attr-defined]
     at_once = list[int]()
-    real = Direct.motions
+    real = UnconstrainedPlanner.motions
 
-    def motions(self: Direct, *given: Any) -> list[Motion]:
+    def motions(self: UnconstrainedPlanner, *given: Any) -> list[Motion]:
         found = real(self, *given)
         at_once.append(len(found))
         return found
 
-    monkeypatch.setattr(Direct, "motions", motions)
+    monkeypatch.setattr(UnconstrainedPlanner, "motions", motions)
     one = flight.fly(flown, vehicles=vehicles)
-    monkeypatch.setattr(Direct, "motions", lambda *_: [])
+    monkeypatch.setattr(UnconstrainedPlanner, "motions", lambda *_: [])
     other = flight.fly(flown, vehicles=vehicles)
     assert one.trace_hash() == other.trace_hash()
     assert one.events == other.events
@@ -249,20 +251,20 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
     rng = np.random.default_rng(seed)
     scale, keep_m, off_m = np.array([1.0, 0.7]), 1.5, 0.02
     motion, base, *others = (drawn(rng, int(rng.integers(1, 17))) for _ in range(12))
-    flown = FlownMotions(scale, DT_S)
+    flown = PossibleMotions(scale, DT_S)
     for row, other in enumerate(others):
-        flown.replace(row, [drawn(rng, 5)], 0, NEVER, 0.0)  # which is replaced by others
-        flown.replace(row, [other, other], 0, NEVER, 0.1 * row)
-    flown.replace(3, [], 0, NEVER, 0.0)
+        flown.replace(row, [PossibleMotion(drawn(rng, 5))])  # which is replaced by others
+        flown.replace(row, [PossibleMotion(other)] * 2, 0.1 * row)
+    flown.replace(3, [])
 
     def least_m(one: Motion, other: Motion) -> float:
         steps = np.arange(begin, max(one.last, other.last, begin) + 1.0, 0.25)
         away = scale * (one.at(steps, DT_S)[0] - other.at(steps, DT_S)[0])
         return float(np.linalg.norm(away, axis=1).min())
 
-    hit = apart.too_near(motion, base, begin, 1, NEVER, flown, keep_m)
-    assert sorted(flown.of) == sorted([0, 1, 2, 4, 5, 6, 7, 8, 9] * 2)
-    for row, is_hit in zip(flown.of, hit[:-1], strict=True):
+    hit = too_near(PossibleMotion(motion), base, begin, 1, flown, keep_m)
+    assert sorted(flown.rows) == sorted([0, 1, 2, 4, 5, 6, 7, 8, 9] * 2)
+    for row, is_hit in zip(flown.rows, hit[:-1], strict=True):
         least, already = least_m(motion, others[row]), least_m(base, others[row])
         keep = keep_m + 0.1 * row
         if row == 1 or least > keep + off_m or (already < keep - off_m and least > already + off_m):
@@ -274,22 +276,23 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
 def test_the_box_of_a_motion_is_just_around_it() -> None:
     """A motion that turns between its two knots lies outside both: the box contains its turn."""
     out_and_back = Motion(0, np.array([[1.0, 5.0]] * 2), np.array([[0.8, 0.0], [-0.8, 0.0]]))
-    flown = FlownMotions(np.array([1.0, 0.5]), DT_S)
-    flown.add(1, out_and_back, 0, NEVER, 0.0)
+    flown = PossibleMotions(np.array([1.0, 0.5]), DT_S)
+    flown.add(1, PossibleMotion(out_and_back))
     furthest = out_and_back.at(np.array([SPACING / 2.0]), DT_S)[0][0, 0]
     assert flown.arrays.high[0].tolist() == pytest.approx([furthest, 2.5])
     assert flown.arrays.low[0].tolist() == pytest.approx([2.0 - furthest, 2.5])
     steady = Motion(0, np.array([[0.0, 1.0], [0.4, 1.0]]), np.array([[0.8, 0.0], [0.8, 0.0]]))
-    flown.add(2, steady, 0, NEVER, 0.0)
+    flown.add(2, PossibleMotion(steady))
     assert flown.arrays.low[1].tolist() == pytest.approx([0.0, 0.5])
     assert flown.arrays.high[1].tolist() == pytest.approx([0.4, 0.5])
 
 
 def test_a_motion_that_lands_has_a_box_down_to_the_ground() -> None:
     """Not where it never lands, nor where it is below the ground already."""
-    flown = FlownMotions(np.ones(3), DT_S)
+    flown = PossibleMotions(np.ones(3), DT_S)
     for lands, height, low in ((NEVER, 4.0, 4.0), (60, 4.0, 0.0), (60, -1.0, -1.0)):
-        flown.replace(1, [resting(0, np.array([1.0, 2.0, height]))], 0, lands, 0.0)
+        motion = resting(0, np.array([1.0, 2.0, height]))
+        flown.replace(1, [PossibleMotion(motion, lands)])
         assert flown.arrays.low[0].tolist() == [1.0, 2.0, low]
         assert flown.arrays.high[0].tolist() == [1.0, 2.0, height]
 
@@ -297,7 +300,7 @@ def test_a_motion_that_lands_has_a_box_down_to_the_ground() -> None:
 @pytest.mark.parametrize(("begin", "end"), [(0, 20), (3, 20), (0, 21), (20, 20), (30, 20)])
 def test_no_piece_begins_after_a_motion_has_come_to_rest(begin: int, end: int) -> None:
     """The pieces follow each other, and the last one reaches its end; at rest there is one."""
-    steps = apart.pieces_of(begin, end)
+    steps = pieces_of(begin, end)
     assert steps[0] == begin
     assert steps[-1] >= end
     assert len(steps) == 2 or steps[-2] < end
@@ -312,10 +315,10 @@ def test_vehicles_that_may_land_come_too_near_below_their_motions(
     rng, scale, keep_m = np.random.default_rng(seed), np.array([1.0, 1.0, 0.5]), 1.0
     up, each = np.array([0.0, 0.0, 9.0]), (drawn(rng, 13, 3), drawn(rng, 13, 3))
     motion, other = (low._replace(position=low.position + up) for low in each)
-    flown = FlownMotions(scale, DT_S)
-    flown.add(1, other, 0, others_land, 0.0)
+    flown = PossibleMotions(scale, DT_S)
+    flown.add(1, PossibleMotion(other, others_land))
     far = resting(0, np.array([100.0, 0.0, 0.0]))
-    hit = apart.too_near(motion, far, 0, 0, lands, flown, keep_m)[0]
+    hit = too_near(PossibleMotion(motion, lands), far, 0, 0, flown, keep_m)[0]
 
     def least_m(early: int) -> float:
         steps = np.append(np.arange(0.0, 240.0, 0.25), 1e6)
@@ -336,18 +339,18 @@ def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
     """It would pass 3 m below; in the end it is to rest beside it, also if neither lands yet."""
     above, times = resting(0, np.array([0.0, 0.0, 4.0])), np.arange(0.0, 121.0, 5.0)
     held = np.tile([1.5, 0.0, 1.0], (len(times), 1))
-    flown, reach_m = FlownMotions(np.ones(3), DT_S), np.full(len(times), 9.0)
+    flown, reach_m = PossibleMotions(np.ones(3), DT_S), np.full(len(times), 9.0)
 
     def planes(lands: int, others_land: int) -> HalfPlanes:
-        flown.replace(1, [above], 0, others_land, 0.0)
-        return apart.half_planes(times, held, reach_m, 0, lands, flown, 0.9)
+        flown.replace(1, [PossibleMotion(above, others_land)])
+        return half_planes(times, held, reach_m, 0, lands, flown, 0.9)
 
     assert np.abs(planes(NEVER, NEVER).normal[:, 2]).min() > 0.5
     found = planes(200, 60)
     level = np.abs(found.normal[:, 2]) < 1e-12
-    assert times[found.at[level]].tolist() == [t for t in times.tolist() if t >= 60]
+    assert times[found.time[level]].tolist() == [t for t in times.tolist() if t >= 60]
     found = planes(200, 200)
-    assert times[found.at[np.abs(found.normal[:, 2]) < 1e-12]].tolist() == [120.0]
+    assert times[found.time[np.abs(found.normal[:, 2]) < 1e-12]].tolist() == [120.0]
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.5])
@@ -355,21 +358,21 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     loss: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At every plan, though only those are gathered that are others than before."""
-    real, looked_at = Roster.gather, list[int]()
+    real, looked_at = MissionState.update_possible, list[int]()
 
-    def gather(self: Roster) -> None:
+    def update_possible(self: MissionState) -> None:
         real(self)
         expected = sorted(
-            (row, motion.first - self.ahead(row), len(motion.position), known.off_m)
-            for row, known in self.known.items()
-            for motion in known.motions()
+            (row, motion.first - self.ahead(row), len(motion.position), vehicle.outside_m)
+            for row, vehicle in self.vehicles.items()
+            for motion in vehicle.motions()
         )
-        count, held = self.flown.count, self.flown.arrays
-        found = zip(held.of, held.first, held.knots, held.wide, strict=True)
+        count, held = self.possible.count, self.possible.arrays
+        found = zip(held.row, held.first, held.knots, held.extra, strict=True)
         assert sorted(list(found)[:count]) == expected
         looked_at.append(count)
 
-    monkeypatch.setattr(Roster, "gather", gather)
+    monkeypatch.setattr(MissionState, "update_possible", update_possible)
     flight.fly(scenario(6, loss, duration=20.0), vehicles=6)
     assert len(looked_at) > 10
     assert max(looked_at) > 6
@@ -384,12 +387,12 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
 
-def alone() -> Together:
+def alone() -> MissionPlanner:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
-    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    return Together(flown, flown.terms(), 2, roster)
+    state = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
+    return MissionPlanner(flown, flown.terms(), 2, state)
 
 
 def exact(vehicles: int) -> ClockMap:
@@ -402,19 +405,19 @@ def exact(vehicles: int) -> ClockMap:
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     """It is in force, may still be taken, or is known to be lost."""
-    made, known = alone()._roster, Known()
-    made.known[0] = known
+    made, vehicle = alone()._state, VehicleMotions()
+    made.vehicles[0] = vehicle
     assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
     first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
-    known.sent.append(Sent(10, first))
-    assert len(known.motions()) == 2
+    vehicle.sent.append(SentMotion(10, first))
+    assert len(vehicle.motions()) == 2
     made.observe(0, observation(20, 10, (4.0, 0.0)))
-    assert known.motions() == [first]
-    known.sent.append(Sent(40, second))
+    assert vehicle.motions() == [first]
+    vehicle.sent.append(SentMotion(40, second))
     made.observe(0, observation(40 + made._join, 10, (4.0, 0.0)))
-    assert len(known.motions()) == 2  # it may have been taken at the very step of the observation
+    assert len(vehicle.motions()) == 2  # it may have been taken at the very step of the observation
     made.observe(0, observation(41 + made._join, 10, (4.0, 0.0)))
-    assert known.motions() == [first]
+    assert vehicle.motions() == [first]
     assert made.counts["horizons_lost"] == 1
     for old in (30, 41 + made._join):  # late, and a copy of the newest
         assert not made.observe(0, observation(old, 10, (4.0, 0.0)))
@@ -422,18 +425,18 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
     """Its steps are smaller, so time would never tell; one that goes on tells by its motion."""
-    made, place = alone()._roster, np.array([4.0, 0.0])
+    made, place = alone()._state, np.array([4.0, 0.0])
     for in_force, left in ((NO_HORIZON, 0), (900, 1)):
-        known = made.known[0] = Known()
-        known.in_force = Sent(900, resting(900, place))
-        known.sent.append(Sent(1000, resting(1000, place)))
-        known.nearer_at, known.goal = 990, place
+        vehicle = made.vehicles[0] = VehicleMotions()
+        vehicle.in_force = SentMotion(900, resting(900, place))
+        vehicle.sent.append(SentMotion(1000, resting(1000, place)))
+        vehicle.progress_step, vehicle.goal = 990, place
         made.forget(0)
-        assert known.motions()
+        assert vehicle.motions()
         made.observe(0, observation(3 if in_force < 0 else 1001, in_force, (4.0, 0.0)))
-        assert len(known.sent) == left
-        assert not known.is_stuck(3, place, 0.0)
-        assert known.nearer_at == 3
+        assert len(vehicle.sent) == left
+        assert not vehicle.is_stuck(3, place, 0.0)
+        assert vehicle.progress_step == 3
 
 
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
@@ -445,28 +448,28 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     made, flown = alone(), scenario(2)
     for row, x in ((0, 4.0), (1, -4.0)):
         made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-    made._roster.meet(np.arange(2), np.array([100, 100]))
-    made._roster.known[1].off_m = 0.1
-    made._roster.gather()
+    made._state.align(np.arange(2), np.array([100, 100]))
+    made._state.vehicles[1].outside_m = 0.1
+    made._state.update_possible()
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
-    assert made._hit(0, near, 100).tolist() == [False, is_hit, False]
+    assert made._conflicts(0, near, 100).tolist() == [False, is_hit, False]
 
 
-def ready() -> Together:
+def ready() -> MissionPlanner:
     """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
     made = alone()
     for row, x in ((0, 4.0), (1, -4.0)):
         made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-        made._roster.known[row].in_force = Sent(90, resting(100, np.array([x, 0.0])))
+        made._state.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
         made.observe(row, observation(101, 90, (x, 0.0)))
     return made
 
 
-def planned(made: Together) -> Motion:
+def planned(made: MissionPlanner) -> Motion:
     """Motion that is decided for the first vehicle at step 101."""
     made.plan(np.arange(2), np.array([101, 101]), None)  # type: ignore[arg-type]
-    motion = made._roster.known[0].next
+    motion = made._state.vehicles[0].next
     assert motion is not None
     return motion
 
@@ -475,32 +478,32 @@ def planned(made: Together) -> Motion:
 def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
     """Though it may fly straight: it is still passing somebody. Bit by bit it turns back."""
     made = ready()
-    made._roster.known[0].turned = turned
+    made._state.vehicles[0].turned_rad = turned
     end = planned(made).position[-1]
     assert end[0] < 3.0  # on its way from x = 4 m to -4 m
     assert (end[1] > 0.5) == (turned > 0.0)
-    assert made._roster.known[0].turned == max(0.0, turned - aims.TURN_BACK)
+    assert made._state.vehicles[0].turned_rad == max(0.0, turned - waypoints.TURN_BACK)
 
 
-@pytest.mark.parametrize(("until", "is_aside"), [(0, True), (-1, False)])
-def test_a_vehicle_is_aside_up_to_its_last_step(until: int, is_aside: bool) -> None:
+@pytest.mark.parametrize(("until", "yields"), [(0, True), (-1, False)])
+def test_a_vehicle_yields_up_to_its_last_step(until: int, yields: bool) -> None:
     """One step later it flies to its own goal again, though the other has not passed."""
     made = ready()
     place = np.array([4.0, 3.0])
-    made._roster.known[0].aside = aside.Aside(place, asker=1, until=until)
+    made._state.vehicles[0].yielding = yielding.Yielding(place, asker=1, until=until)
     end = planned(made).position[-1]
-    assert (made._roster.known[0].aside is not None) == is_aside
-    assert (end[1] > 0.5, end[0] < 3.5) == (is_aside, not is_aside)
+    assert (made._state.vehicles[0].yielding is not None) == yields
+    assert (end[1] > 0.5, end[0] < 3.5) == (yields, not yields)
 
 
 def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
     """The very same one, from the first step on after a third of that age."""
     made = ready()
-    known, last = made._roster.known[0], 90 + made._again
-    assert made._plans(known, last)
-    assert known.next is None
-    assert not made._plans(known, last + 1)
-    assert known.next is known.in_force.motion  # type: ignore[union-attr]
+    vehicle, last = made._state.vehicles[0], 90 + made._resend_after
+    assert made._may_plan(0, vehicle, last)
+    assert vehicle.next is None
+    assert not made._may_plan(0, vehicle, last + 1)
+    assert vehicle.next is vehicle.in_force.motion  # type: ignore[union-attr]
 
 
 def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
@@ -508,7 +511,7 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     made = alone()
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._roster.known[0].in_force = Sent(90, resting(100, np.array([4.0, 0.0])))
+    made._state.vehicles[0].in_force = SentMotion(90, resting(100, np.array([4.0, 0.0])))
     over = 70 + LONGEST  # the last step of the longest motion
     for step, seen, plans in (
         (111, 111, False),
@@ -519,7 +522,7 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
         made.observe(1, observation(seen, 70, (-4.0, 0.0)))
         rows, steps = np.arange(2), np.array([step, step])
         made.plan(rows, steps, None)  # type: ignore[arg-type]
-        assert (made._roster.known[0].next is not None) == plans
+        assert (made._state.vehicles[0].next is not None) == plans
 
 
 def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
@@ -544,52 +547,52 @@ def test_a_motion_is_not_taken_aboard_before_its_first_knot() -> None:
 
 
 def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
-    known = Known()
+    vehicle = VehicleMotions()
     first, sent, new = (resting(step, np.zeros(2)) for step in (100, 104, 108))
-    known.in_force, known.next = Sent(100, first), new
-    known.sent.append(Sent(104, sent))
-    pairs = zip(known.motions(), (first, sent, new), strict=True)
+    vehicle.in_force, vehicle.next = SentMotion(100, first), new
+    vehicle.sent.append(SentMotion(104, sent))
+    pairs = zip(vehicle.motions(), (first, sent, new), strict=True)
     assert all(each is other for each, other in pairs)
-    known.next = first
-    assert len(known.motions()) == 2
+    vehicle.next = first
+    assert len(vehicle.motions()) == 2
 
 
 def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
     """Not before the first loss; the very motion of that step, within what it may be taken in."""
-    known = Known()
-    known.sent.append(Sent(100, resting(100, np.zeros(2))))
-    assert not any(known.owed(step) for step in range(100, 140))
-    known.learn(prompt=False)
-    assert [step for step in range(100, 140) if known.owed(step)] == [104]
+    vehicle = VehicleMotions()
+    vehicle.sent.append(SentMotion(100, resting(100, np.zeros(2))))
+    assert not any(vehicle.repeat_at(step) for step in range(100, 140))
+    vehicle.adapt_copies(prompt=False)
+    assert [step for step in range(100, 140) if vehicle.repeat_at(step)] == [104]
     for _ in range(5):
-        known.learn(prompt=False)
-    due = [step for step in range(100, 140) if known.owed(step)]
+        vehicle.adapt_copies(prompt=False)
+    due = [step for step in range(100, 140) if vehicle.repeat_at(step)]
     assert due == [104, 108]
     assert due[-1] - 100 < scenario(2).terms().join
-    assert known.owed(104) == known.sent[-1]
-    for _ in range(3 * PROMPT):
-        known.learn(prompt=True)
-    assert known.copies == 1
-    known.learn(prompt=False)
-    for _ in range(PROMPT - 1):
-        known.learn(prompt=True)
-    assert known.copies == 2
-    known.learn(prompt=False)
-    known.sent.clear()
-    assert known.owed(104) is None
+    assert vehicle.repeat_at(104) == vehicle.sent[-1]
+    for _ in range(3 * PROMPT_COUNT):
+        vehicle.adapt_copies(prompt=True)
+    assert vehicle.copies == 1
+    vehicle.adapt_copies(prompt=False)
+    for _ in range(PROMPT_COUNT - 1):
+        vehicle.adapt_copies(prompt=True)
+    assert vehicle.copies == 2
+    vehicle.adapt_copies(prompt=False)
+    vehicle.sent.clear()
+    assert vehicle.repeat_at(104) is None
 
 
 def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
     """It is said once in that time; whoever comes nearer, or has another goal, is not stuck."""
-    known, goal = Known(), np.array([4.0, 0.0])
-    patience = known_vehicles.PATIENCE
-    assert not known.is_stuck(0, goal, 10.0)
-    assert not known.is_stuck(100, goal, 10.0 - 0.9 * known_vehicles.NEARER_M)
-    found = [step for step in range(101, 3 * patience) if known.is_stuck(step, goal, 9.8)]
+    vehicle, goal = VehicleMotions(), np.array([4.0, 0.0])
+    patience = vehicle_motions.PATIENCE_STEPS
+    assert not vehicle.is_stuck(0, goal, 10.0)
+    assert not vehicle.is_stuck(100, goal, 10.0 - 0.9 * vehicle_motions.NEARER_M)
+    found = [step for step in range(101, 3 * patience) if vehicle.is_stuck(step, goal, 9.8)]
     assert found == [patience, 2 * patience]
-    assert not known.is_stuck(3 * patience, goal, 9.0)
-    assert not known.is_stuck(4 * patience - 1, goal, 9.0)
-    assert not known.is_stuck(4 * patience, -goal, 9.0)
+    assert not vehicle.is_stuck(3 * patience, goal, 9.0)
+    assert not vehicle.is_stuck(4 * patience - 1, goal, 9.0)
+    assert not vehicle.is_stuck(4 * patience, -goal, 9.0)
 
 
 def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
@@ -597,31 +600,31 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
     made, until = alone(), 70 + LONGEST
     for step, x, taken_x in ((100, -4.0, -4.0), (until, -3.5, -3.5), (until + 1, -3.0, -3.5)):
         made.observe(1, observation(step, 70, (x, 0.0)))
-        known = made._roster.known[1].in_force
-        assert known is not None
-        assert known.motion.position[-1].tolist() == [taken_x, 0.0]
+        vehicle = made._state.vehicles[1].in_force
+        assert vehicle is not None
+        assert vehicle.motion.position[-1].tolist() == [taken_x, 0.0]
 
 
 def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
     """It comes to rest v (τ + v / 2b) further on than where it was seen."""
-    made, terms = alone()._roster, scenario(2).terms()
+    made, terms = alone()._state, scenario(2).terms()
     made.absent.clear()
     moving = observation(100, NO_HORIZON, (4.0, 0.0))
     moving.state[0, 1] = 0.5
     made.observe(0, moving)
     expected = 0.5 * (max(terms.tau_s) + 0.5 / (2.0 * terms.brake_mps2))
-    assert made.known[0].off_m == pytest.approx(expected)
+    assert made.vehicles[0].outside_m == pytest.approx(expected)
 
 
 def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
     """A motion that was sent and may still be taken leads away from where it is."""
-    made = alone()._roster
-    made.known[1] = known = Known()
-    known.in_force = Sent(-100, resting(-100, np.array([1.0, 0.0])))
-    assert len(made.rests(0)) == 1
+    made = alone()._state
+    made.vehicles[1] = vehicle = VehicleMotions()
+    vehicle.in_force = SentMotion(-100, resting(-100, np.array([1.0, 0.0])))
+    assert len(made.resting_places(0)) == 1
     places = np.array([[1.0, 0.0], [1.2, 0.0]])
-    known.sent.append(Sent(-4, Motion(-4, places, np.zeros((2, 2)))))
-    assert made.rests(0) == []
+    vehicle.sent.append(SentMotion(-4, Motion(-4, places, np.zeros((2, 2)))))
+    assert made.resting_places(0) == []
 
 
 def test_who_gets_a_motion_again_says_so_again() -> None:
@@ -665,7 +668,7 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
         return max(left_m(flown, 4))
 
     assert left_over_m() < 0.3
-    monkeypatch.setattr(known_vehicles, "COPIES_MAX", 1)
+    monkeypatch.setattr(vehicle_motions, "COPIES_MAX", 1)
     assert left_over_m() > 3.0
 
 
@@ -715,14 +718,14 @@ def test_sixteen_swap_places_over_the_worst_networks(keys: dict[str, float], see
 @pytest.mark.parametrize("forgets", ["what was sent before", "what may be lost"])
 def test_without_what_may_be_flown_they_meet(forgets: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ablation: apart from the newest motion alone, or from those that are acknowledged alone."""
-    real = Known.motions
+    real = VehicleMotions.motions
     newest = forgets == "what was sent before"
 
-    def some(known: Known) -> list[Motion]:
-        motions = real(known)
+    def some(vehicle: VehicleMotions) -> list[Motion]:
+        motions = real(vehicle)
         return motions[-1:] if newest else motions[:1]
 
-    monkeypatch.setattr(Known, "motions", some)
+    monkeypatch.setattr(VehicleMotions, "motions", some)
     least = [
         separation_m(flight.fly(scenario(16, 0.5, duration=60.0, seed=seed), vehicles=16))
         for seed in (1, 2)
@@ -946,9 +949,9 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
 ) -> None:
     """Ablation: where ways lead around zones alone, the gap is tried for ever.
 
-    Unless a vehicle steps aside, which none does here.
+    Unless a vehicle yields, which none does here.
     """
-    monkeypatch.setattr(Together, "_ask", lambda *_: None)
+    monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
     (tmp_path / "goals.csv").write_text(
         "vehicle,t,x,y\n1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
     )
@@ -963,7 +966,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
         return float(np.linalg.norm(each_of(flown)[1]["state"][-1, :, 0] - [2.6, 2.0]))
 
     assert left_over_m() < 0.3
-    monkeypatch.setattr(Aims, "_detour", lambda self, *_: self.routes)
+    monkeypatch.setattr(Waypoints, "_detour", lambda self, *_: self.routes)
     assert left_over_m() > 1.0
 
 
@@ -974,13 +977,13 @@ def test_a_way_begins_where_an_octagon_faces_a_place(
     """However it lies, the place is as far from it as from the circle within."""
     at = np.array([1.0, -2.0])
     place = at + (radius_m + room_m) * np.array([np.cos(angle), np.sin(angle)])
-    zone = aims._octagon("a vehicle", at, radius_m, place)
+    zone = waypoints._octagon("a vehicle", at, radius_m, place)
     assert Zones([zone]).clearance(place[None])[0, 0] == pytest.approx(room_m)
     around = np.stack([np.cos(turns := np.linspace(0.0, 6.28, 50)), np.sin(turns)], axis=1)
     assert Zones([zone]).clearance(at + radius_m * around).max() < 1e-9
 
 
-def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
+def test_a_vehicle_at_its_goal_in_a_gap_yields(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It comes back once the other has passed. Ablation: else that one never gets through."""
@@ -1003,22 +1006,24 @@ def test_a_vehicle_at_its_goal_in_a_gap_steps_aside(
     assert furthest_m > 1.0
     assert home_m < 0.3
     assert left_over_m < 0.3
-    monkeypatch.setattr(Together, "_ask", lambda *_: None)
+    monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
     furthest_m, _, left_over_m = fly()
     assert furthest_m < 0.3
     assert left_over_m > 3.0
 
 
 @given(st.integers(0, 2**31), st.integers(2, 3))
-def test_a_place_to_step_aside_to_is_off_the_way(seed: int, axes: int) -> None:
+def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
     """The place is clear of the other vehicles and of zones, or there is none."""
     rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
     home, way = rng.uniform(-3, 3, axes), rng.uniform(-3, 3, (3, axes))
     others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
     kept = zones.parse("fence(-4, 4, -4, 4) & box(-1, 1, 1, 2)", axes)
-    found = aside.place(home, way, others, apart_m, scale, kept, Routes(kept, room_m), room_m)
+    found = yielding.place_to_yield(
+        home, way, others, apart_m, scale, kept, Routes(kept, room_m), room_m
+    )
     if found is not None:
-        assert aside.off_way(found[None] * scale, way * scale)[0] >= apart_m
+        assert yielding.distance_from_way(found[None] * scale, way * scale)[0] >= apart_m
         assert np.linalg.norm((others - found) * scale, axis=1).min() >= apart_m
         assert kept.clearance(found[None]).min() >= room_m
 
@@ -1027,41 +1032,45 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
     """Not one beside it, nor one that is far ahead, nor one that it leads away from."""
     way = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 9.0]])
     homes = np.array([[2.5, 1.0], [1.5, 0.5], [1.0, -1.5]])
-    assert aside.off_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
-    assert aside.first_on(way, homes, 0.9) == 1
+    assert yielding.distance_from_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
+    assert yielding.first_on(way, homes, 0.9) == 1
     both, moved = np.array([[0.5, 0.2], [1.5, 0.5]]), np.array([-7.0, 0.0])
-    assert aside.first_on(way + moved, both + moved, 0.9) == 0  # the nearer one to where it begins
-    assert aside.first_on(way, homes[[0, 2]], 0.9) == 0
-    assert aside.first_on(way, homes[2:], 0.9) is None
-    assert aside.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
-    assert aside.first_on(way, homes[:0], 0.9) is None
+    assert (
+        yielding.first_on(way + moved, both + moved, 0.9) == 0
+    )  # the nearer one to where it begins
+    assert yielding.first_on(way, homes[[0, 2]], 0.9) == 0
+    assert yielding.first_on(way, homes[2:], 0.9) is None
+    assert yielding.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
+    assert yielding.first_on(way, homes[:0], 0.9) is None
     around = np.array([[-0.5, 0.5], [-0.5, -0.5], [0.6, 0.6]])
-    assert aside.first_on(way, around, 0.9) == 2
+    assert yielding.first_on(way, around, 0.9) == 2
 
 
 def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
     """Before that one is reached, the way may be another."""
-    corner = 1.1 * aside.AHEAD_M
+    corner = 1.1 * yielding.AHEAD_M
     way = np.array([[0.0, 0.0], [corner, 0.0], [corner + 4.0, 0.0]])
     ahead = np.array([[corner + 2.0, 0.0]])
-    assert aside.first_on(way, ahead, 1.0) is None
-    assert aside.first_on(way[1:], ahead, 1.0) == 0
-    assert aside.first_on(way, np.array([[3.0, 0.0]]), 1.0) == 0
+    assert yielding.first_on(way, ahead, 1.0) is None
+    assert yielding.first_on(way[1:], ahead, 1.0) == 0
+    assert yielding.first_on(way, np.array([[3.0, 0.0]]), 1.0) == 0
 
 
-def test_one_that_is_too_near_already_steps_aside_away_from_the_other() -> None:
+def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
     """Vehicles at rest may be nearer than plans keep. Ablation: no place would be found for it."""
     free = zones.Zones([])
     home, way = np.array([0.91, 0.0]), np.array([[0.0, 0.0], [5.0, 0.0]])
 
     def place() -> Array | None:
         ones = np.ones(2)
-        return aside.place(home, way, way[:1], 0.93, ones, free, Routes(free, 0.2), 0.2)
+        return yielding.place_to_yield(home, way, way[:1], 0.93, ones, free, Routes(free, 0.2), 0.2)
 
     found = place()
     assert found is not None
-    assert aside.off_way(way[:1], np.stack([home, found]))[0] == pytest.approx(0.91)
-    with mock.patch.object(aside, "_least", lambda places, *_: np.full(len(places), 0.93)):
+    assert yielding.distance_from_way(way[:1], np.stack([home, found]))[0] == pytest.approx(0.91)
+    with mock.patch.object(
+        yielding, "_kept_distance", lambda places, *_: np.full(len(places), 0.93)
+    ):
         assert place() is None
 
 
@@ -1133,7 +1142,7 @@ def test_nobody_is_below_a_vehicle_that_lands(
     kept_m, _, other = fly()
     assert kept_m > 0.5
     assert np.abs(other["state"][:, 1, 0]).max() > 0.8
-    monkeypatch.setattr(Roster, "_expect_landing", lambda *_: None)
+    monkeypatch.setattr(MissionState, "_expect_landing", lambda *_: None)
     kept_m, _, other = fly()
     assert kept_m < 0.4
     assert np.abs(other["state"][:, 1, 0]).max() < 0.2
@@ -1157,16 +1166,16 @@ def test_when_a_vehicle_may_begin_to_land(
     flown = reading.check(in_space(tmp_path, "1,0,0,0,2\n"), "hover")
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
-    roster = Roster(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    assert roster.lands(0) == NEVER
+    mission = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
+    assert mission.lands(0) == NEVER
     state = np.zeros((3, 2))
     for k, does in ((400, before), (500, mode)):
         if does is not None:
             said = Observation(1, 1, k, NO_HORIZON, 0, 0, 0, does, 1, state, NO_INPUT)
-            assert roster.observe(0, said)
-    assert roster.lands(0) == lands
-    roster.rows.ahead[0] = 40
-    assert roster.lands(0) == lands - 40
+            assert mission.observe(0, said)
+    assert mission.lands(0) == lands
+    mission.rows.ahead[0] = 40
+    assert mission.lands(0) == lands - 40
 
 
 @pytest.mark.parametrize(

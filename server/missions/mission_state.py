@@ -1,7 +1,8 @@
-"""Motions that each vehicle of a mission may fly, as far as the server knows.
+"""State of a mission: the motions that each vehicle may fly, as far as the server knows.
 
-Kept up by the observations, which acknowledge motions, and by what is sent; `together` plans by
-it. The steps of all vehicles are brought onto one grid here, so that motions can be compared.
+Observations, which acknowledge motions, and the motions that are sent keep it up; `mission_planner`
+plans by it. The steps of all vehicles are brought onto one grid here, so that motions can be
+compared.
 """
 
 from collections import Counter
@@ -10,9 +11,9 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from skytether.server.control.apart import NEVER, FlownMotions
 from skytether.server.control.clock import ClockMap, StepError
-from skytether.server.control.known import Known, Sent, repeats_after
+from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
+from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
 from skytether.shared.base.kernel import B1, F1, I1, kernel
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
@@ -24,11 +25,11 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Steps that a motion takes at most."""
-ANEW = 20
+RESTART_STEPS = 20
 """Steps after a client has begun anew up to which an observation may be of its earlier life."""
-DECIDES, REPEATS = 1, 2
-"""Flags in `Roster.looks`: a motion may be planned for the vehicle at this step; its last one is
-sent once more."""
+PLAN_DUE, REPEAT_DUE = 1, 2
+"""Flags in `MissionState.due`: a motion may be planned for the vehicle at this step; its last
+motion is sent once more."""
 
 
 class VehicleRows(NamedTuple):
@@ -36,8 +37,8 @@ class VehicleRows(NamedTuple):
 
     ahead: I1
     """Steps by which the vehicle is ahead of the grid in common."""
-    met: B1
-    """Whether that is known."""
+    aligned: B1
+    """Whether `ahead` is known."""
     heard: B1
     """Whether an observation has come in this session."""
     number: I1
@@ -47,11 +48,11 @@ class VehicleRows(NamedTuple):
     lands: I1
     """First step at which it may begin to land, or NEVER."""
     unknown_until: I1
-    """Step from which on a motion is over that another server has sent."""
+    """Last step at which the vehicle may fly a motion that another server has sent."""
     sent_step: I1
-    """Step of the motion that was sent last and is not acknowledged."""
+    """Step of the motion that was sent last and is not acknowledged; 0 of none."""
     repeats_for: I1
-    """Steps after that up to which it is sent once more, see `Known.repeats`."""
+    """Steps after that up to which it is sent once more, see `VehicleMotions.repeats`."""
     early: F1
     """Error of the step that is counted for the vehicle, see `clock.StepError`."""
     late: F1
@@ -61,15 +62,15 @@ class VehicleRows(NamedTuple):
     def of(cls, capacity: int) -> Self:
         """Numbers of rows of which nothing is known."""
         ahead, number, sent_step, repeats_for = np.zeros((4, capacity), dtype=np.int64)
-        met, heard = np.zeros((2, capacity), dtype=np.bool_)
+        aligned, heard = np.zeros((2, capacity), dtype=np.bool_)
         observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
         lands = np.full(capacity, NEVER)
         early, late = np.zeros((2, capacity))
         numbers = number, observed_step, lands, unknown_until, sent_step, repeats_for
-        return cls(ahead, met, heard, *numbers, early, late)
+        return cls(ahead, aligned, heard, *numbers, early, late)
 
 
-class Roster:
+class MissionState:
     """Vehicles of a mission, the motions that each may fly, and their places on one grid of steps.
 
     Args:
@@ -94,12 +95,12 @@ class Roster:
     ) -> None:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
-        self.left: list[tuple[int, float]] = []
+        self.left_tube: list[tuple[int, float]] = []
         """Vehicles that have left their tube since this was emptied, and how far outside they were
         [m]."""
         self.state = np.zeros((capacity, terms.axes, 2))
         """States that were observed last; shape (capacity, axes, 2)."""
-        self.known: dict[int, Known] = {}
+        self.vehicles: dict[int, VehicleMotions] = {}
         """Motions of the vehicles, and what is decided on them, by row."""
         self.number_of = number_of
         """Number of the vehicle in a row."""
@@ -119,16 +120,16 @@ class Roster:
         self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
         """Step of the newest observation; shape (capacity,)."""
-        self.looks, self._found = np.zeros((2, block), dtype=np.int64)
-        """Scratch of `meet`: what is to be done for each vehicle, DECIDES and REPEATS, and by how
-        many steps its place on the grid has changed."""
+        self.due, self._moved_by = np.zeros((2, block), dtype=np.int64)
+        """Scratch of `align`: what is to be done for each vehicle, PLAN_DUE and REPEAT_DUE, and by
+        how many steps its place on the grid has changed."""
         scale = np.ones(terms.axes)
         scale[ALTITUDE:] = scenario.mission.height_scale
-        self.flown = FlownMotions(scale, terms.dt_s)
-        """All motions that may be flown, but for those of rows that changed since `gather`."""
+        self.possible = PossibleMotions(scale, terms.dt_s)
+        """All motions that may be flown, as of the last `update_possible`."""
         self._changed: set[int] = set()
-        """Rows to gather anew: their motions that may be flown have changed, or the distance kept
-        from these, or their place on the grid."""
+        """Rows of which the motions, the distance kept from these, or the place on the grid have
+        changed since then."""
         self.decided: set[int] = set()
         """Rows of the vehicles that have a motion to be sent at their newest step."""
         self.restarted: dict[int, int] = {}
@@ -141,30 +142,35 @@ class Roster:
         """Take note that a session is over; motions stay, for the vehicle goes on with them."""
         self.observed_step[row] = -1
         self.rows.heard[row] = False
-        if row in self.known:
+        if row in self.vehicles:
             # Another life of the vehicle counts steps of its own.
-            self.known[row].goal = None
+            self.vehicles[row].goal = None
 
     def restart(self, row: int) -> bool:
         """Take note that the client of a vehicle has begun anew; whether that is news."""
-        known = self.known.get(row)
-        if known is None or row in self.restarted:
+        vehicle = self.vehicles.get(row)
+        if vehicle is None or row in self.restarted:
             return False
         self.restarted[row] = self.now + self.ahead(row)
-        known.off_m = max(known.off_m, self._stopping_m(known))
+        vehicle.outside_m = max(vehicle.outside_m, self._stopping_m(vehicle))
         self._changed.add(row)
         return True
 
-    def brakes_m(self, known: Known) -> float:
+    def brakes_m(self, vehicle: VehicleMotions) -> float:
         """Distance that a vehicle without a motion, which brakes, still flies from where it was
         observed until it is at rest [m]; 0 of one with a motion.
         """
-        brakes = known.in_force is not None and known.in_force.step < 0
-        return self._stopping_m(known) if brakes else 0.0
+        brakes = vehicle.in_force is not None and vehicle.in_force.step < 0
+        return self._stopping_m(vehicle) if brakes else 0.0
 
     def ahead(self, row: int) -> int:
         """Steps by which a vehicle is ahead of the grid in common."""
         return int(self.rows.ahead[row])
+
+    def possible_motion(self, row: int, motion: Motion) -> PossibleMotion:
+        """A motion of a vehicle, by the steps in common."""
+        common = motion._replace(first=motion.first - self.ahead(row))
+        return PossibleMotion(common, self.lands(row), self.error(row))
 
     def lands(self, row: int) -> int:
         """First step in common at which a vehicle may begin to land, or NEVER."""
@@ -175,18 +181,18 @@ class Roster:
         """Error of the step that is counted for a vehicle."""
         return StepError(float(self.rows.early[row]), float(self.rows.late[row]))
 
-    def sent(self, row: int, step: int, motion: Motion) -> None:
+    def note_sent(self, row: int, step: int, motion: Motion) -> None:
         """Take note of a motion that is sent with the packet of a step."""
-        known = self.known[row]
-        known.sent.append(Sent(step, motion))
-        self._note(row, known)
+        vehicle = self.vehicles[row]
+        vehicle.sent.append(SentMotion(step, motion))
+        self._mark_changed(row, vehicle)
 
     def unknown(self) -> int | None:
         """Number of a vehicle that may fly where the server does not know; None if there is none.
 
         A server that begins anew has not heard it yet, or it flies a motion of the server before.
         """
-        unheard = self.absent.difference(self.rows.number[list(self.known)].tolist())
+        unheard = self.absent.difference(self.rows.number[list(self.vehicles)].tolist())
         if unheard:
             return min(unheard)
         return None if self.foreign is None else self.number_of(self.foreign)
@@ -200,50 +206,54 @@ class Roster:
         """Take an observation; False if it is not newer than the last.
 
         Args:
-            row: of the vehicle.
-            observation: it.
+            row: row of the vehicle.
+            observation: the observation.
         """
         if observation.step <= self.observed_step[row]:
             return False
         k = observation.step
         # One that was made before the client began anew says nothing of where it stands.
-        if k > self.restarted.get(row, k) + ANEW or not self.rows.heard[row]:
+        if k > self.restarted.get(row, k) + RESTART_STEPS or not self.rows.heard[row]:
             self.restarted.pop(row, None)
         self.observed_step[row] = k
         self.state[row] = observation.state
-        known = self.known.setdefault(row, Known())
+        vehicle = self.vehicles.setdefault(row, VehicleMotions())
         self.rows.number[row] = self.number_of(row)
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
-            known.in_force = Sent(-1, resting(k, self._place(row, observation.state[:, 0])))
+            vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
             # Nor is anything taken that was sent in an earlier session.
             if not observation.takes or not self.rows.heard[row]:
-                known.sent.clear()
-        elif known.in_force is None or known.in_force.step != observation.in_force:
-            found = next((each for each in known.sent if each.step == observation.in_force), None)
-            if found is None:  # of another server, or of a vehicle that was in this row before
+                vehicle.sent.clear()
+        elif vehicle.in_force is None or vehicle.in_force.step != observation.in_force:
+            taken = next((each for each in vehicle.sent if each.step == observation.in_force), None)
+            if taken is None:  # of another server, or of a vehicle that was in this row before
                 self.rows.unknown_until[row] = observation.in_force + LONGEST
-                found = Sent(observation.in_force, resting(k, observation.state[:, 0]))
-            known.in_force = found
+                taken = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
+            vehicle.in_force = taken
         if k <= self.rows.unknown_until[row]:
             self.foreign = row
-            known.in_force = Sent(known.in_force.step, resting(k, observation.state[:, 0]))
+            vehicle.in_force = SentMotion(
+                vehicle.in_force.step, resting(k, observation.state[:, 0])
+            )
         self._expect_landing(row, observation)
-        newest, motion = known.in_force
-        self._measure(row, known, motion.at(np.array([float(k)]), self._dt_s)[0][0])
-        while known.sent and (known.sent[0].step <= newest or known.sent[0].step + self._join < k):
-            gone = known.sent.popleft()
+        newest, motion = vehicle.in_force
+        self._measure(row, vehicle, motion.at(np.array([float(k)]), self._dt_s)[0][0])
+        while vehicle.sent and (
+            vehicle.sent[0].step <= newest or vehicle.sent[0].step + self._join < k
+        ):
+            gone = vehicle.sent.popleft()
             self.counts["horizons_lost"] += gone.step > newest
-            known.learn(gone.step == newest and k <= observation.since + 1)
+            vehicle.adapt_copies(gone.step == newest and k <= observation.since + 1)
         self.rows.heard[row] = True
-        self._note(row, known)
+        self._mark_changed(row, vehicle)
         return True
 
-    def _note(self, row: int, known: Known) -> None:
+    def _mark_changed(self, row: int, vehicle: VehicleMotions) -> None:
         """Mark a row whose motions that may be flown, or be sent again, have changed."""
         self._changed.add(row)
-        known.again = None
-        self.rows.sent_step[row], self.rows.repeats_for[row] = known.repeats
+        vehicle.repeat = None
+        self.rows.sent_step[row], self.rows.repeats_for[row] = vehicle.repeats
 
     def _expect_landing(self, row: int, observation: Observation) -> None:
         """Take note of the first step at which a vehicle may begin to land."""
@@ -259,25 +269,25 @@ class Roster:
             case _:
                 lands[row] = k + self._land_after
 
-    def _measure(self, row: int, known: Known, expected: Array) -> None:
+    def _measure(self, row: int, vehicle: VehicleMotions, expected: Array) -> None:
         """Take note of how far a vehicle may be from where its motion has it."""
         number, state = self.number_of(row), self.state[row]
-        assert known.in_force is not None
-        off_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
-        known.speed_mps = float(np.linalg.norm(state[:, 1]))
-        if known.in_force.step < 0:
-            off_m = max(off_m, self.brakes_m(known))
-        elif off_m <= 0.0:
+        assert vehicle.in_force is not None
+        outside_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
+        vehicle.speed_mps = float(np.linalg.norm(state[:, 1]))
+        if vehicle.in_force.step < 0:
+            outside_m = max(outside_m, self.brakes_m(vehicle))
+        elif outside_m <= 0.0:
             self.absent.discard(number)
         elif number not in self.absent:
             self.counts["left_tube"] += 1
-            if not known.off_m:
-                self.left.append((number, off_m))
-        known.off_m = 0.0 if number in self.absent else max(off_m, 0.0)
+            if not vehicle.outside_m:
+                self.left_tube.append((number, outside_m))
+        vehicle.outside_m = 0.0 if number in self.absent else max(outside_m, 0.0)
 
-    def _stopping_m(self, known: Known) -> float:
+    def _stopping_m(self, vehicle: VehicleMotions) -> float:
         """Distance in which a vehicle that brakes comes to rest [m]."""
-        return known.speed_mps * (self._tau_s + known.speed_mps / self._braking)
+        return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
         """Resting place of a vehicle without a motion: where it begins its mission, or is."""
@@ -287,33 +297,34 @@ class Roster:
         first = self.begins_at(number)
         return first if np.linalg.norm(first - observed) < self._tube_m else observed
 
-    def meet(self, rows: Indices, step: Indices) -> None:
+    def align(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
         n = len(rows)
         self.now = self._clock.tick_ns // self._dt_ns
-        moved, foreign = _meet(rows, step, self.now, self.rows, self.looks, self._found)
+        moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
         # Of all rows, for others keep apart from those that are silent too.
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         for row in self.restarted:
             self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
         if moved:
-            self._changed.update(rows[self._found[:n] != 0].tolist())
+            self._changed.update(rows[self._moved_by[:n] != 0].tolist())
         if self.decided:
             for row in self.decided.intersection(rows.tolist()):
-                self.known[row].next = None
+                self.vehicles[row].next = None
                 self._changed.add(row)
                 self.decided.remove(row)
         self.foreign = None if foreign < 0 else foreign
 
-    def gather(self) -> None:
-        """Bring all motions that may be flown side by side, those that are others since then."""
-        for row in self._changed & self.known.keys():
-            each = self.known[row]
-            # All that may be flown, also those whose acknowledgement is still under way.
-            self.flown.replace(row, each.motions(), self.ahead(row), self.lands(row), each.off_m)
+    def update_possible(self) -> None:
+        """Replace the possible motions of all vehicles of which these have changed."""
+        for row in self._changed & self.vehicles.keys():
+            each = self.vehicles[row]
+            # Also motions whose acknowledgement is still under way.
+            motions = [self.possible_motion(row, motion) for motion in each.motions()]
+            self.possible.replace(row, motions, each.outside_m)
         self._changed.clear()
-        self.flown.doubt(self.rows.early, self.rows.late)
+        self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
         """Goal of a vehicle at the present step [m]; shape (axes,)."""
@@ -321,28 +332,28 @@ class Roster:
         wanted = self._references(self.number_of(row))(np.array(k * self._dt_s))
         return np.ascontiguousarray(wanted[:, 0])  # kernels reckon with that
 
-    def rests(self, row: int) -> list[Array]:
+    def resting_places(self, row: int) -> list[Array]:
         """Resting places of all vehicles but one [m]."""
-        found = []
-        for other, each in self.known.items():
+        places = []
+        for other, each in self.vehicles.items():
             motions, now = each.motions(), self.now + self.rows.ahead[other]
             if other != row and motions and all(motion.last <= now for motion in motions):
-                found.append(motions[0].position[-1])
-        return found
+                places.append(motions[0].position[-1])
+        return places
 
 
 @kernel
-def _meet(
-    rows: I1, step: I1, now: int, vehicles: VehicleRows, looks: I1, found: I1
+def _align(
+    rows: I1, step: I1, now: int, vehicles: VehicleRows, due: I1, moved_by: I1
 ) -> tuple[int, int]:
     """Bring vehicles onto one grid, and find what is to be done for each.
 
     Args:
         rows, step: the vehicles, and the step of each; shape (n,).
         now: step on the grid.
-        vehicles: numbers of all rows.
-        looks: output: DECIDES, REPEATS, both or 0; shape (n,) at least.
-        found: output: change of the place on the grid [steps]; shape (n,) at least.
+        vehicles: see `MissionState.rows`.
+        due: output: PLAN_DUE, REPEAT_DUE, both or 0; shape (n,) at least.
+        moved_by: output: change of the place on the grid [steps]; shape (n,) at least.
 
     Returns:
         the number of vehicles whose place on the grid has changed, and the row of a vehicle that
@@ -351,14 +362,14 @@ def _meet(
     moved, foreign = 0, -1
     for i in range(len(rows)):
         row = rows[i]
-        found[i] = step[i] - now - vehicles.ahead[row]
-        moved += found[i] != 0
-        vehicles.ahead[row], vehicles.met[row] = step[i] - now, True
-        looks[i] = 0
+        moved_by[i] = step[i] - now - vehicles.ahead[row]
+        moved += moved_by[i] != 0
+        vehicles.ahead[row], vehicles.aligned[row] = step[i] - now, True
+        due[i] = 0
         if vehicles.heard[row] and (step[i] - vehicles.number[row]) % SPACING == 0:
-            looks[i] |= DECIDES
+            due[i] |= PLAN_DUE
         if repeats_after(step[i] - vehicles.sent_step[row], vehicles.repeats_for[row]):
-            looks[i] |= REPEATS
+            due[i] |= REPEAT_DUE
     for row in range(len(vehicles.heard)):
         if (
             foreign < 0

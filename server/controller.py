@@ -4,8 +4,8 @@
     (`planner`) → event? (`trigger`) → what is sent, remembered.
 
 With the schemes "predictive" and "none" d is 0; with "trajectory" nothing is planned, and
-`trajectory` stands in place of estimator and planner. Every vehicle is planned for at every step,
-for planning is a small part of what a step costs.
+`trajectory`, or on a mission `mission_planner`, stands in place of estimator and planner. Every
+vehicle is planned for at every step, for planning is a small part of what a step costs.
 """
 
 from collections import Counter
@@ -19,14 +19,13 @@ from skytether.server.control.budget import SharedBudget
 from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.control.committed import Replay
 from skytether.server.control.desired import Desired
-from skytether.server.control.moves import Figures
 from skytether.server.control.planner import Planner
 from skytether.server.control.predictive import Estimator
-from skytether.server.control.roster import Roster
-from skytether.server.control.scheme import DOUBTS, Foresight, Scheme, foresight
-from skytether.server.control.together import Together
+from skytether.server.control.scheme import DOUBTS, Figures, Foresight, Scheme, foresight
 from skytether.server.control.trajectory import Guidance
-from skytether.shared.base.kernel import B1, I1, kernel
+from skytether.server.missions.mission_planner import MissionPlanner
+from skytether.server.missions.mission_state import MissionState
+from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
@@ -43,22 +42,24 @@ BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
-_PACKAGE = __name__.rpartition(".")[0]
-_MISSION = ("apart", "clear", "direct", "dual", "knots", "motionplan", "roster")
 _SCHEMES = {
-    "predictive": ("predictive", "planner", "exact"),
-    "none": ("predictive", "planner", "exact"),
-    "committed": ("committed", "memory", "planner", "exact"),
-    "trajectory": ("trajectory", "knots", "exact"),
+    "predictive": ("control.predictive", "control.planner", "control.exact"),
+    "none": ("control.predictive", "control.planner", "control.exact"),
+    "committed": ("control.committed", "control.memory", "control.planner", "control.exact"),
+    "trajectory": ("control.trajectory", "control.knots", "control.exact"),
+    "mission": ("missions", "control.knots"),
 }
-"""Modules whose kernels plan by each scheme; the others' kernels are called with any of them."""
+"""Modules and packages whose kernels plan by each scheme, and for missions; the others' kernels are
+called with any of them."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
     """Names of the modules whose kernels are not called where a scenario is flown."""
-    own = _MISSION if scenario.is_mission else _SCHEMES[scenario.control.scheme]
-    names = {*_MISSION, *chain.from_iterable(_SCHEMES.values())} - {*own}
-    return {f"{_PACKAGE}.{name}" for name in names}
+    scheme = "mission" if scenario.is_mission else scenario.control.scheme
+    others = {*chain.from_iterable(_SCHEMES.values())}.difference(_SCHEMES[scheme])
+    server = __name__.rpartition(".")[0]
+    names = tuple(f"{server}.{each}." for each in others)
+    return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
 class Decisions(NamedTuple):
@@ -120,16 +121,16 @@ class Controller:
         self.desired = Desired(scenario, terms, room, block, references)
         """Desired trajectories as far as they are known."""
         self._scheme: Scheme
-        self.planner: Planner | Guidance | Together
+        self.planner: Planner | Guidance | MissionPlanner
         """Plans of every vehicle, or what is sent in place of a plan."""
-        self._together: Together | None = None
+        self._missions: MissionPlanner | None = None
         """Planner that keeps vehicles of a mission apart."""
         if scenario.is_mission and references is not None:
-            self._scheme = self.planner = self._together = Together(
+            self._scheme = self.planner = self._missions = MissionPlanner(
                 scenario,
                 terms,
                 block,
-                Roster(scenario, terms, room, block, references, self.desired.number, clock),
+                MissionState(scenario, terms, room, block, references, self.desired.number, clock),
             )
         elif terms.splines:
             self._scheme = self.planner = Guidance(
@@ -201,38 +202,38 @@ class Controller:
 
     def change_zones(self, zones: Zones) -> None:
         """Keep vehicles of a mission out of other zones from now on."""
-        if self._together:
-            self._together.change_zones(zones)
+        if self._missions:
+            self._missions.change_zones(zones)
 
     def objection(self, zones: Zones) -> str:
         """Why there cannot be these zones now, in words; empty: there can."""
-        return self._together.objection(zones) if self._together else ""
+        return self._missions.objection(zones) if self._missions else ""
 
     @property
     def inside(self) -> list[tuple[int, str]]:
         """Vehicles of a mission that were found at rest within a zone, and its name; to be
         emptied.
         """
-        return self._together.inside if self._together else []
+        return self._missions.inside if self._missions else []
 
     @property
-    def left(self) -> list[tuple[int, float]]:
+    def left_tube(self) -> list[tuple[int, float]]:
         """Vehicles of a mission that have left their tube, and by how much [m]; to be emptied."""
-        return self._together.left if self._together else []
+        return self._missions.left_tube if self._missions else []
 
     def waits(self, row: int) -> str:
         """Reason in words why a vehicle of a mission waits; empty if it does not."""
-        return self._together.waits(row) if self._together else ""
+        return self._missions.waits(row) if self._missions else ""
 
     def clock_m(self, row: int) -> float | None:
         """Distance by which a vehicle of a mission may be elsewhere for want of its clock [m]."""
-        return self._together.clock_m(row) if self._together else None
+        return self._missions.clock_m(row) if self._missions else None
 
     def restart(self, row: int) -> bool:
         """Take note that the client of a vehicle on a mission has begun anew; whether that is
         news.
         """
-        return self._together is not None and self._together.restart(row)
+        return self._missions is not None and self._missions.restart(row)
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""

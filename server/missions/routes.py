@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from skytether.server.control.clear import seen
+from skytether.server.missions.zone_clearance import are_clear
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.zones import Zones
 
@@ -28,11 +28,11 @@ class Routes:
 
     Args:
         zones: what is in the way.
-        room_m: distance that a way keeps from them [m].
+        clearance_m: distance that a way keeps from them [m].
     """
 
-    def __init__(self, zones: Zones, room_m: float) -> None:
-        self._zones, self._room_m = zones, room_m
+    def __init__(self, zones: Zones, clearance_m: float) -> None:
+        self._zones, self._clearance_m = zones, clearance_m
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
@@ -45,9 +45,9 @@ class Routes:
             shape (n, axes); n >= 1.
         """
         corners = self._graph(self._heights(place, goal)).corners(place[:2], goal[:2])
-        found = np.repeat(goal[None], len(corners) + 1, axis=0)
-        found[:-1, :2] = corners
-        return found
+        points = np.repeat(goal[None], len(corners) + 1, axis=0)
+        points[:-1, :2] = corners
+        return points
 
     def reaches(self, place: Array, goal: Array) -> bool:
         """Whether there is a way; shapes (axes,)."""
@@ -59,9 +59,9 @@ class Routes:
         if len(place) < 3:
             return (True,) * len(self._zones.zones)
         low, high = sorted((float(place[2]), float(goal[2])))
-        room_m = self._room_m
+        clearance_m = self._clearance_m
         return tuple(
-            zone.is_fence or (zone.low_m - room_m < high and low < zone.high_m + room_m)
+            zone.is_fence or (zone.low_m - clearance_m < high and low < zone.high_m + clearance_m)
             for zone in self._zones.zones
         )
 
@@ -70,7 +70,7 @@ class Routes:
         level = [
             zone._replace(low_m=-np.inf, high_m=np.inf) for zone, is_there in there if is_there
         ]
-        return Graph(Zones(level), self._room_m)
+        return Graph(Zones(level), self._clearance_m)
 
 
 class Graph:
@@ -78,14 +78,14 @@ class Graph:
 
     Args:
         zones: what is in the way, of any height.
-        room_m: distance that a way keeps from them [m].
+        clearance_m: distance that a way keeps from them [m].
     """
 
-    def __init__(self, zones: Zones, room_m: float) -> None:
-        self._zones, self._room_m = zones, room_m
-        self._nodes = _nodes(zones, room_m + OFF_M)
+    def __init__(self, zones: Zones, clearance_m: float) -> None:
+        self._zones, self._clearance_m = zones, clearance_m
+        self._nodes = _nodes(zones, clearance_m + OFF_M)
         if len(self._nodes):
-            clear = zones.clearance(self._nodes).min(axis=1) >= room_m
+            clear = zones.clearance(self._nodes).min(axis=1) >= clearance_m
             self._nodes = self._nodes[clear][:NODES_MAX]
         n = len(self._nodes)
         here, there = np.triu_indices(n, 1)
@@ -114,14 +114,14 @@ class Graph:
         via, at = np.unravel_index(int(long.argmin()), long.shape)
         if not np.isfinite(long[via, at]):
             return nodes[:0]
-        found = [int(via)]
-        while found[-1] != at:
-            found.append(int(self._after[found[-1], at]))
-        return nodes[found]
+        path = [int(via)]
+        while path[-1] != at:
+            path.append(int(self._after[path[-1], at]))
+        return nodes[path]
 
     def sees(self, here: Array, there: Array) -> Flags:
         """Whether straight lines keep their distance; shape (n,), of two of shape (n, 2)."""
-        return seen(self._zones, here, there, self._room_m - TINY_M)
+        return are_clear(self._zones, here, there, self._clearance_m - TINY_M)
 
     def _lengths(self, here: Array) -> Array:
         """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
@@ -132,7 +132,7 @@ class Graph:
 
 def _nodes(zones: Zones, off_m: float) -> Array:
     """Places off the corners of zones, outward on the line that halves each [m]; shape (n, 2)."""
-    found = [np.zeros((0, 2))]
+    points = [np.zeros((0, 2))]
     for zone in zones.zones:
         corners = zone.corners
         after, before = (
@@ -147,5 +147,5 @@ def _nodes(zones: Zones, off_m: float) -> Array:
         halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
         size[straight] = 1.0
         # Both ways: one of them is where vehicles may be.
-        found += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
-    return np.concatenate(found)
+        points += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
+    return np.concatenate(points)

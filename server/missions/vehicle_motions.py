@@ -1,16 +1,16 @@
 """Motions that one vehicle on a mission may fly, as far as the server knows.
 
-A motion that is not acknowledged is sent again, the very same one, while it may still be taken. One
-or its acknowledgement that is lost costs the time until an observation says so, in which nothing
-can be planned; so after such a loss the next ones are sent twice, and then three times.
+A motion that is not acknowledged is sent again, the very same one, while it may still be taken.
+When a motion or its acknowledgement is lost, nothing can be planned until an observation says so;
+after such a loss the next motions are therefore sent twice, and then three times.
 """
 
 import math
 from collections import deque
 from typing import NamedTuple
 
-from skytether.server.control.aside import Aside
-from skytether.server.control.routes import Routes
+from skytether.server.missions.routes import Routes
+from skytether.server.missions.yielding import Yielding
 from skytether.shared.base.kernel import shared
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Motion
@@ -19,17 +19,17 @@ COPIES_MAX = 3
 """Largest number of times that a motion is sent."""
 COPY_STEPS = 4
 """Steps from one time to the next."""
-PATIENCE = 120
-"""Steps without coming nearer to its goal after which a vehicle asks another to step aside."""
+PATIENCE_STEPS = 120
+"""Steps without coming nearer to its goal after which a vehicle asks another to yield."""
 CLOSED_MAX = 8
 """Largest number of places that are taken for closed."""
 NEARER_M = 0.3
 """Distance that counts as having come nearer [m]."""
-PROMPT = 8
+PROMPT_COUNT = 8
 """Number of motions in a row, each acknowledged at once, after which they are sent less often."""
 
 
-class Sent(NamedTuple):
+class SentMotion(NamedTuple):
     """A motion that was sent."""
 
     step: int
@@ -37,19 +37,19 @@ class Sent(NamedTuple):
     motion: Motion
 
 
-class Known:
-    """State of one vehicle as the server knows it."""
+class VehicleMotions:
+    """Motions of one vehicle, and what is decided on them."""
 
     def __init__(self) -> None:
-        self.in_force: Sent | None = None
+        self.in_force: SentMotion | None = None
         """Motion that it flies, with its packet's step; None before the first observation."""
-        self.sent: deque[Sent] = deque(maxlen=64)
+        self.sent: deque[SentMotion] = deque(maxlen=64)
         """Motions sent after that, oldest first, that may still be taken."""
         self.next: Motion | None = None
         """Motion to be sent at this step."""
-        self.turned = 0.0
-        """Angle by which it aims to the right of its goal [rad]."""
-        self.off_m = 0.0
+        self.turned_rad = 0.0
+        """Angle by which its waypoints are to the right of its goal [rad]."""
+        self.outside_m = 0.0
         """Distance by which it was outside its tube when it was last observed [m]."""
         self.speed_mps = 0.0
         """Speed when it was last observed [m/s]."""
@@ -58,70 +58,71 @@ class Known:
         self.detour_until = 0
         """Step up to which it takes them."""
         self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
-        """Places on ways to its goal between zones that leave too little room [m]."""
+        """Places on ways to its goal between zones that are too close for a motion [m]."""
         self.goal: Array | None = None
-        """Goal to which it flew last [m]; shape (axes,); None before the first, and where nothing
-        that was found out about ways to it holds any more."""
-        self.left_m = 0.0
+        """Goal to which it flew last [m]; shape (axes,); None before the first, and where what
+        was learnt about ways to it no longer holds."""
+        self.remaining_m = 0.0
         """Shortest way that was ever left to that [m]."""
-        self.nearer_at = 0
-        """Step at which it was that near first, or asked another to step aside last."""
-        self.barred = False
+        self.progress_step = 0
+        """Step at which it came that near, or asked another to yield last."""
+        self.zone_blocks = False
         """Whether a zone has held it back since it was found stuck last."""
-        self.aside: Aside | None = None
-        """Place it has stepped aside to; None if it flies to its own goal."""
+        self.yielding: Yielding | None = None
+        """Place to which it yields; None if it flies to its own goal."""
         self.in_zone = False
         """Whether it rests within a zone, or too near to one."""
-        self.waits = ""
+        self.waits_for = ""
         """Reason why it waits, in words for the operator; empty if it does not."""
 
         self.copies = 1
         """Largest number of times that a motion is sent to it."""
-        self.prompt = 0
-        """Number of motions in a row that it has acknowledged at once."""
-        self.again: Sent | None = None
+        self.prompt_count = 0
+        """Number of motions in a row that it acknowledged at once."""
+        self.repeat: SentMotion | None = None
         """Motion that is sent once more at this step."""
 
     def motions(self) -> list[Motion]:
         """Motions that may be flown, the one to be sent at this step included."""
-        flown = [self.in_force.motion] if self.in_force else []
-        flown += [each.motion for each in self.sent]
+        motions = [self.in_force.motion] if self.in_force else []
+        motions += [each.motion for each in self.sent]
         if self.next and not (self.in_force and self.next is self.in_force.motion):
-            flown.append(self.next)
-        return flown
+            motions.append(self.next)
+        return motions
 
-    def learn(self, prompt: bool) -> None:
+    def adapt_copies(self, prompt: bool) -> None:
         """Send motions more often where one, or its acknowledgement, was lost; less often later.
 
         Args:
             prompt: whether a motion was acknowledged at once.
         """
-        self.prompt = self.prompt + 1 if prompt else 0
+        self.prompt_count = self.prompt_count + 1 if prompt else 0
         if not prompt:
             self.copies = min(self.copies + 1, COPIES_MAX)
-        elif self.prompt % PROMPT == 0:
+        elif self.prompt_count % PROMPT_COUNT == 0:
             self.copies = max(self.copies - 1, 1)
 
-    def is_stuck(self, step: int, goal: Array, left_m: float) -> bool:
-        """Whether it has come no nearer to its goal for PATIENCE steps; said once in that time.
+    def is_stuck(self, step: int, goal: Array, remaining_m: float) -> bool:
+        """Whether it has come no nearer to its goal for PATIENCE_STEPS; said once in
+        that time.
 
         Args:
             step: k, of its own.
             goal: where it flies to [m]; shape (axes,).
-            left_m: length of the way that is left [m].
+            remaining_m: length of the way that is left [m].
         """
         if self.goal is None or (goal != self.goal).any():
             self.detour = None
             self.closed.clear()
-            self.left_m = math.inf
-        if left_m < self.left_m - NEARER_M:
-            self.goal, self.left_m, self.nearer_at = goal, left_m, step
-        elif step - self.nearer_at >= PATIENCE:
-            self.nearer_at = step
+            self.remaining_m = math.inf
+        if remaining_m < self.remaining_m - NEARER_M:
+            self.goal, self.remaining_m, self.progress_step = goal, remaining_m, step
+        elif step - self.progress_step >= PATIENCE_STEPS:
+            self.progress_step = step
             return True
         return False
 
-    def owed(self, step: int) -> Sent | None:
+    def repeat_at(self, step: int) -> SentMotion | None:
         """Motion that is to be sent once more at a step; None where there is none."""
         sent_step, repeats_for = self.repeats
         return self.sent[-1] if repeats_after(step - sent_step, repeats_for) else None
@@ -142,6 +143,6 @@ def repeats_after(since: int, repeats_for: int) -> bool:
 
     Args:
         since: steps since it was sent first.
-        repeats_for: steps after that up to which it is, see `Known.repeats`.
+        repeats_for: steps after that up to which it is, see `VehicleMotions.repeats`.
     """
     return 0 < since <= repeats_for and since % COPY_STEPS == 0

@@ -1,0 +1,133 @@
+"""Motions as kernels see them: where one is at a step, and bounds of how it goes on.
+
+Distances along the third axis may count less than those in the plane: all are of coordinates that
+are multiplied by `Metric.scale` first. So a sphere of that metric is an ellipsoid, higher than it
+is wide, as downwash asks for.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.shared.base.kernel import F1, F2, kernel, part
+from skytether.shared.law.model import ALTITUDE, Array
+from skytether.shared.law.motion import SAMPLES, SPACING, Motion
+
+
+class Metric(NamedTuple):
+    """Measure of distances and times."""
+
+    scale: F1
+    """Factor of each coordinate before distances are taken; shape (axes,)."""
+    dt_s: float
+    """Length of a step [s]."""
+
+
+class Extent(NamedTuple):
+    """Bounds of how a motion goes on."""
+
+    speed: float
+    """Largest speed, scaled [m/s]."""
+    bend: float
+    """Largest distance from its straight pieces, SAMPLES an interval, scaled [m]."""
+
+
+def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
+    """Positions [m] and velocities [m/s] of a motion at steps SPACING apart; see `Motion.at`.
+
+    Args:
+        motion: any.
+        begin: the first step.
+        count: number of steps.
+        dt_s: length of a step [s].
+
+    Returns:
+        two arrays of shape (count, axes).
+    """
+    position, velocity = np.empty((2, count, motion.position.shape[1]))
+    _states(motion, begin, dt_s, position, velocity)
+    return position, velocity
+
+
+def pieces_of(begin: int, end: int) -> Array:
+    """Steps between which motions are taken for straight, until they rest; shape (n,)."""
+    count = max(-(-(end - begin) * SAMPLES // SPACING), 1)
+    return np.linspace(begin, begin + count * SPACING / SAMPLES, count + 1)
+
+
+@kernel
+def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2) -> None:
+    """Fill in `states`."""
+    for i in range(len(position)):
+        for x in range(position.shape[1]):
+            step = float(begin + i * SPACING)
+            position[i, x], velocity[i, x] = state_at(motion, x, step, dt_s)
+
+
+@part
+def state_at(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
+    """Position and velocity of a motion on an axis at a step; see `Motion.at`."""
+    position, velocity = motion.position, motion.velocity
+    along = (step - motion.first) / SPACING
+    if along <= 0.0:
+        return position[0, axis], velocity[0, axis]
+    if along >= len(position) - 1:
+        return position[-1, axis], velocity[-1, axis]
+    knot = int(along)
+    T = SPACING * dt_s
+    t = (along - knot) * T
+    v = velocity[knot, axis]
+    gained = t / T * (velocity[knot + 1, axis] - v)
+    return position[knot, axis] + t * (v + 0.5 * gained), v + gained
+
+
+@part
+def position_at(motion: Motion, axis: int, step: float, dt_s: float) -> float:
+    """Position of a motion on an axis at a step."""
+    return state_at(motion, axis, step, dt_s)[0]
+
+
+@part
+def last_step(motion: Motion) -> int:
+    """Step at which a motion has come to rest, see `Motion.last`."""
+    return motion.first + (len(motion.position) - 1) * SPACING
+
+
+@part
+def bounding_box(motion: Motion, lands: bool, metric: Metric, low: F1, high: F1) -> None:
+    """Fill in two corners of a box around a motion, and the landing behind it, scaled [m].
+
+    Args:
+        lands: whether its vehicle may ever land.
+        low, high: output; shape (axes,).
+    """
+    position, velocity, scale = motion.position, motion.velocity, metric.scale
+    for x in range(len(scale)):
+        low[x], high[x], turn = np.inf, -np.inf, 0.0
+        for knot in range(len(position)):
+            low[x] = min(low[x], position[knot, x])
+            high[x] = max(high[x], position[knot, x])
+            if knot:
+                turn = max(turn, abs(velocity[knot, x] - velocity[knot - 1, x]))
+        # Between two knots, T apart, a parabola is off the straight line by Δv T / 8 at most.
+        bend = turn * SPACING * metric.dt_s / 8.0
+        low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
+        if x == ALTITUDE and lands:
+            low[x] = min(low[x], 0.0)
+
+
+@part
+def extent_of(motion: Motion, metric: Metric) -> Extent:
+    """Bounds of how a motion goes on."""
+    fastest, turn, scale = 0.0, 0.0, metric.scale
+    for knot in range(len(motion.velocity)):
+        speed, change = 0.0, 0.0
+        for x in range(len(scale)):
+            v = scale[x] * motion.velocity[knot, x]
+            speed += v * v
+            if knot:
+                change += (v - scale[x] * motion.velocity[knot - 1, x]) ** 2
+        fastest, turn = max(fastest, speed), max(turn, change)
+    # Over a piece of the time t a parabola is off the straight line by a t² / 8 at most.
+    piece = SPACING / SAMPLES * metric.dt_s
+    return Extent(np.sqrt(fastest), np.sqrt(turn) / (SPACING * metric.dt_s) * piece * piece / 8.0)

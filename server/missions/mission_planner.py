@@ -1,0 +1,551 @@
+"""Motions that keep vehicles apart, and out of zones, whichever packets are lost.
+
+A motion is where a vehicle is at every time: a spline that ends at rest, and rest from there on. It
+is sent as a trajectory whose knots are all of it, so a vehicle that hears nothing more flies it to
+its end and hovers there. For each vehicle the server keeps every motion that may be flown:
+
+- the one in force at its newest observation, which acknowledges it; and
+- each that was sent since, as long as a packet may still be taken. Aboard a trajectory is taken no
+  later than `link.join_s` after its first knot, so an observation made later says for certain
+  whether it was.
+
+A new motion is sent only if at every time it keeps the distance
+
+    D = separation_m + 2 tube_m
+
+from all that all other vehicles may fly, wherever on these motions they may be by what is known of
+their clocks, with `tube_m` for how far a vehicle is from its motion (wind, tracking); from one that
+was seen outside its tube, as much more as it was. Those were apart already. So whichever of them
+are taken, and whichever packets are lost or late, vehicles are `separation_m` apart, as long as
+each stays in its tube (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion
+in force is always a way out: it needs no packet.
+
+`mission_state` has what may be flown, `trajectory_qp` the QP, `separation` and `half_planes` the
+distances, `routes` the ways around zones, `waypoints` what a vehicle flies towards, and `yielding`
+who yields to whom.
+"""
+
+import math
+from functools import partial
+from operator import sub
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.control.scheme import FIGURES, Figures, Foresight
+from skytether.server.missions import yielding
+from skytether.server.missions.compiled_motion import pieces_of, states
+from skytether.server.missions.half_planes import HalfPlanes, half_planes
+from skytether.server.missions.mission_state import PLAN_DUE, REPEAT_DUE, MissionState
+from skytether.server.missions.separation import too_near
+from skytether.server.missions.trajectory_qp import TrajectoryQP
+from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
+from skytether.server.missions.vehicle_motions import VehicleMotions
+from skytether.server.missions.waypoints import DETOUR_S, TURN_BACK, Waypoints
+from skytether.server.missions.yielding import YIELD_S, Yielding
+from skytether.server.missions.zone_clearance import comes_near
+from skytether.shared.base.chance import stream
+from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
+from skytether.shared.law.motion import SPACING, Motion
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.wire.protocol import KNOTS_MAX, Observation
+
+RESTS_MPS = 0.2
+"""Measured speed up to which a vehicle rests [m/s]."""
+ARRIVED_M = 0.02
+"""Distance from the goal at which a motion ends there [m]."""
+ROUNDS = 5
+"""Number of times that constraints are added for a waypoint."""
+STUCK = 0.3
+"""Share of the way to a waypoint, 2 m at most, below which a plan is taken for stuck."""
+TURN = 2.0 * np.pi * np.arange(32) / 32
+AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
+"""Directions in which a vehicle that rests within a zone looks for a way out."""
+OUT_M, OUT_STEPS = 0.1, 500
+"""Distance from one place that is looked at to the next [m], and number of these."""
+NEARER_M = 1e-3
+"""Distance by which a vehicle may come nearer to the zone that it leaves [m]."""
+ZONE = "a zone"
+"""Reason why a vehicle waits: a zone holds it back."""
+CLOCK_POINTS = 33
+"""Number of steps, of those that a vehicle may be at, that `clock_m` looks at."""
+BINDS_M = 1e-4
+"""Distance from a half-plane up to which it holds a motion back [m]."""
+
+SILENT = np.zeros((), dtype=FIGURES)
+"""Figures of a vehicle to which nothing is sent."""
+SILENT["gap"], SILENT["solved"] = 1, True
+
+
+class DirectFlight(NamedTuple):
+    """Vehicle that may fly straight to its goal."""
+
+    row: int
+    vehicle: VehicleMotions
+    k: int
+    """Present step of the vehicle."""
+    goal: Array
+    """Shape (axes,) [m]."""
+
+
+class MissionPlanner:
+    """The scheme "trajectory" for missions: motions that keep apart.
+
+    Args:
+        scenario: what is asked for, as `mission` says it, and the seed of directions.
+        terms: the rule of flight.
+        block: number of vehicles that are decided on at a time.
+        state: vehicles, and the motions that each may fly.
+    """
+
+    solve_ns = -1
+
+    def __init__(self, scenario: Scenario, terms: Terms, block: int, state: MissionState) -> None:
+        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        self.planned = np.zeros((block, terms.axes, 2))
+        self._state = state
+        self.counts, self.left_tube = state.counts, state.left_tube
+        self.inside: list[tuple[int, str]] = []
+        """Vehicles that were found at rest within a zone since this was emptied, and its name."""
+        self.observed_step = state.observed_step
+        mission = scenario.mission
+        clearances = self._clearances = scenario.clearances
+        self._dt_s = terms.dt_s
+        self._kept_steps = -(-terms.join // SPACING) * SPACING
+        """Steps after the first knot from which on a motion differs from the one in force."""
+        self._resend_after = terms.age_max // 3
+        """Steps after which a motion is sent again, before it is too old to be flown."""
+        self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
+        self._zones, self._lands = scenario.zones, scenario.lands
+        self._waypoints = Waypoints(
+            self._zones,
+            clearances.tube_m,
+            clearances.planned_apart_m,
+            round(DETOUR_S / terms.dt_s),
+            stream(scenario.seed, "together"),
+        )
+        self._repeating: list[VehicleMotions] = []
+        """Vehicles that are sent a motion once more at this step."""
+        kept = self._kept_steps // SPACING + 1
+        self._scale = state.possible.metric.scale.copy()
+        self._scale[ALTITUDE:] = scenario.rest_scale
+        """Factors of the coordinates before distances of vehicles at rest are taken; shape
+        (axes,)."""
+        self._unconstrained = UnconstrainedPlanner(
+            self._qp, state.possible, kept, clearances.apart_m, STUCK
+        )
+
+    def forget(self, row: int) -> None:
+        """See `Scheme`."""
+        self._state.forget(row)
+
+    def restart(self, row: int) -> bool:
+        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        return self._state.restart(row)
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """See `Scheme`."""
+        return self._state.observe(row, observation)
+
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """See `Scheme`: what was observed, as it is."""
+        n = len(rows)
+        found.estimate[:n] = found.start[:n] = self._state.state[rows]
+
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """Plan for vehicles every SPACING steps, not all at the same."""
+        figures, n = self.figures, len(rows)
+        self._state.align(rows, step)
+        figures[:n] = SILENT
+        figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
+        # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+        # before it.
+        for each in self._repeating:
+            each.repeat = None
+        self._repeating.clear()
+        direct: list[DirectFlight] = []
+        looked_at = self._state.due[:n].nonzero()[0].tolist()
+        for i in looked_at:
+            row, k = int(rows[i]), int(step[i])
+            vehicle = self._state.vehicles[row]
+            if self._state.due[i] & REPEAT_DUE:
+                vehicle.repeat = vehicle.repeat_at(k)
+                self._repeating.append(vehicle)
+            if self._state.due[i] & PLAN_DUE and self._may_plan(row, vehicle, k):
+                self._plan_to_goal(row, vehicle, k, direct)
+        self._plan_direct(direct)
+        for i in looked_at:
+            vehicle = self._state.vehicles[int(rows[i])]
+            # A figure above any threshold: a motion that was found has to be sent.
+            if vehicle.next or vehicle.repeat:
+                figures["expected_gap"][i] = 1e9
+            if vehicle.next:
+                self._state.decided.add(int(rows[i]))
+        self.planned[:n] = self._state.state[rows]
+
+    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+        """See `Scheme`; the knots of what is sent."""
+        for i in event.nonzero()[0].tolist():
+            vehicle, k = self._state.vehicles[int(rows[i])], int(step[i])
+            if vehicle.repeat:
+                k, motion = vehicle.repeat
+            elif vehicle.next:
+                motion = vehicle.next
+            else:
+                assert vehicle.in_force is not None
+                motion = vehicle.in_force.motion
+            count = min(max((motion.last - k) // SPACING, 0) + 1, KNOTS_MAX)
+            p, v = motion.at(k + SPACING * np.arange(count, dtype=np.float64), self._dt_s)
+            knots = np.stack([p, v], axis=-1).transpose(1, 0, 2).reshape(p.shape[1], -1)
+            found.told.knots[i, :, : 2 * count] = knots
+            found.told.number[i], found.told.spacing[i] = count, SPACING
+            found.told.back[i] = int(step[i]) - k
+            if not vehicle.repeat:
+                self._state.note_sent(int(rows[i]), k, motion)
+
+    # -- zones -------------------------------------------------------------------------------------
+
+    def change_zones(self, zones: Zones) -> None:
+        """Keep out of other zones from now on, to which `objection` has nothing to say."""
+        self._zones = zones
+        self._waypoints.change_zones(zones)
+        for vehicle in self._state.vehicles.values():
+            vehicle.goal = None  # what was learnt about ways to it no longer holds
+
+    def objection(self, zones: Zones) -> str:
+        """Why there cannot be these zones: where a vehicle may fly into one, or is not known to
+        keep out; empty: there can.
+        """
+        if zones and (number := self._state.unknown()) is not None:
+            return f"zones before it is known where vehicle {number} is"
+        for row, vehicle in self._state.vehicles.items():
+            clearance_m = (
+                self._clearances.tube_m + self._clearances.bend_m + self._state.brakes_m(vehicle)
+            )
+            for motion in vehicle.motions():
+                # The earliest step that the vehicle may be at.
+                k = self._state.now + self._state.ahead(row)
+                k -= max(math.ceil(self._state.error(row).late), 0)
+                points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
+                if comes_near(zones, points, clearance_m):
+                    zone = zones.in_the_way(points, clearance_m)
+                    left_s = max(motion.last - k, 0) * self._dt_s
+                    hovers = "hovers in or above" if self._lands else "hovers in"
+                    does = f"may fly into for {left_s:.1f} s more" if left_s else hovers
+                    number = self._state.number_of(row)
+                    return f"{zone}, which vehicle {number} {does}, tube included"
+        return ""
+
+    def waits(self, row: int) -> str:
+        """Reason why a vehicle waits; empty if it does not."""
+        return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
+
+    def clock_m(self, row: int) -> float | None:
+        """Distance by which a vehicle may now be elsewhere on its motion than where its step is
+        counted [m]; None of none.
+
+        Others keep as much further away from it, along its way.
+        """
+        vehicle, error = self._state.vehicles.get(row), self._state.error(row)
+        if vehicle is None or vehicle.in_force is None:
+            return None
+        motion, k = vehicle.in_force.motion, self._state.now + self._state.ahead(row)
+        steps = np.linspace(k - error.late, k + error.early, CLOCK_POINTS)
+        steps = np.append(steps, float(k))
+        position, _ = motion.at(steps.clip(motion.first, motion.last), self._dt_s)
+        return float(np.linalg.norm(position - position[-1], axis=1).max())
+
+    # -- what is decided ---------------------------------------------------------------------------
+
+    def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
+        """Whether another motion may be planned for a vehicle at its step k; sets what it waits
+        for, or the motion in force to be sent again, if not.
+        """
+        in_force = vehicle.in_force
+        assert in_force is not None
+        vehicle.waits_for = self._awaited_of_itself(row, vehicle)
+        if vehicle.waits_for:
+            return False
+        # A vehicle without a motion is first of all sent the place where it hovers. Another one's
+        # motion would end aboard, and the vehicle drift.
+        if in_force.step < 0 or k - in_force.step > self._resend_after:
+            vehicle.next = in_force.motion
+            return False
+        vehicle.waits_for = self._awaited_of_others()
+        return not vehicle.waits_for
+
+    def _awaited_of_itself(self, row: int, vehicle: VehicleMotions) -> str:
+        """What a vehicle waits for until something is sent to it, in words; empty: nothing."""
+        if row in self._state.restarted:
+            return "its client, which has begun anew"
+        if vehicle.sent:
+            return "an acknowledgement"  # until then it is not known which motion it flies
+        has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0
+        return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
+
+    def _awaited_of_others(self) -> str:
+        """What all vehicles wait for until motions are planned, in words; empty: nothing."""
+        if self._state.absent:
+            return f"vehicle {min(self._state.absent)} to begin"
+        if self._state.foreign is not None:
+            number = self._state.number_of(self._state.foreign)
+            return f"vehicle {number}, of another server's motion"
+        return ""
+
+    def _plan_to_goal(
+        self, row: int, vehicle: VehicleMotions, k: int, direct: list[DirectFlight]
+    ) -> None:
+        """Find a motion to a vehicle's goal, or to the place where it yields.
+
+        Args:
+            row, vehicle: row and motions of the vehicle.
+            k: its step.
+            direct: takes the vehicles that may fly straight, to be planned for in one call.
+        """
+        assert vehicle.in_force is not None
+        home = self._state.goal(row)
+        yields = vehicle.yielding
+        if yields and (self._state.now > yields.until or not self._has_to_pass(yields, home)):
+            vehicle.yielding = None
+        goal = vehicle.yielding.place if vehicle.yielding else home
+        place = vehicle.in_force.motion.position[-1]
+        if (out := self._way_out(row, vehicle, place)) is not None:
+            self._state.update_possible()
+            self._plan_motion(row, vehicle, k, out)
+            return
+        if max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M:
+            vehicle.turned_rad = 0.0
+            if vehicle.yielding:
+                asker = self._state.number_of(vehicle.yielding.asker)
+                vehicle.waits_for = f"vehicle {asker} to pass"
+            return
+        self._state.update_possible()
+        way = self._way(row, goal) if self._zones else np.array([place, goal])
+        is_stuck = vehicle.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:])))
+        is_on_detour = vehicle.detour and k < vehicle.detour_until
+        roams = vehicle.turned_rad or vehicle.yielding or is_on_detour
+        if not (is_stuck or roams or self._zones):
+            direct.append(DirectFlight(row, vehicle, k, goal))
+            return
+        # A plan reckons with all that were decided before it.
+        self._plan_direct(direct)
+        asked = is_stuck and self._ask_to_yield(row, way)
+        self._plan_motion(row, vehicle, k, goal)
+        if is_stuck:
+            is_blocked = vehicle.zone_blocks and not asked
+            if is_blocked and self._waypoints.close_way(vehicle, k, place, goal):
+                self.counts["closed"] += 1
+            vehicle.zone_blocks = False
+
+    def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
+        """Nearest place clear of zones, for a vehicle that rests within one [m]; None of one that
+        is clear.
+
+        No motion leads there: it was there when the server began, which knew of no zone before.
+        """
+        clearance_m = self._clearances.tube_m
+        if not self._zones or self._zones.clearance(place[None]).min() >= clearance_m:
+            vehicle.in_zone = False
+            return None
+        if not vehicle.in_zone:
+            vehicle.in_zone = True
+            zone = self._zones.in_the_way(place[None], clearance_m)
+            self.inside.append((self._state.number_of(row), zone))
+        around = np.zeros((len(AROUND), len(place)))
+        around[:, :2] = AROUND
+        for far_m in np.arange(1, OUT_STEPS) * OUT_M:
+            places: Array = place + far_m * around
+            clear_m = self._zones.clearance(places).min(axis=1)
+            best = int(clear_m.argmax())
+            if clear_m[best] >= self._clearances.planned_clear_m:
+                there: Array = places[best]
+                return there
+        return None
+
+    def _plan_direct(self, direct: list[DirectFlight]) -> None:
+        """Find motions of vehicles that may fly straight, one after the other; none are left."""
+        while direct:
+            rows, steps = np.array([(each.row, each.k) for each in direct]).T.copy()
+            goals = np.array([each.goal for each in direct])
+            motions = self._unconstrained.motions(rows, steps, self._state.rows.ahead[rows], goals)
+            for (_, vehicle, _, _), motion in zip(direct, motions, strict=False):
+                vehicle.next, vehicle.waits_for = motion, ""
+            del direct[: len(motions)]
+            if direct:  # the first that is left cannot fly straight
+                self._plan_motion(*direct.pop(0))
+
+    def _plan_motion(self, row: int, vehicle: VehicleMotions, k: int, goal: Array) -> None:
+        """Find a motion towards a goal, around others that are in the way."""
+        vehicle.next = self._motion_toward(row, vehicle, k, goal)
+        if vehicle.next is None:
+            self.counts["stuck"] += 1
+        else:
+            planned = self._state.possible_motion(row, vehicle.next)
+            self._state.possible.add(row, planned, vehicle.outside_m)
+
+    def _way(self, row: int, goal: Array) -> Array:
+        """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
+        in_force = self._state.vehicles[row].in_force
+        assert in_force is not None
+        place = in_force.motion.position[-1]
+        return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
+
+    def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
+        """Whether a vehicle has yet to pass the home of one that yields to it."""
+        way = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
+        (away_m,) = yielding.distance_from_way(home[None] * self._scale, way)
+        return bool(away_m < self._clearances.planned_apart_m)
+
+    def _ask_to_yield(self, row: int, way: Array) -> bool:
+        """Ask the first vehicle that rests at its goal in another vehicle's way to yield;
+        whether it does.
+        """
+        keep_m = self._clearances.planned_apart_m
+        ends, homes = list[tuple[int, Array]](), list[int]()
+        for other, each in self._state.vehicles.items():
+            if other == row or each.in_force is None or not self._state.rows.aligned[other]:
+                continue
+            motions = each.motions()
+            ends += [(other, motion.position[-1]) for motion in motions]
+            rests = each.in_force.step >= 0 and len(motions) == 1 and each.yielding is None
+            left_m = motions[0].position[-1] - self._state.goal(other)
+            if rests and np.abs(left_m).max() < ARRIVED_M:
+                homes.append(other)
+        places = np.array([self._state.goal(other) for other in homes]).reshape(-1, way.shape[1])
+        first = yielding.first_on(way * self._scale, places * self._scale, keep_m)
+        if first is None:
+            return False
+        asked, others = homes[first], [end for other, end in ends if other != homes[first]]
+        free = yielding.place_to_yield(
+            places[first],
+            way,
+            np.array([way[0], *others]),
+            keep_m,
+            self._scale,
+            self._zones,
+            self._waypoints.routes,
+            self._clearances.planned_clear_m,
+        )
+        if free is not None:
+            self.counts["asides"] += 1
+            until = self._state.now + round(YIELD_S / self._dt_s)
+            self._state.vehicles[asked].yielding = Yielding(free, row, until)
+        return free is not None
+
+    def _motion_toward(
+        self, row: int, vehicle: VehicleMotions, k: int, goal: Array
+    ) -> Motion | None:
+        """A motion from the one in force towards a goal, apart from all; None where none is found.
+
+        Only those constraints are added that a solution without them has violated: mostly
+        nothing is near, and the way is straight.
+        """
+        assert vehicle.in_force is not None
+        qp, base = self._qp, vehicle.in_force.motion
+        due = k + self._kept_steps
+        kept = states(base, k, self._kept_steps // SPACING + 1, self._dt_s)
+        p0 = kept[0][-1]
+        planes, violated = None, np.zeros(self._state.possible.count + 1, dtype=np.bool_)
+        rests = partial(self._state.resting_places, row)
+        for waypoint in self._waypoints.candidates(vehicle, k, p0, goal, rests):
+            for _ in range(ROUNDS):
+                constraints = planes.from_some(violated) if planes else None
+                solved = qp.solve(*kept, waypoint, constraints)
+                if solved is None:
+                    self.counts["unsolved"] += 1
+                    return None
+                motion = Motion(k, *solved)
+                conflicts = self._conflicts(row, motion, k)
+                if not (conflicts & ~violated).any():
+                    break
+                violated |= conflicts
+                planes = planes or self._half_planes(row, base, due)
+            # A plan that hardly moves is taken for stuck, and another waypoint is tried.
+            moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(waypoint, p0)
+            if moved_m >= STUCK * min(far_m, 2.0) and not conflicts.any():
+                vehicle.waits_for, vehicle.turned_rad = "", max(0.0, vehicle.turned_rad - TURN_BACK)
+                return motion
+            if constraints:
+                vehicle.waits_for = vehicle.waits_for or self._blocker(solved, constraints)
+                vehicle.zone_blocks |= vehicle.waits_for == ZONE
+            self.counts["refused"] += bool(conflicts.any())
+        return None
+
+    def _half_planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
+        """Half-planes of the others' motions, and behind them those of zones."""
+        qp, ahead = self._qp, self._state.rows.ahead[row]
+        times = due + qp.times * SPACING
+        in_force, _ = base.at(times, self._dt_s)
+        planes = half_planes(
+            times - ahead,
+            in_force,
+            qp.reach_m,
+            row,
+            self._state.lands(row),
+            self._state.possible,
+            self._clearances.planned_apart_m + self._state.vehicles[row].outside_m,
+            self._state.error(row),
+        )
+        if not self._zones:
+            return planes
+        near = self._zones.planes(in_force, qp.reach_m + self._clearances.planned_clear_m)
+        # A vehicle that is nearer to a zone already need only come no nearer.
+        bound = np.minimum(self._clearances.planned_clear_m, near.away_m - 1e-4)
+        bound += np.einsum("ij,ij->i", near.normal, near.border)
+        return HalfPlanes(
+            np.concatenate([planes.time, near.at]),
+            np.concatenate([planes.normal, near.normal]),
+            np.concatenate([planes.bound, bound]),
+            np.concatenate([planes.other, np.full(len(near.at), self._state.possible.count)]),
+        )
+
+    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
+        """Constraint that holds a motion back most, in words."""
+        position = self._qp.at_times(*solved)
+        spare_m = np.einsum("ij,ij->i", planes.normal, position[planes.time]) - planes.bound
+        binding = planes.other[spare_m < BINDS_M]
+        if not len(binding):
+            return ""
+        index, often = np.unique(binding, return_counts=True)
+        most = int(index[often.argmax()])
+        if most == self._state.possible.count:
+            return ZONE
+        return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
+
+    def _conflicts(self, row: int, motion: Motion, k: int) -> Flags:
+        """Which motions of others one comes too near to, ever, and last whether it does a zone."""
+        vehicle = self._state.vehicles[row]
+        assert vehicle.in_force is not None
+        ahead, in_force = self._state.ahead(row), vehicle.in_force.motion
+        conflicts = too_near(
+            self._state.possible_motion(row, motion),
+            in_force._replace(first=in_force.first - ahead),
+            k - ahead,
+            row,
+            self._state.possible,
+            self._clearances.apart_m + vehicle.outside_m,
+        )
+        if self._zones:
+            points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
+            conflicts[-1] = self._enters_zone(points)
+        return conflicts
+
+    def _enters_zone(self, points: Array) -> bool:
+        """Whether a way through points comes too near to a zone; from one that it begins in, or is
+        too near to already, it may only come out.
+        """
+        clearance_m = self._clearances.tube_m + self._clearances.bend_m
+        if not comes_near(self._zones, points, clearance_m):
+            return False
+        away_m = self._zones.clearance(points)
+        is_clear = away_m[0] >= clearance_m
+        if is_clear.all():
+            return True
+        others = [zone for zone, clear in zip(self._zones.zones, is_clear, strict=True) if clear]
+        if others and comes_near(Zones(others), points, clearance_m):
+            return True
+        left_m = away_m[:, ~is_clear]
+        so_far = np.minimum(np.maximum.accumulate(left_m, axis=0), clearance_m)
+        return bool((left_m < so_far - NEARER_M).any())

@@ -1,0 +1,221 @@
+"""Motions that vehicles may be flying, side by side, with what is uncertain of each.
+
+Where each vehicle is on its motion the server knows to within the error of the step that it counts
+(`clock.StepError`). Between two vehicles only the sum of both counts, and it is that of one number:
+by how many steps the other one is further on its motion, or less far, than the server counts. So
+one of the two is taken at a step, and the other anywhere between two steps: a swept piece of its
+way, which is longer the faster it flies, and a point where it rests.
+
+In space a vehicle that hears nothing lands after a while. From the first step at which it may, it
+may be anywhere between its motion, which is at rest by then, and the ground. So in the end any two
+motions have to be apart side by side.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.control.clock import EXACT, StepError
+from skytether.server.missions.compiled_motion import Metric, bounding_box, last_step
+from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, making_kernel, making_part, part
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, Motion
+
+KNOTS = INTERVALS + JOIN_MAX + 1
+"""Largest number of knots of a motion."""
+NEVER = 2**62
+"""First step of landing of a vehicle that never lands."""
+
+
+class PossibleMotion(NamedTuple):
+    """Motion that a vehicle may be flying, by the steps that all vehicles have in common."""
+
+    motion: Motion
+    lands: int = NEVER
+    """First step at which the vehicle may begin to land."""
+    error: StepError = EXACT
+    """Error of the step that is counted for the vehicle."""
+
+
+class MotionArrays(NamedTuple):
+    """Possible motions side by side; shapes (capacity, …)."""
+
+    first: I1
+    """Step of the first knot."""
+    knots: I1
+    """Number of knots."""
+    row: I1
+    """Row of the vehicle."""
+    lands: I1
+    """First step at which the vehicle may begin to land."""
+    extra: F1
+    """Distance kept from this motion beyond that from others [m]."""
+    early: F1
+    """Error of the vehicle's steps, see `clock.StepError`."""
+    late: F1
+    """Error of the vehicle's steps the other way."""
+    position: F3
+    """Positions of the knots [m]; shape (capacity, KNOTS, axes)."""
+    velocity: F3
+    """Velocities of the knots [m/s]; shape (capacity, KNOTS, axes)."""
+    low: F2
+    """Corner of a box around the whole motion, scaled [m]; shape (capacity, axes)."""
+    high: F2
+    """Opposite corner."""
+
+
+class PossibleMotions:
+    """All motions that vehicles may be flying. Those of a vehicle are replaced when they change.
+
+    Args:
+        scale: see `Metric`; shape (axes,).
+        dt_s: length of a step [s].
+    """
+
+    def __init__(self, scale: Array, dt_s: float) -> None:
+        self.count = 0
+        self.metric = Metric(scale, dt_s)
+        capacity, axes = 64, len(scale)
+        numbers, floats = np.zeros((4, capacity), dtype=np.int64), np.zeros((3, capacity))
+        knots, corners = np.zeros((2, capacity, KNOTS, axes)), np.zeros((2, capacity, axes))
+        self.arrays = MotionArrays._make([*numbers, *floats, *knots, *corners])
+
+    def replace(self, row: int, motions: Sequence[PossibleMotion], extra_m: float = 0.0) -> None:
+        """Replace all motions of a vehicle; see `add`."""
+        self.count = _remove(self.arrays, self.count, row, self.metric)
+        for motion in motions:
+            self.add(row, motion, extra_m)
+
+    def add(self, row: int, motion: PossibleMotion, extra_m: float = 0.0) -> None:
+        """Add a motion.
+
+        Args:
+            row: row of the vehicle.
+            motion: its motion.
+            extra_m: distance kept from this motion beyond that from others [m].
+        """
+        self.reserve(1)
+        _add(self.arrays, self.count, row, motion, extra_m, self.metric)
+        self.count += 1
+
+    def set_errors(self, early: Array, late: Array) -> None:
+        """Replace the errors of all vehicles' steps.
+
+        Args:
+            early, late: by row, see `clock.StepError`; shape (capacity,).
+        """
+        n, rows = self.count, self.rows
+        self.arrays.early[:n], self.arrays.late[:n] = early[rows], late[rows]
+
+    def reserve(self, more: int) -> None:
+        """Have capacity for so many more motions."""
+        while self.count + more > len(self.arrays.row):
+            self.arrays = MotionArrays._make(
+                np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
+            )
+
+    @property
+    def rows(self) -> Indices:
+        """Row of the vehicle of each motion; shape (count,)."""
+        return self.arrays.row[: self.count]
+
+
+@making_part  # numba counts references to what it returns
+def motion_at(arrays: MotionArrays, m: int) -> PossibleMotion:
+    """Motion at index m."""
+    n = arrays.knots[m]
+    return PossibleMotion(
+        Motion(arrays.first[m], arrays.position[m, :n], arrays.velocity[m, :n]),
+        arrays.lands[m],
+        StepError(arrays.early[m], arrays.late[m]),
+    )
+
+
+@part
+def write(
+    arrays: MotionArrays, m: int, row: int, motion: PossibleMotion, extra: float, metric: Metric
+) -> None:
+    """Write a motion at index m, see `PossibleMotions.add`."""
+    position, velocity = motion.motion.position, motion.motion.velocity
+    n, axes = position.shape
+    arrays.first[m], arrays.knots[m], arrays.row[m] = motion.motion.first, n, row
+    arrays.lands[m], arrays.extra[m] = motion.lands, extra
+    arrays.early[m], arrays.late[m] = motion.error.early, motion.error.late
+    for knot in range(n):
+        for x in range(axes):
+            arrays.position[m, knot, x] = position[knot, x]
+            arrays.velocity[m, knot, x] = velocity[knot, x]
+    lands = motion.lands < NEVER
+    bounding_box(motion.motion, lands, metric, arrays.low[m], arrays.high[m])
+
+
+@kernel
+def _add(
+    arrays: MotionArrays, m: int, row: int, motion: PossibleMotion, extra: float, metric: Metric
+) -> None:
+    """Write a motion at index m."""
+    write(arrays, m, row, motion, extra, metric)
+
+
+@making_kernel
+def _remove(arrays: MotionArrays, count: int, row: int, metric: Metric) -> int:
+    """Remove the motions of a vehicle, the last ones taking their places; the number left."""
+    for m in range(count - 1, -1, -1):
+        if arrays.row[m] == row:
+            count -= 1
+            write(
+                arrays, m, arrays.row[count], motion_at(arrays, count), arrays.extra[count], metric
+            )
+    return count
+
+
+@part
+def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) -> bool:
+    """Whether a box is further than a distance from the box of the motion at index m."""
+    square = 0.0
+    for x in range(len(low)):
+        off = max(low[x] - arrays.high[m, x], arrays.low[m, x] - high[x], 0.0)
+        square += off * off
+    return square > distance * distance
+
+
+@part
+def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
+    """Height of one vehicle above another that counts, each of which may be on its way down.
+
+    Args:
+        height: of the motion of the first above that of the second; negative below it [m].
+        one_lands, other_lands: whether the first, and the second, may be landing, and so anywhere
+            below its motion.
+    """
+    if (one_lands and height > 0.0) or (other_lands and height < 0.0):
+        return 0.0
+    return height
+
+
+@part
+def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
+    """Least and most steps by which another vehicle may be further on than it is counted, when one
+    vehicle is where it is counted.
+
+    Args:
+        one, other: errors of their steps.
+        drift: what is added, for the time for which both are looked ahead [steps].
+    """
+    return -other.late - one.early - drift, other.early + one.late + drift
+
+
+@part
+def moving_shifts(
+    other: Motion, begin: float, end: float, least: float, most: float
+) -> tuple[float, float]:
+    """Part of the shifts from `least` to `most` in which another motion is ever elsewhere.
+
+    Args:
+        other: the motion.
+        begin, end: steps between which it is looked at.
+        least, most: steps by which it may be further on.
+    """
+    last = last_step(other)
+    return min(max(least, other.first - end), most), max(min(most, last - begin), least)
