@@ -75,7 +75,7 @@ class BenchmarkOptions:
 
 def main() -> int:
     """Run as the command line says, and return the exit code."""
-    options = tyro.cli(BenchmarkOptions, description=__doc__)
+    options = tyro.cli(BenchmarkOptions, prog="python -m bench", description=__doc__)
     for name in options.only:
         section = SECTIONS[name]
         CONSOLE.rule(name)

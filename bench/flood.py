@@ -10,7 +10,6 @@ The same flight without a flood is measured for comparison.
 The flood is sent by absolute deadlines, one batch per millisecond.
 """
 
-import ctypes
 import math
 import socket
 import tempfile
@@ -39,6 +38,7 @@ from skytether.shared.telemetry import record
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire import channel, handshake
 from skytether.shell import driver
+from skytether.shell.batch import BATCH_MAX, Batch, pack_address
 
 VEHICLES = 5
 NEWCOMER = VEHICLES + 1
@@ -171,52 +171,19 @@ def hellos(good: bytes) -> list[bytes]:
     ]
 
 
-class _Message(ctypes.Structure):
-    """`struct msghdr`, which is padded at its end."""
-
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_bytes", ctypes.c_uint32),
-        ("pieces", ctypes.c_void_p),
-        ("pieces_count", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_bytes", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _Sending(ctypes.Structure):
-    """`struct mmsghdr`."""
-
-    _fields_ = (("message", _Message), ("sent_bytes", ctypes.c_uint32))
-
-
-class _Piece(ctypes.Structure):
-    """`struct iovec`."""
-
-    _fields_ = (("base", ctypes.c_void_p), ("bytes", ctypes.c_size_t))
-
-
 def flood(
     pipe: Connection, port: int, packets: list[bytes], rate: int, seconds: int
 ) -> tuple[int, int]:
     """Send packets, many per system call; returns their number, and the CPU time [ns]."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.connect((HOST, port))
-    buffers = [ctypes.create_string_buffer(packet, len(packet)) for packet in packets]
-    count = len(packets)
-    pieces = (_Piece * count)(*(_Piece(ctypes.addressof(b), len(b)) for b in buffers))
-    sendings = (_Sending * (2 * count))()  # the pool twice, so that a batch never wraps around
-    for i, sending in enumerate(sendings):
-        sending.message.pieces = ctypes.addressof(pieces) + (i % count) * ctypes.sizeof(_Piece)
-        sending.message.pieces_count = 1
-    send, width = ctypes.CDLL(None).sendmmsg, ctypes.sizeof(_Sending)
+    batch, peer = Batch(socket.AF_INET), pack_address((HOST, port))
     sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
         used_ns = used_ns or time.process_time_ns()
         while sent < due:
-            at = ctypes.c_void_p(ctypes.addressof(sendings) + sent % count * width)
-            sent += max(0, send(sock.fileno(), at, min(due - sent, count), 0))
+            first = sent % len(packets)
+            some = packets[first : first + min(due - sent, BATCH_MAX)]
+            sent += batch.send(sock, some, [peer] * len(some))
     return sent, time.process_time_ns() - used_ns
 
 
