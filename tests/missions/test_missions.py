@@ -52,19 +52,9 @@ from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation, Trajectory
 from skytether.sim import flight
+from two_vehicles import DT_S, alone, exact, observation, planned, ready, scenario
 
-DT_S = 0.05
 LOST = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
-
-
-def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: Any) -> Scenario:
-    """Vehicles that swap places."""
-    table = reading.to_table(reading.load("swap"))
-    table |= {"duration": duration, "seed": keys.pop("seed", 1)}
-    table["reference"]["shape"] = f"swap({vehicles})"
-    for way in ("uplink", "downlink"):
-        table["network"][way] |= {"loss": loss, **keys}
-    return reading.check(table, "swap")
 
 
 def each_of(flown: Record) -> list[Rows]:
@@ -381,28 +371,6 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
 # -- what may be flown -----------------------------------------------------------------------------
 
 
-def observation(step: int, in_force: int, place: tuple[float, float]) -> Observation:
-    """An observation of a vehicle at rest."""
-    state = np.array([[place[0], 0.0], [place[1], 0.0]])
-    return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
-
-
-def alone() -> MissionPlanner:
-    """Decision for two vehicles that swap places."""
-    flown = scenario(2)
-    goals = swap(2, 4.0, 2)
-    state = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    return MissionPlanner(flown, flown.terms(), 2, state)
-
-
-def exact(vehicles: int) -> ClockMap:
-    """Clocks that show what the server's does, for certain."""
-    clock = ClockMap(vehicles, round(DT_S * SECOND_NS))
-    for row in range(vehicles):
-        clock.observe(row, 0, 0, heard=1, now_ns=0)
-    return clock
-
-
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     """It is in force, may still be taken, or is known to be lost."""
     made, vehicle = alone()._state, VehicleMotions()
@@ -454,24 +422,6 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
     assert made._conflicts(0, near, 100).tolist() == [False, is_hit, False]
-
-
-def ready() -> MissionPlanner:
-    """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
-    made = alone()
-    for row, x in ((0, 4.0), (1, -4.0)):
-        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-        made._state.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
-        made.observe(row, observation(101, 90, (x, 0.0)))
-    return made
-
-
-def planned(made: MissionPlanner) -> Motion:
-    """Motion that is decided for the first vehicle at step 101."""
-    made.plan(np.arange(2), np.array([101, 101]), None)  # type: ignore[arg-type]
-    motion = made._state.vehicles[0].next
-    assert motion is not None
-    return motion
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.5])

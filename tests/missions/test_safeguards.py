@@ -1,0 +1,273 @@
+"""Safeguards of missions, one by one: each test fails where its safeguard is taken out."""
+
+import numpy as np
+import pytest
+
+from skytether.server.control.clock import EXACT, ClockMap, Contradiction, StepError
+from skytether.server.missions.half_planes import half_planes
+from skytether.server.missions.mission_state import LONGEST
+from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
+from skytether.server.missions.separation import too_near
+from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.law.motion import SPACING, Motion, resting
+from skytether.shared.scenario import zones
+from skytether.shared.wire.protocol import NO_HORIZON
+from two_vehicles import DT_S, alone, observation, planned, ready, scenario
+
+BOTH = np.arange(2)
+FAR = 100.0
+"""Place of a vehicle that nobody meets, on each axis [m]."""
+
+
+def along(start: list[float], velocity: list[float], *, first: int = 0) -> Motion:
+    """Motion over 11 knots that flies at one velocity between its ends, where it rests."""
+    v = np.vstack([np.zeros(len(start)), *[velocity] * 9, np.zeros(len(start))])
+    moved = np.cumsum(0.5 * SPACING * DT_S * (v[1:] + v[:-1]), axis=0)
+    return Motion(first, np.array(start) + np.vstack([np.zeros(len(start)), moved]), v)
+
+
+def is_too_near(
+    one: Motion,
+    other: Motion,
+    keep_m: float,
+    *,
+    begin: int = 0,
+    lands: int = NEVER,
+    error: StepError = EXACT,
+) -> bool:
+    """Whether a motion comes too near to another one, whose step may be wrong.
+
+    Args:
+        one, other: the motions.
+        keep_m: distance to keep [m].
+        begin: step from which they are compared.
+        lands: first step at which the first vehicle may begin to land.
+        error: of the other's step.
+    """
+    axes = one.position.shape[1]
+    possible = PossibleMotions(np.ones(axes), DT_S)
+    possible.add(1, PossibleMotion(other, error=error))
+    far, planned = resting(0, np.full(axes, FAR)), PossibleMotion(one, lands)
+    return bool(too_near(planned, far, begin, 0, possible, keep_m)[0])
+
+
+# -- distances -----------------------------------------------------------------------------------
+
+
+def test_clocks_that_drift_over_the_time_looked_ahead_count() -> None:
+    """Two fly 1 m behind each other, 100 s from now; they pass 1.6 cm a step of error."""
+    one = along([0.0, 0.0], [0.8, 0.0], first=2000)
+    other = along([1.0, 0.0], [0.8, 0.0], first=2000)
+    assert is_too_near(one, other, 0.92)
+
+
+def test_one_that_may_be_down_is_kept_away_from_by_one_that_is_late() -> None:
+    """A vehicle at rest may land while another still passes below, for its step is uncertain."""
+    above, passes = resting(0, np.array([0.0, 0.0, 6.0])), along([-2.0, 0.0, 2.0], [0.8, 0.0, 0.0])
+    assert is_too_near(above, passes, 0.9, lands=130, error=StepError(0.0, 100.0))
+
+
+def test_the_bend_of_a_motion_is_taken_off_its_distances() -> None:
+    """A motion that turns round between its knots comes 1 m near to a place at rest."""
+    turns = Motion(
+        0,
+        np.array([[0.0, 0.0], [0.0, 0.0], [-0.2, 0.0]]),
+        np.array([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.0]]),
+    )
+    assert is_too_near(turns, resting(0, np.array([1.1, 0.0])), 1.002, begin=1)
+
+
+def test_half_planes_keep_away_from_one_outside_its_tube() -> None:
+    """By as much more as it is outside, 0.3 m."""
+    possible = PossibleMotions(np.ones(2), DT_S)
+    possible.add(1, PossibleMotion(resting(0, np.zeros(2))), 0.3)
+    times = np.arange(0.0, 121.0, 5.0)
+    held, reach = np.tile([3.0, 0.0], (len(times), 1)), np.full(len(times), 9.0)
+    assert half_planes(times, held, reach, 0, NEVER, possible, 0.9).bound == pytest.approx(1.2)
+
+
+def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> None:
+    """One vehicle is gone; the one that lands from 6 m comes down on whoever is below."""
+    possible = PossibleMotions(np.ones(3), DT_S)
+    possible.add(1, PossibleMotion(resting(0, np.array([9.0, 9.0, 9.0]))))
+    possible.add(2, PossibleMotion(resting(0, np.array([0.0, 0.0, 6.0])), 60))
+    possible.replace(1, [])
+    below, far = resting(0, np.array([0.0, 0.0, 1.0])), resting(0, np.full(3, FAR))
+    assert too_near(PossibleMotion(below), far, 0, 0, possible, 0.9)[0]
+
+
+# -- what is sent --------------------------------------------------------------------------------
+
+
+def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
+    """The last check before a motion is sent."""
+    made = ready()
+    vehicle = made._state.vehicles[0]
+    vehicle.turned_rad = 0.5
+    made._conflicts = lambda *_: np.ones(made._state.possible.count + 1, dtype=bool)
+    made.plan(BOTH, np.array([101, 101]), None)
+    assert vehicle.next is None
+
+
+def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
+    """Zones around (4, 0), where it is, and around (0, 0)."""
+    made = ready()
+    made.change_zones(zones.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
+    way = np.stack([np.linspace(4.0, 0.0, 41), np.zeros(41)], axis=1)
+    assert made._enters_zone(way)
+    assert not made._enters_zone(way * [-1.0, 1.0] + [8.0, 0.0])
+
+
+def test_a_vehicle_that_moves_is_not_told_to_rest_where_it_passes() -> None:
+    """Without a motion and at 0.5 m/s."""
+    made = alone()
+    for step in (100, 101):
+        for row, x in ((0, 4.0), (1, -4.0)):
+            said = observation(step, NO_HORIZON, (x, 0.0))
+            said.state[0, 1] = 0.5
+            made.observe(row, said)
+    made.plan(BOTH, np.array([101, 101]), None)
+    assert made._state.vehicles[0].next is None
+    assert made.waits(0) == "coming to rest"
+
+
+def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_next_motion() -> None:
+    """Towards motions that others fly, and those planned at the same step."""
+    made = ready()
+    made._state.align(BOTH, np.array([101, 101]))
+    made._state.update_possible()
+    made._state.vehicles[0].outside_m = 0.1
+    place = np.array([-4.0 + scenario(2).clearances.apart_m + 0.05, 0.0])
+    assert made._conflicts(0, resting(101, place), 101).tolist() == [False, True, False]
+    made._state.vehicles[0].outside_m, made._state.vehicles[0].turned_rad = 0.4, 0.5
+    made._state._changed.add(0)
+    planned(made)
+    possible = made._state.possible
+    mine = [possible.arrays.extra[m] for m in range(possible.count) if possible.rows[m] == 0]
+    assert mine == pytest.approx([0.4] * len(mine))
+
+
+def test_a_new_motion_is_the_old_one_as_long_as_it_may_be_taken() -> None:
+    """Taken late, within `link.join_s`, it is no leap."""
+    made = ready()
+    motion, before = planned(made), made._state.vehicles[0].in_force.motion
+    steps = np.arange(101.0, 102.0 + scenario(2).terms().join)
+    assert motion.at(steps, DT_S)[0] == pytest.approx(before.at(steps, DT_S)[0], abs=1e-9)
+
+
+def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
+    """A vehicle at rest would drift: twice within `link.age_max_s`, for one may be lost."""
+    terms = scenario(2).terms()
+    assert 2 * ready()._resend_after + terms.join < terms.age_max
+
+
+# -- clients that begin anew ---------------------------------------------------------------------
+
+
+def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
+    """Nobody knows where along its motions it is."""
+    made = ready()
+    made._state.align(BOTH, np.array([100, 100]))
+    made._state.restart(0)
+    made.plan(BOTH, np.array([101, 101]), None)
+    assert made._state.vehicles[0].next is None
+    assert made.waits(0) == "its client, which has begun anew"
+
+
+def test_others_keep_away_from_all_of_its_motions() -> None:
+    """It may be as late as any vehicle can be."""
+    made = ready()
+    made._state.align(BOTH, np.array([101, 101]))
+    made._state.restart(0)
+    made._state.align(BOTH, np.array([102, 102]))
+    assert made._state.error(0).late >= LONGEST
+
+
+def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
+    """One that was under way when it began anew."""
+    made = ready()
+    made._state.align(BOTH, np.array([101, 101]))
+    assert made._state.restart(0)
+    made.observe(0, observation(110, 90, (4.0, 0.0)))
+    assert 0 in made._state.restarted
+    made.observe(0, observation(122, 90, (4.0, 0.0)))
+    assert 0 not in made._state.restarted
+
+
+# -- zones ---------------------------------------------------------------------------------------
+
+
+def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() -> None:
+    """The motion of an earlier server may lead anywhere."""
+    made = alone()
+    made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
+    made.observe(1, observation(100, 70, (-4.0, 0.0)))
+    made._state.align(BOTH, np.array([101, 101]))
+    assert "vehicle 2" in made.objection(zones.parse("cylinder(20, 20, 1)", 2))
+
+
+def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
+    """It may be 60 steps behind the place that its step tells."""
+    made = ready()
+    made._state.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
+    made._state.align(BOTH, np.array([165, 165]))
+    zone = zones.parse("cylinder(3.4, 0, 0.3)", 2)
+    made._state.rows.late[0] = 0.0
+    assert not made.objection(zone)
+    made._state.rows.late[0] = 60.0
+    assert "vehicle 1" in made.objection(zone)
+
+
+# -- clocks --------------------------------------------------------------------------------------
+
+
+def heard(count: int, *, asymmetry_ns: int = 0) -> ClockMap:
+    """Clocks of a vehicle that is heard once a second, each packet 0.1 s under way."""
+    clocks = ClockMap(
+        1, 50 * MILLISECOND_NS, **({"asymmetry_ns": asymmetry_ns} if asymmetry_ns else {})
+    )
+    for at in range(count):
+        delay_ns = 100 * MILLISECOND_NS
+        clocks.observe(0, delay_ns, delay_ns, heard=at, now_ns=at * SECOND_NS)
+    return clocks
+
+
+def test_clocks_may_have_drifted_over_all_the_time_that_is_looked_back() -> None:
+    """Also where the operator's word on delays leaves little else."""
+    clocks = heard(25, asymmetry_ns=10 * MILLISECOND_NS)
+    assert clocks.middle_ns(0, 24 * SECOND_NS)[1] >= 25 * MILLISECOND_NS
+
+
+def test_what_the_time_of_day_said_before_a_clock_was_set_does_not_count() -> None:
+    """Set by 5 s; then the time of day tells that, and contradicts nothing."""
+    clocks, delay_ns = heard(10), 100 * MILLISECOND_NS
+    clocks.tell(0, 0, MILLISECOND_NS, now_ns=10 * SECOND_NS)
+    set_ns = 5 * SECOND_NS
+    clocks.observe(0, delay_ns - set_ns, delay_ns + set_ns, heard=11, now_ns=11 * SECOND_NS)
+    assert clocks.middle_ns(0, 11 * SECOND_NS)[0] == pytest.approx(set_ns, abs=0.15 * SECOND_NS)
+    told = clocks.tell(0, set_ns, MILLISECOND_NS, now_ns=12 * SECOND_NS)
+    assert told is Contradiction.NOTHING
+
+
+def test_a_time_of_day_that_delays_contradict_moves_no_step() -> None:
+    """0.4 s off, where delays leave 0.1 s."""
+    clocks = heard(5)
+    told = clocks.tell(0, 400 * MILLISECOND_NS, 5 * MILLISECOND_NS, now_ns=5 * SECOND_NS)
+    assert told is Contradiction.TIME_OF_DAY
+    now_ns = 5 * SECOND_NS + 25 * MILLISECOND_NS
+    assert clocks.steps(np.array([0]), now_ns).tolist() == [100]
+
+
+# -- goals ---------------------------------------------------------------------------------------
+
+
+def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
+    """Neither its closed places nor its detour are left."""
+    vehicle = VehicleMotions()
+    vehicle.is_stuck(0, np.array([4.0, 0.0]), 9.0)
+    vehicle.closed.append(np.zeros(2))
+    vehicle.detour, vehicle.detour_until = object(), 999
+    vehicle.is_stuck(1, np.array([-4.0, 0.0]), 9.0)
+    assert not vehicle.closed
+    assert vehicle.detour is None
