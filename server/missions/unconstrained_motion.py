@@ -59,7 +59,7 @@ class UnconstrainedPlanner:
         """Motions of the first of some vehicles, one after the other; each keeps clear of all
         before.
 
-        They are those up to the first vehicle that cannot fly straight, and are put to the motions
+        Planning stops at the first vehicle that cannot fly straight. The motions are added to those
         that may be flown.
 
         Args:

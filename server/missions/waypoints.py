@@ -90,11 +90,10 @@ class Waypoints:
             way = vehicle.detour.way(place, goal)
             yield _along(place, way, AHEAD_M)
         ahead = way[0, :2] - place[:2]
-        distance = float(np.linalg.norm(ahead))
-        ahead = ahead / distance if distance > 1e-9 else np.array([1.0, 0.0])
-        reach_m = (
-            WAYPOINT_M if len(way) > 1 else min(float(np.linalg.norm(goal - place)), WAYPOINT_M)
-        )
+        distance_m = float(np.linalg.norm(ahead))
+        ahead = ahead / distance_m if distance_m > 1e-9 else np.array([1.0, 0.0])
+        goal_m = float(np.linalg.norm(goal - place))
+        reach_m = WAYPOINT_M if len(way) > 1 else min(goal_m, WAYPOINT_M)
         for _ in range(TRIES):
             c, s = np.cos(-vehicle.turned_rad), np.sin(-vehicle.turned_rad)
             waypoint = place.copy()
