@@ -204,7 +204,7 @@ def _flown(scenario: Scenario, runs: int, **keys: Any) -> list[Record]:
 def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float | None]:
     """Growth of the mean square after a push, and half-width of its 95 % interval (jackknife).
 
-    It is infinite where SMALL is reached within STEPS_MIN.
+    It is infinite where SMALL is reached within STEPS_MIN, or there is no session.
 
     Args:
         trigger: see `clocked_trigger`.
@@ -234,6 +234,8 @@ def _answers(scenario: Scenario, trigger: str, runs: int) -> Array:
     if flown.sensor != SensorConfig():
         calm_p, calm_u = _positions_and_inputs(_flown(flown, runs))
         p, u = p - calm_p, u - calm_u
+    if not p.any(axis=(1, 2)).all():  # a vehicle had no session by then
+        return np.zeros((runs, 0))
     begins = np.argmax(p.any(axis=2), axis=1) + round(PUSH_S / dt)
     steps = min(round((FOLLOWED_S - 2.0) / dt), p.shape[1] - int(begins.max()))
     p, u = (

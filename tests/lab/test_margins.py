@@ -107,6 +107,12 @@ def test_noise_does_not_hide_how_a_push_decays() -> None:
     assert noisy == pytest.approx(alone, abs=0.001)
 
 
+def test_a_vehicle_that_is_not_reached_is_not_stable() -> None:
+    """No plan arrives, so that nothing brings it back."""
+    silent = demo_with(network__uplink="loss(1)", link__connect_s=5.0)
+    assert growth_of(silent, "always", 1) == (np.inf, None)
+
+
 def test_only_what_looks_at_the_clock_sends_after_a_weak_push() -> None:
     """Any other trigger is replaced by a period that sends as often."""
     for trigger in ("always", "periodic(7)", "periodic(7) | silence(1)", "always & budget(5, 2)"):

@@ -11,6 +11,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from skytether.lab import maps
@@ -181,7 +182,7 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
     table = Table(title=title, title_justify="left", min_width=len(title))
     headings = ("bursts [s]", "dead time [s]", "vehicles", "limit cycles", "not stable")
     for heading in (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"):
-        table.add_column(heading, justify="right")
+        table.add_column(escape(heading), justify="right")
     for (burst_s, dead_time_s), group in groups.items():
         rmse = np.array([point.rmse_m or np.nan for point in group])
         saturated = max(point.saturated or 0.0 for point in group)
@@ -215,7 +216,7 @@ def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> Non
     table.add_column("growth")
     table.add_column("stable")
     for axis in "xyz"[: scenario.model.axes]:
-        table.add_column(f"RMS {axis} [m]", justify="right")
+        table.add_column(escape(f"RMS {axis} [m]"), justify="right")
     table.add_column("bound", justify="right")
     for each in found:
         rms: Sequence[float | None] = each.rms_m or [None] * scenario.model.axes
@@ -245,5 +246,5 @@ def _show_limits(limits: Sequence[Limit]) -> None:
     for each in limits:
         beyond = "<" if each.quantity.endswith("least") else ">"
         unknown = f"{beyond} {each.searched:g}"
-        table.add_row(each.quantity, unknown if each.value is None else f"{each.value:.3g}")
+        table.add_row(escape(each.quantity), unknown if each.value is None else f"{each.value:.3g}")
     terminal.show(table)
