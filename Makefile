@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Kernels are compiled once, the server's beside the laboratory's, and so are the tests, whose asserts
 # pytest rewrites: not by each of its workers.
 LOAD = from skytether.shared.base import kernel; kernel.load()
-KERNELS = $(BIN)/python -c "import skytether.lab.loops, skytether.quadrotor.loops; $(LOAD)" & \
+KERNELS = $(BIN)/python -c "import skytether.sim.flight, skytether.quadrotor.loops; $(LOAD)" & \
 	$(BIN)/pytest --collect-only -qq >/dev/null & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 

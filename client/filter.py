@@ -129,9 +129,6 @@ class Kalman:
         )
         """Inputs that have acted since, see `advance` [m/s]."""
         self._late = [each.late for each in terms.dead_times]
-        self.gains: list[list[Gain]] = [[], []]
-        """Gains by which position and velocity were corrected last, of each axis; empty where that
-        was not measured at the last step."""
 
     def begin(self, measured: Measurement) -> None:
         """Take the first measurement, which has a position; the vehicle stands."""
@@ -170,13 +167,12 @@ class Kalman:
         for which, (correct, values) in enumerate(
             zip((by_position, by_velocity), measured[1:], strict=True)
         ):
-            self.gains[which] = []
             if values is None:
                 continue
             variance = self.variances[which]
             corrected = [correct(P, variance) for P in self.spreads]
             self.spreads = [P for _, P in corrected]
-            gains = self.gains[which] = [corrected[kind][0] for kind in self.kinds]
+            gains = [corrected[kind][0] for kind in self.kinds]
             self.x = [
                 (p + kp * off, v + kv * off, w + kw * off)
                 for (p, v, w), (kp, kv, kw), off in (

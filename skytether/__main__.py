@@ -16,7 +16,7 @@ reorders and loses their packets.
   crowd [SCENARIO]      how many vehicles fly on one shared air, scheme by scheme
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
   envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
-  margins [SCENARIO]    whether its loop is stable, and with which vehicles, computed
+  margins [SCENARIO]    whether its loop is stable, and with which vehicles, by flights
   identify KIND         a vehicle's gain, time constant and dead time, from small steps it flies
   torture               flights through faults and attacks, and whether anything unsafe is flown
   adversary [MISSION]   a search for what brings vehicles of a mission together

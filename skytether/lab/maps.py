@@ -4,7 +4,7 @@ Each point of the box is flown without wind, twice: at rest, from START_M beside
 is to hover; and along the scenario's reference. At rest nothing disturbs it, so a vehicle whose
 loop is stable comes to rest. A vehicle that still moves in the last quarter, by more than REST_M
 about the point and hardly less than in the quarter before, is in a limit cycle: it oscillates
-between the bounds of its input. The table also has the computed growth (`lab.margins`).
+between the bounds of its input. The table also has the growth after a push (`lab.margins`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from skytether.figures.flights import save
 from skytether.figures.tables import to_csv
 from skytether.lab.journal import digests
-from skytether.lab.margins import Differing, growth_of, hovering
+from skytether.lab.margins import Differing, growth_of, hovering, windless
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -39,8 +39,8 @@ SUSTAINED = 0.7
 decay."""
 RUNS = 2
 """Number of flights of each kind at a point, with seeds that count up from the scenario's."""
-TIMINGS, PUSHES = 12, 16
-"""Number of timings for the computed growth, and of pushes simulated at once."""
+PUSHES = 4
+"""Number of seeds for the growth after a push."""
 
 
 class Place(NamedTuple):
@@ -72,7 +72,7 @@ class MapPoint(msgspec.Struct, frozen=True):
     event_ratio: float | None
     """Share of the server's steps along the reference that sent a horizon."""
     growth: float
-    """Growth of the second moment per step, computed without bounds."""
+    """Growth of the mean square per step after a push."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Box:
     """Name of the scenario."""
     scenario: Scenario
     trigger: str
-    """Trigger for the computed growth: the scenario's, or a periodic one with the same rate."""
+    """Trigger of the pushes, see `lab.margins.clocked_trigger`."""
     tau: tuple[float, ...]
     gain: tuple[float, ...]
     dead_time_s: tuple[float, ...]
@@ -109,17 +109,14 @@ class Box:
     def scenario_of(self, number: int) -> Scenario:
         """Scenario of a point, without wind."""
         burst_s, dead_time_s, gain, tau = self.places[number]
-        scenario, network = self.scenario, self.scenario.network
-        vehicle = replace(scenario.vehicle, wind=0.0, steady_wind_mps=(), gust_mps2=0.0)
+        network = self.scenario.network
         uplink, downlink = (
             replace(direction, burst_s=burst_s) for direction in (network.uplink, network.downlink)
         )
-        still = replace(
-            scenario,
-            vehicle=vehicle,
-            network=replace(network, uplink=uplink, downlink=downlink),
+        network = replace(network, uplink=uplink, downlink=downlink)
+        return Differing(tau, gain, dead_time_s).of(
+            replace(windless(self.scenario), network=network)
         )
-        return Differing(tau, gain, dead_time_s).of(still)
 
     def fly(self, number: int) -> MapPoint:
         """Fly a point in virtual time, and judge it; called in a worker."""
@@ -131,8 +128,6 @@ class Box:
         for seed, flight in zip(seeds, fly_batch(scenario, seeds), strict=True):
             seeded = replace(scenario, seed=seed)
             flown.append(summarise(seeded, self.name, flight.client, flight.server))
-        control = replace(scenario.control, trigger=self.trigger)
-        growth, _ = growth_of(replace(scenario, control=control), TIMINGS, PUSHES)
         return MapPoint(
             number,
             cycles=any(before * SUSTAINED < last > REST_M for before, last in rests),
@@ -140,7 +135,7 @@ class Box:
             rmse_m=_mean(each.rmse_xy for each in flown),
             saturated=_mean(each.saturated for each in flown),
             event_ratio=_mean(each.event_ratio for each in flown),
-            growth=growth,
+            growth=growth_of(scenario, self.trigger, PUSHES)[0],
         )
 
     def csv(self, points: Iterable[MapPoint]) -> str:
@@ -155,8 +150,7 @@ class Box:
 
 def at_rest(scenario: Scenario) -> Scenario:
     """Scenario as a flight to rest."""
-    beside = (START_M,) + (0.0,) * (scenario.model.axes - 1)
-    still = replace(hovering(scenario), duration=REST_S, settle=0.0)
+    beside, still = (START_M,) + (0.0,) * (scenario.model.axes - 1), hovering(scenario, REST_S)
     return replace(still, vehicle=replace(still.vehicle, start_m=beside))
 
 
@@ -223,7 +217,7 @@ CYCLES: dict[str, Any] = {
     "marker": "x",
     "color": "#c1272d",
     "markeredgewidth": 2.0,
-    "label": "flown: limit cycle",
+    "label": "limit cycle",
 }
 GROWS: dict[str, Any] = {
     "linestyle": "none",
@@ -231,5 +225,5 @@ GROWS: dict[str, Any] = {
     "markersize": 10,
     "markerfacecolor": "none",
     "color": "black",
-    "label": "computed: not stable",
+    "label": "grows after a push",
 }

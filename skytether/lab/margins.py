@@ -1,81 +1,67 @@
-"""Margins: stability of a loop over a bad network, and how far the vehicle may differ.
+"""Margins: whether a loop is stable over a network, and how far the vehicle may differ.
 
-While no bound is active the loop is linear for a given timing (`lab.linear`), and with triggers
-that use only the clock the timing depends on the network alone: so it is taken from flights in
-virtual time. With h(n) the mean of p² n steps after a push of strength 1, over pushes and timings,
+The loop is the product's own, flown in virtual time: vehicle, server and network of a scenario,
+hovering. A flight answers one of three questions.
 
-    variance of p  =  strength² · Σ h(n)              under white wind or noise, once it is settled
-    growth         =  lim h(n+1) / h(n)               of the second moment, at each step
+    push   no wind but PUSH_S of a weak one; h(n): mean over seeds and axes of p² n steps after it
+           growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
+    wind   the scenario's white wind and noise alone: root mean square of p and u
+    rest   no wind, from START_M beside the point: a vehicle that does not come to rest is in a
+           limit cycle, an oscillation between the bounds of its input
 
-and the loop is stable in the mean square where the growth is below 1. The vehicle that is pushed
-may differ from the model that the server plans with.
+What is not linear is kept out of the growth. Bounds: steps count until the answer of an input
+reaches SMALL of its bound. Noise: pushes are flown twice, with and without; p is the difference.
+Thresholds: the weak push stays below all of them, so that a trigger that looks at the state would
+never send; it is replaced by a periodic one with its measured rate. Wind and rest are flown with
+the scenario's own trigger.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from scipy import stats
 
-from skytether.lab.linear import WIND, Loop, Timing
-from skytether.lab.loops import make_loops, no_packets, respond, timing_of
 from skytether.lab.sweep import interval
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import policies
 from skytether.shared.scenario.schema import ReferenceConfig, Scenario, SensorConfig
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import AT_BOUND
 from skytether.sim.flight import fly_batch
 
-FLIGHT_S = 80.0
-"""Length of the flights that timings are taken from [s]."""
-SETTLE_S = 5.0
-"""Time after which a flight's session and delay bound are stationary [s]."""
-FOLLOWED_S = 24.0
-"""Time for which a push is followed [s]: six time constants of a typical disturbance observer."""
-PUSHES = 64
-"""Number of pushes of each source simulated at once."""
+PUSH_S, FOLLOWED_S = 0.25, 24.0
+"""Length of a push, and time for which its answer is followed [s]: six time constants of a typical
+disturbance observer."""
+PUSH = 1e-4
+"""Strength of the push, a white acceleration [m/s per √s]: too weak for any bound or
+threshold, and well above what rounding on the wire adds beside noise of some centimetres."""
+FLOOR = 1e-9
+"""Share of its largest value below which a mean square is rounding."""
+SETTLE_S, ROUND_TRIPS = 5.0, 4.0
+"""Time [s] and mean round trips until there are sessions, and a stationary delay bound."""
+WIND_S, WIND_BUILDS_S = 60.0, 10.0
+"""Time for which the answer to wind counts, and time before that in which it builds up [s]."""
+SMALL = 0.05
+"""Share of an input's bound up to which its answer to a push counts: no bound acts there."""
+STEPS_MIN = 10
+"""Least number of steps until then from which a growth can be read."""
 WIND_ALONE = 0.1
-"""Wind for which the error is computed if a scenario has neither wind nor noise."""
+"""Wind in which a vehicle is flown if its scenario has neither wind nor noise."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
 """Policies that do not look at the state."""
-RATE_RUNS = 4
-"""Number of flights from which the rate of a trigger is measured."""
-
-
-class Margin(msgspec.Struct, frozen=True, kw_only=True):
-    """Results for a loop whose vehicle equals, or differs from, the model."""
-
-    vehicle: str
-    """Name of the vehicle in a table."""
-    growth: float
-    """Growth of the second moment per step."""
-    growth_ci95: float | None
-    """Half-width of the growth's 95 % interval over timings; None for a single timing."""
-    stable: bool
-    """Whether the upper end of the growth's interval is below 1."""
-    rms_m: tuple[float, ...] | None
-    """Root mean square of the position's deviation, of each axis [m]; None if unstable."""
-    rms_ci95_m: tuple[float, ...] | None
-    """Half-width of the 95 % interval of `rms_m`; None if unstable, or for a single timing."""
-    rms_input_mps: tuple[float, ...] | None
-    """Root mean square of the input's deviation, of each axis [m/s]; None if unstable."""
-
-    def saturated(self, u_max: Sequence[float]) -> float | None:
-        """Share of the steps at which a normally distributed input would exceed its bound."""
-        if self.rms_input_mps is None:
-            return None
-        beyond = [
-            math.erfc(bound / (rms * math.sqrt(2.0))) if rms else 0.0
-            for bound, rms in zip(u_max, self.rms_input_mps, strict=True)
-        ]
-        return 1.0 - math.prod(1.0 - share for share in beyond)
+RATE_RUNS, LIMIT_RUNS = 4, 4
+"""Number of seeds: for the rate of a trigger, and at most for each value that is tried for a limit.
+"""
+HALVINGS = 7
+"""Number of halvings of a limit's interval."""
 
 
 class Differing(NamedTuple):
-    """Differences of a vehicle from the model."""
+    """Differences of a vehicle and its network from the model."""
 
     tau: float = 1.0
     """Time constants over those of the model."""
@@ -83,21 +69,30 @@ class Differing(NamedTuple):
     """Gains of the velocity loop over those of the model."""
     dead_time_s: float = 0.0
     """Dead time minus that of the model [s]."""
+    delay_s: float = 0.0
+    """Delay added to the network's, each way [s]."""
 
     def is_of(self, scenario: Scenario) -> bool:
         """Whether such a vehicle exists: its dead time must not be negative."""
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        """Scenario with such a vehicle."""
-        terms = scenario.terms()
+        """Scenario with such a vehicle and network."""
+        terms, network = scenario.terms(), scenario.network
         vehicle = replace(
             scenario.vehicle,
             tau_s=tuple(self.tau * tau_s for tau_s in scenario.model.tau_s),
             gain=tuple(self.gain * gain for gain in terms.gain),
             dead_time_s=tuple(self.dead_time_s + late_s for late_s in terms.dead_time_s),
         )
-        return replace(scenario, vehicle=vehicle)
+        if self.delay_s:
+            uplink, downlink = (
+                replace(each, impairments=" & ".join(filter(None, (each.text, later))))
+                for later in [f"constant({self.delay_s!r})"]
+                for each in (network.uplink, network.downlink)
+            )
+            network = replace(network, uplink=uplink, downlink=downlink)
+        return replace(scenario, vehicle=vehicle, network=network)
 
 
 AS_IT_IS = "as the scenario has it"
@@ -113,157 +108,160 @@ VEHICLES: dict[str, Differing] = {
     "dead time 0.2 s more": Differing(dead_time_s=0.2),
     "dead time 0.3 s more": Differing(dead_time_s=0.3),
 }
-"""Vehicles for which margins are computed besides the scenario's own, if they exist."""
+"""Vehicles that are flown besides the scenario's own, if they exist."""
+LIMITS: dict[str, tuple[str, float, float]] = {
+    "time constant, least": ("tau", 1.0, 0.1),
+    "time constant, most": ("tau", 1.0, 10.0),
+    "gain, least": ("gain", 1.0, 0.1),
+    "gain, most": ("gain", 1.0, 10.0),
+    "dead time, more [s]": ("dead_time_s", 0.0, 2.0),
+    "delay each way, more [s]": ("delay_s", 0.0, 2.0),
+}
+"""Quantities whose limit is searched for: field of `Differing`, and from and up to which value."""
+
+
+class Margin(msgspec.Struct, frozen=True, kw_only=True):
+    """Results for a vehicle that equals, or differs from, the model."""
+
+    vehicle: str
+    """Name of the vehicle in a table."""
+    growth: float
+    """Growth of the mean square per step."""
+    growth_ci95: float | None
+    """Half-width of the growth's 95 % interval over seeds; None for a single seed."""
+    stable: bool
+    """Whether the upper end of the growth's interval is below 1."""
+    rms_m: tuple[float, ...] | None
+    """Root mean square of the position's deviation, of each axis [m]; None if unstable."""
+    rms_ci95_m: tuple[float, ...] | None
+    """Half-width of the 95 % interval of `rms_m`; None if unstable, or for a single seed."""
+    rms_input_mps: tuple[float, ...] | None
+    """Root mean square of the input, of each axis [m/s]; None if unstable."""
+    saturated: float | None
+    """Share of the steps with an input at its bound on some axis; None if unstable."""
+
+
+class Limit(msgspec.Struct, frozen=True, kw_only=True):
+    """Largest difference from the model up to which the loop is stable, all else being equal."""
+
+    quantity: str
+    """Name of the quantity in a table."""
+    searched: float
+    """Value up to which it was searched for."""
+    value: float | None
+    """The limit; None if the loop is stable at `searched`."""
 
 
 def looks_at_state(scenario: Scenario) -> bool:
-    """Whether the trigger looks at the state, so that the loop is not linear."""
+    """Whether the trigger looks at the state, and so has a threshold."""
     trigger, splines = policies.parse(scenario.control.trigger), scenario.terms().splines
     return not splines and any(each.name not in CLOCK_ONLY for each in policies.policies(trigger))
 
 
-def equivalent_period(
-    scenario: Scenario, *, stopped: Callable[[], bool] = lambda: False
-) -> Scenario:
-    """Scenario with the policy `periodic`, at the measured rate of its own trigger."""
-    seeds = range(scenario.seed, scenario.seed + RATE_RUNS)
-    flights = fly_batch(scenario, seeds, stopped=stopped)
-    events = np.concatenate([flight.server["event"] for flight in flights])
+def clocked_trigger(scenario: Scenario) -> str:
+    """Trigger without a threshold: the scenario's own, or `periodic` at its measured rate."""
+    if not looks_at_state(scenario):
+        return scenario.control.trigger
+    events = np.concatenate([each.server["event"] for each in _flown(scenario, RATE_RUNS)])
     period = max(1, round(1.0 / max(events.mean(), 1.0 / policies.PERIOD_MAX)))
-    return replace(scenario, control=replace(scenario.control, trigger=f"periodic({period})"))
+    return f"periodic({period})"
 
 
-def hovering(scenario: Scenario) -> Scenario:
-    """Scenario with a hover point in place of its reference."""
-    point = (0.0,) * scenario.model.axes
-    return replace(scenario, reference=ReferenceConfig(shape="hover", points_m=(point,)))
-
-
-def calm(scenario: Scenario) -> Scenario:
-    """Scenario for measuring timings: the vehicle equals the model, and is at rest.
-
-    The omitted parts do not affect packet timing, with one exception: reports that depend on the
-    state are replaced by reports at every step.
-    """
-    vehicle = replace(
-        scenario.vehicle,
-        report="always",
-        tau_s=(),
-        gain=(),
-        dead_time_s=(),
-        start_m=(),
-        wind=0.0,
-        steady_wind_mps=(),
-        gust_mps2=0.0,
-    )
-    duration = max(FLIGHT_S, 10 * scenario.control.horizon * scenario.control.dt)
-    still = replace(hovering(scenario), vehicle=vehicle, sensor=SensorConfig())
-    return replace(still, duration=duration, settle=0.0)
-
-
-def timings(
-    scenario: Scenario, runs: int, *, stopped: Callable[[], bool] = lambda: False
-) -> list[Timing]:
-    """Timings of a number of flights, with seeds that count up from the scenario's."""
-    flown = calm(scenario)
-    if flown.terms().splines:  # the vehicle flies the reference aboard, whatever arrives
-        return [no_packets(flown.steps)] * runs
-    seeds = range(flown.seed, flown.seed + runs)
-    return [timing_of(flight) for flight in fly_batch(flown, seeds, stopped=stopped)]
-
-
-@lru_cache(maxsize=4)
-def _known_timings(still: Scenario, runs: int) -> list[Timing]:
-    """Timings, see `timings`, of a scenario that is calm already."""
-    return timings(still, runs)
-
-
-def growth_of(scenario: Scenario, runs: int, pushes: int) -> tuple[float, float | None]:
-    """Growth of a scenario along some timings, and half-width of its 95 % interval.
+def hovering(scenario: Scenario, duration: float) -> Scenario:
+    """Scenario of a simulated vehicle without wind that hovers where it begins.
 
     Args:
-        pushes: see PUSHES.
+        duration: length of the flight [s].
     """
-    given = _known_timings(calm(scenario), runs)
-    known = _responses_of_axes(scenario, given, pushes)
-    return max((each.growth() for each in known.values()), key=lambda pair: pair[0])
-
-
-def margin(scenario: Scenario, vehicle: str, given: Sequence[Timing]) -> Margin:
-    """Margin of a scenario along some timings.
-
-    Args:
-        vehicle: name of the scenario's vehicle.
-    """
-    known = _responses_of_axes(scenario, given, PUSHES)
-    growth, half = max((each.growth() for each in known.values()), key=lambda pair: pair[0])
-    stable = growth + (half or 0.0) < 1.0
-    settled = [known[kind].rms(scenario) for kind in _kinds(scenario) if stable]
-    return Margin(
-        vehicle=vehicle,
-        growth=growth,
-        growth_ci95=half,
-        stable=stable,
-        rms_m=tuple(each[0] for each in settled) if stable else None,
-        rms_ci95_m=tuple(each[1] for each in settled) if stable and len(given) > 1 else None,
-        rms_input_mps=tuple(each[2] for each in settled) if stable else None,
+    origin = (0.0,) * scenario.model.axes
+    flown = windless(scenario)
+    return replace(
+        flown,
+        reference=ReferenceConfig(shape="hover", points_m=(origin,)),
+        vehicle=replace(flown.vehicle, kind="simulated", start_m=()),
+        duration=duration,
+        settle=0.0,
     )
 
 
-def _kinds(scenario: Scenario) -> list[tuple[float, ...]]:
-    """Time constant, gain and dead time of the model and of the vehicle, of each axis.
+def settled_s(scenario: Scenario) -> float:
+    """Time after which a flight is stationary [s], see SETTLE_S."""
+    network = scenario.network
+    return SETTLE_S + ROUND_TRIPS * (network.uplink.mean_s + network.downlink.mean_s)
 
-    Equal axes share one entry.
+
+def windless(scenario: Scenario) -> Scenario:
+    """Scenario without any wind."""
+    calm = replace(scenario.vehicle, wind=0.0, steady_wind_mps=(), gust_mps2=0.0)
+    return replace(scenario, vehicle=calm)
+
+
+def _flown(scenario: Scenario, runs: int, **keys: Any) -> list[Record]:
+    """Flights with seeds that count up from the scenario's."""
+    return fly_batch(scenario, range(scenario.seed, scenario.seed + runs), **keys)
+
+
+def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float | None]:
+    """Growth of the mean square after a push, and half-width of its 95 % interval (jackknife).
+
+    It is infinite where SMALL is reached within STEPS_MIN, or there is no session.
+
+    Args:
+        trigger: see `clocked_trigger`.
+        runs: number of seeds.
     """
-    terms, true = scenario.terms(), (scenario.true_tau_s, scenario.true_gain)
-    numbers = (terms.tau_s, terms.gain, terms.dead_time_s, *true, scenario.true_dead_time_s)
-    return list(zip(*numbers, strict=True))
+    h = _answers(scenario, trigger, runs)
+    if h.shape[1] < STEPS_MIN:
+        return math.inf, None
+    growth = _growth(h.mean(axis=0))
+    if runs < 2:
+        return growth, None
+    others = np.array([_growth(np.delete(h, run, axis=0).mean(axis=0)) for run in range(runs)])
+    return growth, float(stats.t.ppf(0.975, runs - 1)) * math.sqrt((runs - 1) * others.var())
 
 
-def _responses_of_axes(
-    scenario: Scenario, given: Sequence[Timing], pushes: int
-) -> "dict[tuple[float, ...], Responses]":
-    """Responses of each distinct kind of axis."""
-    steps = max(len(timing.in_force) for timing in given)
-    loops = dict(zip(_kinds(scenario), make_loops(scenario, steps), strict=True))
-    return {kind: responses(scenario, loop, given, pushes) for kind, loop in loops.items()}
+def _answers(scenario: Scenario, trigger: str, runs: int) -> Array:
+    """Mean of p² over the axes at each step after a push; shape (runs, steps)."""
+    dt, begin_s = scenario.control.dt, settled_s(scenario)
+    flown = hovering(scenario, begin_s + FOLLOWED_S)
+    flown = replace(
+        flown,
+        vehicle=replace(flown.vehicle, report="always"),
+        control=replace(scenario.control, trigger=trigger),
+    )
+    push = [(begin_s, {"vehicle.wind": PUSH}), (begin_s + PUSH_S, {"vehicle.wind": 0.0})]
+    p, u = _positions_and_inputs(_flown(flown, runs, changes=push))
+    if flown.sensor != SensorConfig():
+        calm_p, calm_u = _positions_and_inputs(_flown(flown, runs))
+        p, u = p - calm_p, u - calm_u
+    if not p.any(axis=(1, 2)).all():  # a vehicle had no session by then
+        return np.zeros((runs, 0))
+    begins = np.argmax(p.any(axis=2), axis=1) + round(PUSH_S / dt)
+    steps = min(round((FOLLOWED_S - 2.0) / dt), p.shape[1] - int(begins.max()))
+    p, u = (
+        np.array([run[begin : begin + steps] for run, begin in zip(each, begins, strict=True)])
+        for each in (p, u)
+    )
+    large = (np.abs(u) >= SMALL * scenario.u_max).any(axis=(0, 2))
+    return (p[:, : int(np.argmax(large)) if large.any() else steps] ** 2).mean(axis=2)
 
 
-class Responses(NamedTuple):
-    """Mean squares of position and input by number of steps after a push of strength 1."""
-
-    squares: Array
-    """Shape (timings, 2, sources, window)."""
-
-    def growth(self) -> tuple[float, float | None]:
-        """Growth of the second moment, and half-width of its 95 % interval (jackknife)."""
-        h = self.squares[:, 0, :WIND].sum(axis=1)
-        n, mean = len(h), _growth(h.mean(axis=0))
-        if n < 2:
-            return mean, None
-        others = np.array([_growth(np.delete(h, i, axis=0).mean(axis=0)) for i in range(n)])
-        error = math.sqrt((n - 1) * others.var())
-        return mean, float(stats.t.ppf(0.975, n - 1)) * error
-
-    def rms(self, scenario: Scenario) -> tuple[float, float, float]:
-        """Root mean square of the position, half of its 95 % interval, and that of the input."""
-        wind, noises = strengths(scenario)
-        sources = np.array([wind, wind, *noises])[: self.squares.shape[2]]
-        each = np.einsum("tqsn,s->tq", self.squares, sources**2)
-        # Beyond the simulated window, the response is extrapolated with its decay.
-        growth, _ = self.growth()
-        each += np.einsum("tqs,s->tq", self.squares[..., -1], sources**2) * growth / (1.0 - growth)
-        variance, half = interval(each[:, 0].tolist())
-        rms = math.sqrt(variance or 0.0)
-        rms_input = math.sqrt(each[:, 1].mean())
-        return rms, 0.5 * half / rms if half and rms else 0.0, rms_input
+def _positions_and_inputs(flights: Sequence[Record]) -> tuple[Array, Array]:
+    """Positions [m] and inputs [m/s] of flights; each of shape (runs, steps, axes)."""
+    steps = min(len(flight.client) for flight in flights)
+    return (
+        np.array([flight.client["state"][:steps, :, 0] for flight in flights]),
+        np.array([flight.client["input"][:steps] for flight in flights]),
+    )
 
 
 def _growth(h: Array) -> float:
-    """Growth per step in the later part of a response, by least squares of its logarithm.
+    """Growth per step in the later part of an answer, by least squares of its logarithm.
 
-    Averaging over quarters of the response removes most of slow oscillations.
+    Averaging over quarters of the answer removes most of slow oscillations.
     """
+    (rounded,) = np.nonzero(h < FLOOR * h[:1])
+    h = h[: int(rounded[0])] if len(rounded) else h
     width = max(1, len(h) // 4)
     means = np.convolve(h, np.full(width, 1.0 / width), "valid")
     steps = np.arange(len(h) // 3, len(means))
@@ -273,21 +271,67 @@ def _growth(h: Array) -> float:
     return float(np.exp(np.polyfit(steps, np.log(means[steps]), 1)[0]))
 
 
-def strengths(scenario: Scenario) -> tuple[float, tuple[float, float]]:
-    """White wind, and standard deviations of the noise, for which the error is computed."""
-    sensor = scenario.sensor
-    noises = (sensor.position_noise_m, sensor.velocity_noise_mps)
+def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
+    """Margin of a scenario, flown for a number of seeds.
+
+    Args:
+        vehicle: name of the scenario's vehicle.
+        trigger: see `clocked_trigger`.
+    """
+    growth, half = growth_of(scenario, trigger, runs)
+    if growth + (half or 0.0) >= 1.0:
+        none = dict.fromkeys(("rms_m", "rms_ci95_m", "rms_input_mps", "saturated"))
+        return Margin(vehicle=vehicle, growth=growth, growth_ci95=half, stable=False, **none)
+    # It blows from there on: until its first plan a vehicle drifts, and comes back for long.
+    begin_s = settled_s(scenario)
+    wind = [(begin_s, {"vehicle.wind": wind_of(scenario)})]
+    flown = hovering(scenario, begin_s + WIND_BUILDS_S + WIND_S)
+    counted = round((begin_s + WIND_BUILDS_S) / scenario.control.dt)
+    flights = _flown(flown, runs, changes=wind)
+    p, u = (each[:, counted:] for each in _positions_and_inputs(flights))
+    variances = [interval(axis.tolist()) for axis in (p**2).mean(axis=1).T]
+    rms = [math.sqrt(mean or 0.0) for mean, _ in variances]
+    halves = [
+        0.5 * (half or 0.0) / one if one else 0.0
+        for (_, half), one in zip(variances, rms, strict=True)
+    ]
+    return Margin(
+        vehicle=vehicle,
+        growth=growth,
+        growth_ci95=half,
+        stable=True,
+        rms_m=tuple(rms),
+        rms_ci95_m=tuple(halves) if runs > 1 else None,
+        rms_input_mps=tuple(np.sqrt((u**2).mean(axis=(0, 1))).tolist()),
+        saturated=float((np.abs(u) >= AT_BOUND * scenario.u_max).any(axis=2).mean()),
+    )
+
+
+def wind_of(scenario: Scenario) -> float:
+    """White wind in which vehicles are flown [m/s per √s]."""
+    noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
     alone = not any(noises) and scenario.vehicle.wind == 0.0
-    return WIND_ALONE if alone else scenario.vehicle.wind, noises
+    return WIND_ALONE if alone else scenario.vehicle.wind
 
 
-def responses(scenario: Scenario, loop: Loop, given: Sequence[Timing], pushes: int) -> Responses:
-    """Responses to pushes along each timing, simulated a number per source at once."""
-    dt = scenario.control.dt
-    begin, window = round(SETTLE_S / dt), max(round(FOLLOWED_S / dt), 2)
-    each = []
-    for timing in given:
-        window = max(2, min(window, (len(timing.in_force) - begin) // 2))
-        squares, counts = respond(scenario, loop, timing, begin, window, min(pushes, window))
-        each.append(squares / np.maximum(counts, 1))
-    return Responses(np.array(each))
+def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> Limit:
+    """Limit of a quantity, by bisection: between a stable vehicle and one that is not.
+
+    Args:
+        quantity: one of LIMITS.
+        trigger: see `clocked_trigger`.
+        runs: number of seeds for each value.
+    """
+    name, near, far = LIMITS[quantity]
+    found, searched = None, far
+
+    def is_stable(value: float) -> bool:
+        differing = Differing(**{name: value}).of(scenario)
+        return growth_of(differing, trigger, runs)[0] < 1.0
+
+    if not is_stable(far):
+        for _ in range(HALVINGS):
+            middle = math.sqrt(near * far) if near else 0.5 * (near + far)
+            near, far = (middle, far) if is_stable(middle) else (near, middle)
+        found = near
+    return Limit(quantity=quantity, searched=searched, value=found)

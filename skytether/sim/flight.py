@@ -120,6 +120,7 @@ def fly_batch(
     scenario: Scenario,
     seeds: Sequence[int],
     *,
+    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[Record]:
@@ -132,6 +133,7 @@ def fly_batch(
     Args:
         scenario: what to fly.
         seeds: seeds in place of the scenario's, no two alike.
+        changes: see `fly`.
         on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
 
     Raises:
@@ -142,7 +144,11 @@ def fly_batch(
     alone = not in_time or scenario.is_mission or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
-    flights = [flight for group in groups for flight in _fly(scenario, group, on_second, stopped)]
+    flights = [
+        flight
+        for group in groups
+        for flight in _fly(scenario, group, on_second, stopped, changes=changes)
+    ]
     for _, _, event in (event for flight in flights for event in flight.events):
         if isinstance(event, Fault):
             raise ConfigError(event.traceback.splitlines()[-1])
@@ -354,7 +360,8 @@ def _fly(
     # Added last, the server is woken last at an instant: it has heard everything due by then.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
-    plan_changes(world, scenario, {SERVER[0]: server, **runs[0].hosts, **beside}, changes)
+    hosts = {host: endpoint for run in runs for host, endpoint in run.hosts.items()}
+    plan_changes(world, scenario, {SERVER[0]: server, **hosts, **beside}, changes)
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
 
     error_ns = seconds_to_ns(scenario.simulation.time_error_s)

@@ -41,6 +41,15 @@ def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Record]:
     return flights
 
 
+def test_a_change_in_flight_reaches_every_run_of_a_batch() -> None:
+    """At the same time as it would alone."""
+    changes = [(1.0, {"vehicle.wind": 0.3})]
+    together = [each.trace_hash() for each in fly_batch(scenario(), (1, 2), changes=changes)]
+    alone = [fly(scenario(seed=seed), changes=changes).trace_hash() for seed in (1, 2)]
+    assert together == alone
+    assert together != [each.trace_hash() for each in fly_batch(scenario(), (1, 2))]
+
+
 directions = st.fixed_dictionaries(
     {
         "delay": st.sampled_from(["poisson", "constant", "none"]),

@@ -14,7 +14,6 @@ import pytest
 import warm
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
-from skytether.lab import maps
 from skytether.shell import command
 
 pytestmark = pytest.mark.long
@@ -88,7 +87,6 @@ def test_a_documented_flight_flies(
     if re.search(r"--duration (20|600)\b", line):
         line += " --settle 0 --duration 4"
     _, *argv = shlex.split(line)
-    monkeypatch.setattr(maps, "TIMINGS", 2)
     monkeypatch.chdir(tmp_path)
     if argv[0] in ("fly", "fleet"):
         run = warm.skytether(*argv)

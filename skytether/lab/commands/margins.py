@@ -1,24 +1,26 @@
 """`skytether margins`: stability of a scenario's loop, and the vehicles for which it holds."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from skytether.lab import maps
 from skytether.lab import margins as lab
-from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
 from skytether.lab.journal import Journal
 from skytether.lab.maps import Box, MapPoint
-from skytether.lab.margins import Margin
-from skytether.shared.base import files, kernel
+from skytether.lab.margins import Limit, Margin
+from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, terminal
@@ -35,8 +37,7 @@ class MarginsOptions:
     scenario: ScenarioName = "demo"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
     runs: Annotated[int, tyro.conf.arg(metavar="N")] = 16
-    """Number of flights whose packet timing is used, with seeds that count up from the
-    scenario's."""
+    """Number of seeds that each vehicle is flown with, which count up from the scenario's."""
     json: Path | None = None
     """File for the figures."""
     maps: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -55,20 +56,22 @@ class MarginsOptions:
 
 
 def margins(argv: Sequence[str]) -> None:
-    """Compute whether a scenario's loop is stable, for its own vehicle and for others.
+    """Fly a scenario's loop, and find for which vehicles it is stable.
 
-    While no bound is active, the loop is linear for a given timing of packets. Along the timings of
-    some flights, the decay of the mean square after a disturbance is computed:
+    Flown in virtual time, hovering, over the scenario's network. After a weak push:
 
-      growth   of the mean square per step; below 1 the loop is stable in the mean square
-      RMS      of the position's deviation, under the scenario's white wind and noise alone
-      bound    share of the steps at which an input would exceed its bound: above some percent
-               the loop is not linear, and the true RMS is larger
+      growth   of the mean square of the deviation per step; below 1 the loop is stable
+
+    In the scenario's white wind and noise alone, where the loop is stable:
+
+      RMS      of the position's deviation
+      bound    share of the steps with an input at its bound
 
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
-    other rows the vehicle differs as stated, which shows how wrong the model may be. With a trigger
-    that looks at the state the loop is not linear; then a periodic trigger with the same rate is
-    used.
+    other rows the vehicle differs as stated. The second table has limits, found by bisection: how
+    far one quantity may differ, relative to the model, before the loop is no longer stable. With a
+    trigger that looks at the state, pushes are flown with a periodic one that sends as often,
+    because a weak push stays below every threshold.
 
     With --maps FOLDER every vehicle of a box is flown as well, without wind: FOLDER/points.csv has
     a row for each, FOLDER/maps.png shows where the flight ends in a limit cycle, and the RMSE. The
@@ -81,38 +84,48 @@ def margins(argv: Sequence[str]) -> None:
     if options.maps is not None:
         _box(options, scenario.control.trigger)
         command.claim_folder("--maps", options.maps, "points.csv", "maps.png")
-    rates = lab.looks_at_state(scenario)
-    rows = {lab.AS_IT_IS: scenario}
-    rows |= {name: each.of(scenario) for name, each in lab.VEHICLES.items() if each.is_of(scenario)}
-    total = len(rows) + 1 + rates
-    terminal.prepare(kernel.missing())
-    with (
-        command.interruptible() as interrupted,
-        terminal.progress("computing margins", total, "parts") as bar,
-    ):
+    vehicles = {lab.AS_IT_IS: scenario}
+    vehicles |= {
+        name: each.of(scenario) for name, each in lab.VEHICLES.items() if each.is_of(scenario)
+    }
+    total = len(vehicles) + len(lab.LIMITS) + 1
+    try:
+        with crew(
+            options.pool, f"flying vehicles like {options.scenario}'s", total, "parts"
+        ) as flyers:
+            (trigger,) = flyers.map(lab.clocked_trigger, [scenario])
+            flyers.advance(1)
+            parts: list[Callable[[], Margin | Limit]] = [
+                partial(lab.margin, each, name, trigger, options.runs)
+                for name, each in vehicles.items()
+            ]
+            runs = min(options.runs, lab.LIMIT_RUNS)
+            parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
+            found: dict[int, Margin | Limit] = {}
 
-        def check(done: int) -> None:
-            bar(done)
-            if interrupted():
-                raise CommandError("interrupted", command.INTERRUPTED)
+            def keep(number: int, result: Margin | Limit) -> None:
+                found[number] = result
+                flyers.advance(1)
 
-        if rates:
-            scenario = lab.equivalent_period(scenario, stopped=interrupted)
-            check(1)
-        trigger = scenario.control.trigger
-        given = lab.timings(scenario, options.runs, stopped=interrupted)
-        check(1 + rates)
-        found = []
-        for name, each in rows.items():
-            alike = msgspec.structs.replace(each, control=scenario.control)
-            found.append(lab.margin(alike, name, given))
-            check(1 + rates + len(found))
+            flyers.share(_fly, parts, keep)
+    except Interrupted as interrupted:  # nothing is kept of what was flown
+        raise CommandError("interrupted", command.INTERRUPTED) from interrupted
+    results = [found[number] for number in range(len(parts))]
+    flown = [each for each in results if isinstance(each, Margin)]
+    limits = [each for each in results if isinstance(each, Limit)]
     if options.json is not None:
-        content = {"scenario": options.scenario, "trigger": trigger}
-        command.write(options.json, msgspec.json.encode(content | {"margins": found}))
-    _show(options, scenario, found)
+        about = {"scenario": options.scenario, "trigger": trigger}
+        content = msgspec.json.encode(about | {"margins": flown, "limits": limits})
+        command.write(options.json, content)
+    _show(options, trigger, flown)
+    _show_limits(limits)
     if options.maps is not None:
         _map(options, options.maps, trigger)
+
+
+def _fly(part: Callable[[], Margin | Limit]) -> Margin | Limit:
+    """Result of a part; called in a worker."""
+    return part()
 
 
 def _box(options: MarginsOptions, trigger: str) -> Box:
@@ -169,7 +182,7 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
     table = Table(title=title, title_justify="left", min_width=len(title))
     headings = ("bursts [s]", "dead time [s]", "vehicles", "limit cycles", "not stable")
     for heading in (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"):
-        table.add_column(heading, justify="right")
+        table.add_column(escape(heading), justify="right")
     for (burst_s, dead_time_s), group in groups.items():
         rmse = np.array([point.rmse_m or np.nan for point in group])
         saturated = max(point.saturated or 0.0 for point in group)
@@ -186,39 +199,52 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
     terminal.show(table)
 
 
-def _show(options: MarginsOptions, scenario: Scenario, found: Sequence[Margin]) -> None:
-    wind, noises = lab.strengths(scenario)
-    strengths = f"white wind {wind:g}"
+def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> None:
+    """Print a row for each vehicle."""
+    scenario = options.config
+    title = f"{options.scenario}, {options.runs} seeds, white wind {lab.wind_of(scenario):g}"
+    noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
     if any(noises):
-        strengths += f", noise {noises[0]:g} m and {noises[1]:g} m/s"
-    title = f"{options.scenario}, {options.runs} timings, {strengths}"
-    if scenario.control.trigger != options.config.control.trigger:
+        title += f", noise {noises[0]:g} m and {noises[1]:g} m/s"
+    if trigger != scenario.control.trigger:
         print(
-            f"control.trigger: {options.config.control.trigger!r} looks at the state, so that the "
-            f"loop is not linear: computed for {scenario.control.trigger!r}, which sends as often"
+            f"control.trigger: {scenario.control.trigger!r} looks at the state; pushes are flown "
+            f"with {trigger!r}, which sends as often"
         )
     table = Table(title=title, title_justify="left", min_width=len(title))
     table.add_column("vehicle")
     table.add_column("growth")
     table.add_column("stable")
     for axis in "xyz"[: scenario.model.axes]:
-        table.add_column(f"RMS {axis} [m]", justify="right")
+        table.add_column(escape(f"RMS {axis} [m]"), justify="right")
     table.add_column("bound", justify="right")
     for each in found:
-        half = "" if each.growth_ci95 is None else f" ± {each.growth_ci95:.4f}"
-        rms = ["-"] * scenario.model.axes
-        if each.rms_m is not None:
-            halves: Sequence[Any] = each.rms_ci95_m or [None] * len(rms)
-            rms = [
-                f"{value:.4f}" + ("" if around is None else f" ± {around:.4f}")
-                for value, around in zip(each.rms_m, halves, strict=True)
-            ]
-        beyond = each.saturated(scenario.u_max.tolist())
+        rms: Sequence[float | None] = each.rms_m or [None] * scenario.model.axes
+        halves = each.rms_ci95_m or [None] * len(rms)
         table.add_row(
             each.vehicle,
-            f"{each.growth:.4f}{half}",
+            _with_interval(each.growth, each.growth_ci95),
             "yes" if each.stable else "no",
-            *rms,
-            "-" if beyond is None else f"{beyond:.1%}",
+            *map(_with_interval, rms, halves),
+            "-" if each.saturated is None else f"{each.saturated:.1%}",
         )
+    terminal.show(table)
+
+
+def _with_interval(value: float | None, half: float | None) -> str:
+    """Value and half-width of its interval in a table."""
+    if value is None:
+        return "-"
+    return f"{value:.4f}" + ("" if half is None else f" ± {half:.4f}")
+
+
+def _show_limits(limits: Sequence[Limit]) -> None:
+    """Print a row for each limit."""
+    table = Table(title="stable up to, relative to the model", title_justify="left", min_width=36)
+    table.add_column("quantity")
+    table.add_column("limit", justify="right")
+    for each in limits:
+        beyond = "<" if each.quantity.endswith("least") else ">"
+        unknown = f"{beyond} {each.searched:g}"
+        table.add_row(escape(each.quantity), unknown if each.value is None else f"{each.value:.3g}")
     terminal.show(table)
