@@ -40,8 +40,8 @@ def test_a_key_without_one_owner_is_a_mistake(section: type[Section]) -> None:
 
 
 def test_the_documented_keys_change_in_flight() -> None:
-    """Exactly those in the table of docs/control.md, at each socket."""
-    text = (DOCS / "control.md").read_text()
+    """Exactly those in the table of docs/operating.md, at each socket."""
+    text = (DOCS / "operating.md").read_text()
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
     assert named["server"] == TRIGGER | POINT | ZONES | GOALS

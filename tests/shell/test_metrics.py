@@ -428,7 +428,7 @@ def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
 
 def test_the_documented_metrics_are_those_there_are() -> None:
     """Line by line: name, kind and what it is; and the labels that a number has."""
-    text = (ROOT / "docs" / "feed.md").read_text()
+    text = (ROOT / "docs" / "operating.md").read_text()
     lines = re.findall(r"^\| `skytether_(\w+)` \| (\w+) \| ([^|]*) \| (.*) \|$", text, re.MULTILINE)
     documented = {(name, kind, what) for name, kind, _, what in lines}
     assert documented == {

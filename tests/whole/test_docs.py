@@ -159,9 +159,9 @@ def fly_together(lines: list[str], folder: Path) -> str:
 def test_the_documented_changes_are_made_in_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those of docs/control.md, one after the other, and the flight that they are for."""
+    """Those of docs/operating.md, one after the other, and the flight that they are for."""
     monkeypatch.chdir(tmp_path)
-    (flies,), changes = blocks(ROOT / "docs" / "control.md")
+    (flies,), changes, *_ = blocks(ROOT / "docs" / "operating.md")
     with subprocess.Popen(
         skytether(flies), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     ) as flight:
@@ -262,9 +262,9 @@ def test_documented_targets_exist(line: str) -> None:
 
 
 def test_documented_extras_exist() -> None:
-    """Extras for users are all in docs/install.md; every documented `pip install` names one."""
+    """Extras for users are all in docs/running.md; every documented `pip install` names one."""
     extras = set(metadata.metadata("skytether").get_all("Provides-Extra", ()))
-    page = (ROOT / "docs" / "install.md").read_text()
+    page = (ROOT / "docs" / "running.md").read_text()
     told = set(re.findall(r"(?m)^\| `(\w+)` \| .* \| .* \|$", page.partition("| extra |")[2]))
     assert told == extras - {"bench", "dev", "docs", "fuzz"}
     for document in DOCUMENTS:

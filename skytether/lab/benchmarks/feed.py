@@ -5,9 +5,9 @@ readers changes every few seconds, in a random order each round, so that disturb
 programs affect all numbers alike. Three times are taken of each tick: the CPU time of this thread,
 the wall-clock time, and how long after the deadline the last packet was sent.
 
-`python -m skytether.lab.benchmarks.feed` takes three minutes; docs/feed.md has the results. With
-`--pages` each reader is a page in a browser: a process that serves it, and a tab of Chromium on
-this machine.
+`python -m skytether.lab.benchmarks.feed` takes three minutes; docs/operating.md has the results.
+With `--pages` each reader is a page in a browser: a process that serves it, and a tab of Chromium
+on this machine.
 """
 
 import os

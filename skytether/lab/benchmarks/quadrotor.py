@@ -1,7 +1,7 @@
 """Quadrotors in hover and in steps of velocity, as a table and a picture.
 
 `python -m skytether.lab.benchmarks.quadrotor docs/quadrotor.png` draws the picture of
-docs/quadrotor.md and prints its tables.
+docs/vehicles.md and prints its tables.
 """
 
 import sys
