@@ -4,7 +4,7 @@
 both of the scripted autopilot's flavours, in calm air and in wind, in virtual time: Skytether with
 `vehicle.kind = "mavlink"`, and set-points sent straight by each of the laws of `station.laws`. All
 meet the networks and winds of the same seeds, counted from each one's start. Each flight is
-repeated with the network cut for a while. With --write, the tables go into docs/straight.md.
+repeated with the network cut for a while. With --write, the tables go into docs/compare.md.
 """
 
 import io
@@ -36,7 +36,7 @@ from skytether.sim import flight, straight
 from skytether.station import laws
 from skytether.station.joined import state_at, summary_of, within
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "straight.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "compare.md"
 Air = Literal["calm", "wind"]
 INPUTS: dict[str, Any] = {
     "scheme": "committed",
@@ -304,7 +304,7 @@ class AutopilotBenchmarkOptions:
     json: Path | None = None
     """File for the figures of every flight; flights already in the file are not repeated."""
     write: bool = False
-    """Put the tables into docs/straight.md."""
+    """Put the tables into docs/compare.md."""
 
 
 def main() -> int:

@@ -1,6 +1,6 @@
 """Names that a plug-in imports: the decorators, and the types of what its functions are given.
 
-docs/triggers.md has triggers, docs/targets.md references, docs/vehicles.md vehicles,
+docs/triggers.md has triggers, docs/schemes.md references, docs/vehicles.md vehicles,
 docs/network.md impairments.
 """
 

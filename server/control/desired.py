@@ -3,7 +3,7 @@
 A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
 `reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
 k + preview. What lies beyond is predicted from the desired state there, which goes on at its
-velocity; that of a target turns round at the bounds within which it moves (docs/targets.md has what
+velocity; that of a target turns round at the bounds within which it moves (docs/schemes.md has what
 else was tried). Of a point that is moved in flight only the present is known (`live`), and the same
 for all vehicles.
 

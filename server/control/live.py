@@ -13,7 +13,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 
 MEMORY_S = 0.2
-"""Time constant of the mean of velocities [s]; docs/targets.md says why it is this long."""
+"""Time constant of the mean of velocities [s], the smallest that tolerates moves wrong by 2 cm."""
 REST_S = 1.0
 """Time without a move after which a point rests [s]."""
 

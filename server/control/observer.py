@@ -43,6 +43,6 @@ def learned(
     """
     # A change of w changes the velocity after m steps by 1 - a11^m of it.
     missing = off / (1.0 - a11**m)
-    # Tried at the full speed: the loop swings at round trips beyond 1.5 s (docs/committed.md).
+    # Tried at the full speed: the loop swings at round trips beyond 1.5 s (docs/schemes.md).
     slower = max(1.0, trip_ns / TRIP_NS)
     return bounded(w + (1.0 - decay ** (m / slower)) * missing, bound)

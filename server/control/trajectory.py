@@ -186,7 +186,7 @@ class Guidance:
         # TINY: weights that ask for no gain on position would divide by 0.
         lead_s = (1.0 + regulator[:, 1]) / np.maximum(regulator[:, 0], TINY)
         # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
-        # the spline goes straight on: measured, such plans led up to 12 m away (docs/envelope.md).
+        # the spline goes straight on: measured, such plans led up to 12 m away (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self.counts: Counter[str] = Counter()
         self._desired, self._clock = desired, clock

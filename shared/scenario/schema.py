@@ -258,7 +258,7 @@ class VehicleConfig(Section, frozen=True):
     gust_s: OfWind[MeanTime] = 1.0
     """Mean length of a gust [s]."""
     frame: OfVehicle[Literal["auto", "crazyflie", "1.5kg", "sih"]] = "auto"
-    """Frame of a quadrotor, see docs/quadrotor.md; auto: 1.5kg, and of an autopilot the one that
+    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, and of an autopilot the one that
     its own simulator flies."""
     battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
     """Charge of a quadrotor's battery at the start, from 0 to 1; endless: it stays full."""

@@ -116,7 +116,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
                 (axes, 2),
             ),  # true position [m] and velocity [m/s]; the estimate where nobody knows
             ("measured", "<f8", (axes, 2)),  # had of it since the step before, NaN for nothing
-            ("estimate", "<f8", (axes, 2)),  # what is reported and flown by, see docs/noise.md
+            ("estimate", "<f8", (axes, 2)),  # what is reported and flown by, see docs/vehicles.md
             ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
             ("covered", "?"),  # whether that is an input of a horizon, neither hovering nor braking
             ("in_force", "<i8"),  # step that its horizon was made for, -1 for none

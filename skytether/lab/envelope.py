@@ -58,7 +58,7 @@ ROUNDING = 1e-6
 Outcome = Literal[
     "flown", "interrupted", "hovering", "unanswered", "refused", "astray", "flyaway", "crashed"
 ]
-"""Outcome of a point, as explained in docs/envelope.md."""
+"""Outcome of a point, as explained in docs/studies.md."""
 BAD: tuple[Outcome, ...] = ("crashed", "flyaway")
 """Forbidden outcomes, the worst first."""
 WRONG: tuple[Outcome, ...] = (*BAD, "astray")

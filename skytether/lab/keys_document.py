@@ -25,8 +25,9 @@ page is for looking up, and made from `shared/scenario/schema.py` by `make keys`
   [term](protocol.md#terms): where the ends differ in it, there is no flight. Keys with another
   owner may differ. With *each end*, both use a value of their own. Keys of *virtual time* are not
   used over UDP.
-- Keys with "yes" under **in flight** may be [changed in flight](control.md); position and velocity
-  of a point only where `reference.shape = "live"`.
+- Keys with "yes" under **in flight** may be
+  [changed in flight](operating.md#change-keys-in-flight); position and velocity of a point
+  only where `reference.shape = "live"`.
 - **Values** are written as in TOML; *list of numbers, 0 to 1* bounds each number.
 - Meanings use the terms of the [glossary](glossary.md), such as [horizon](glossary.md#horizon),
   [trigger](glossary.md#trigger) and [scheme](glossary.md#scheme).

@@ -1,8 +1,8 @@
 """Numbers that may be changed in flight, described as the sliders of a page.
 
 Each has a name, a range, and functions to read it from, and write it to, the keys that a process
-lets change (docs/control.md). Nothing is checked here: the processes check changes as they check a
-scenario.
+lets change (docs/operating.md). Nothing is checked here: the processes check changes as they check
+a scenario.
 """
 
 from collections.abc import Callable, Mapping

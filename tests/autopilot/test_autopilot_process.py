@@ -17,7 +17,7 @@ from warm import Command, skytether
 
 ROOT = Path(__file__).parents[2]
 LINES = re.findall(
-    r"^skytether (autopilot .*)$", (ROOT / "docs/autopilot.md").read_text(), re.MULTILINE
+    r"^skytether (autopilot .*)$", (ROOT / "docs/fly-a-real-one.md").read_text(), re.MULTILINE
 )
 
 

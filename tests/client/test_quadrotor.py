@@ -218,7 +218,7 @@ def test_it_hovers(frame: Frame, gains: Gains) -> None:
 def test_a_step_of_1_mps_is_as_documented(
     frame: Frame, gains: Gains, half_s: float, most: float, axis: int
 ) -> None:
-    """Half of it is reached when docs/quadrotor.md says so, its peak is no higher; both ways."""
+    """Half of it is reached when docs/vehicles.md says so, its peak is no higher; both ways."""
     velocity = np.eye(3)[axis]
     rows = response(quadrotor(frame, gains), tuple(velocity))
     values = rows[:, 3 + axis]
@@ -273,7 +273,7 @@ def test_px4_stands_in_a_wind_that_drags_with_6_newtons(
 def test_turbulence_moves_it_as_documented(
     frame: Frame, gains: Gains, least_mps: float, most_mps: float
 ) -> None:
-    """In hover, in a wind of 6 m/s: docs/straight.md."""
+    """In hover, in a wind of 6 m/s: docs/compare.md."""
     flown_ = quadrotor(frame, gains)
     flown_.blow((6.0,), 6.0)
     rows = response(flown_, (0.0, 0.0, 0.0), 600.0)[6000:]

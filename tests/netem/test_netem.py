@@ -1,4 +1,4 @@
-"""Netem for any UDP: the examples of docs/netem.md, with real programs on loopback."""
+"""Netem for any UDP: the examples of docs/network.md, with real programs on loopback."""
 
 import re
 import shlex
@@ -30,7 +30,7 @@ from skytether.shell.udp import leads_back
 from skytether.view import traffic
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "netem.md").read_text()
+TEXT = (ROOT / "docs" / "network.md").read_text()
 BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)]
 PATIENCE_S = 60.0
 

@@ -38,7 +38,7 @@ def test_a_key_without_one_owner_is_a_mistake(section: type[Section]) -> None:
 
 
 def test_the_documented_keys_change_in_flight() -> None:
-    text = (DOCS / "control.md").read_text()
+    text = (DOCS / "operating.md").read_text()
     rows = re.findall(r"^\| (server|netem|client) \| (.*) \|$", text, re.MULTILINE)
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
     assert named["server"] == TRIGGER | POINT | ZONES | GOALS

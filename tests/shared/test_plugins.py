@@ -33,8 +33,8 @@ from skytether.shell import plugins
 from skytether.sim.flight import fly, fly_batch
 
 ROOT = Path(__file__).parents[2]
-TRIGGERS_MD, TARGETS_MD, VEHICLES_MD, NETWORK_MD = (
-    ROOT / "docs" / f"{name}.md" for name in ("triggers", "targets", "vehicles", "network")
+TRIGGERS_MD, SCHEMES_MD, VEHICLES_MD, NETWORK_MD = (
+    ROOT / "docs" / f"{name}.md" for name in ("triggers", "schemes", "vehicles", "network")
 )
 HEAD = "import numpy as np\nfrom skytether.plugin import *\n"
 NEVER = """\
@@ -99,15 +99,16 @@ def faults(flight: Record) -> list[str]:
 
 def example(document: Path) -> str:
     """The one plug-in in a document."""
-    (code,) = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
-    return str(code)
+    blocks: list[str] = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
+    (code,) = (block for block in blocks if "skytether.plugin" in block)
+    return code
 
 
 @pytest.mark.parametrize(
     ("document", "file"),
     [
         (TRIGGERS_MD, "slip.py"),
-        (TARGETS_MD, "spiral.py"),
+        (SCHEMES_MD, "spiral.py"),
         (VEHICLES_MD, "cart.py"),
         (NETWORK_MD, "fading.py"),
     ],
@@ -134,7 +135,7 @@ def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) 
 
 def test_the_documented_reference_moves_as_fast_as_it_says(tmp_path: Path) -> None:
     """Its velocity is the slope of its positions; at the end it rests at `radius_m`."""
-    plug(tmp_path, example(TARGETS_MD))
+    plug(tmp_path, example(SCHEMES_MD))
     wanted = {"shape": "spiral(2)", "period_s": 40.0, "radius_m": 3.0}
     at = scenario(reference=wanted).make_reference()
     times = np.linspace(1.0, 39.0, 300)

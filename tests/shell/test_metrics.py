@@ -421,7 +421,7 @@ def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
 
 
 def test_the_documented_metrics_are_those_there_are() -> None:
-    text = (ROOT / "docs" / "feed.md").read_text()
+    text = (ROOT / "docs" / "operating.md").read_text()
     lines = re.findall(r"^\| `skytether_(\w+)` \| (\w+) \| ([^|]*) \|", text, re.MULTILINE)
     assert {(name, kind) for name, kind, _ in lines} == {
         (each.name, "gauge" if each.kind == "modes" else each.kind)

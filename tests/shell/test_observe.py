@@ -29,7 +29,7 @@ pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 OBSERVE = ROOT / "deploy"
-DOCUMENT = ROOT / "docs" / "feed.md"
+DOCUMENT = ROOT / "docs" / "operating.md"
 DASHBOARD = json.loads((OBSERVE / "grafana" / "dashboards" / "skytether.json").read_text())
 RULES = yaml.safe_load((OBSERVE / "rules.yml").read_text())
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -132,7 +132,7 @@ def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]])
 
 
 def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str]], str]) -> None:
-    """The program in docs/feed.md prints positions while three processes fly."""
+    """The program in docs/operating.md prints positions while three processes fly."""
     lines = flown[1].splitlines()
     assert len(lines) > 20
     assert all(re.fullmatch(r"vehicle 1 is at \[[^]]*\] m", line) for line in lines)

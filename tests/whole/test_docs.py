@@ -150,9 +150,9 @@ def fly_together(lines: list[str], folder: Path) -> str:
 def test_the_documented_changes_are_made_in_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those of docs/control.md, one after the other, and the flight that they are for."""
+    """Those of docs/operating.md, one after the other, and the flight that they are for."""
     monkeypatch.chdir(tmp_path)
-    (flies,), changes = blocks(ROOT / "docs" / "control.md")
+    (flies,), changes, *_ = blocks(ROOT / "docs" / "operating.md")
     with subprocess.Popen(
         skytether(flies), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     ) as flight:

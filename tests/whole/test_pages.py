@@ -21,7 +21,7 @@ def test_the_page_of_commands_has_every_command() -> None:
 
 
 def test_the_page_of_the_library_has_every_name() -> None:
-    text = (DOCS / "library.md").read_text()
+    text = (DOCS / "python.md").read_text()
     named = re.findall(r"^::: skytether\.(\w+)$", text, re.MULTILINE)
     assert sorted(named) == sorted([*skytether.__all__, "plugin"])
 
@@ -44,4 +44,4 @@ def test_the_site_is_built_and_loads_nothing_from_outside(tmp_path: Path) -> Non
     for page in built:
         text = (site / page).read_text()
         assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(https?:[^"]+)"', text), page
-    assert 'id="skytether.fly"' in (site / "library.html").read_text()
+    assert 'id="skytether.fly"' in (site / "python.html").read_text()

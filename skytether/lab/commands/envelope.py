@@ -47,7 +47,7 @@ def envelope(argv: Sequence[str]) -> None:
     scenario's. A point is "flown" if it stays within 1 m of the reference, "refused" with one line,
     or "hovering" if it ends without a plan and brakes. A vehicle that moves when it should brake,
     or leaves the reference's surroundings, is a "flyaway": the exit code is then 1, and the printed
-    command line flies the point again. docs/envelope.md explains each outcome.
+    command line flies the point again. docs/studies.md explains each outcome.
 
     OUT/points.csv has a row for each point, OUT/envelope.png shows the outcomes. All flights are
     kept: after Ctrl-C or a crash, the same command continues.
