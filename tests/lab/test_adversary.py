@@ -28,6 +28,7 @@ from skytether.lab.adversary import (
     spare_m,
 )
 from skytether.lab.commands.adversary import Kept
+from skytether.lab.commands.pool import Interrupted
 from skytether.server.control.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
@@ -39,6 +40,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command
 from skytether.sim.world import World
 
 Patch = Callable[[pytest.MonkeyPatch], None]
@@ -307,6 +309,30 @@ def test_the_command_ends_well_where_all_distances_are_kept(
     monkeypatch.setattr(commands, "crew", alone)
     assert main(["adversary", *SHORT, "--with", "losses,copies", "--tries", "2", "--random"]) == 0
     assert "2, losses,copies" in capsys.readouterr().out
+
+
+def test_a_search_that_is_interrupted_shows_and_keeps_what_was_flown(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    @contextmanager
+    def one_climb(*_: object) -> Iterator[Any]:
+        with alone() as flyers:
+            share = flyers.share
+
+            def stopped(function: Callable[[Any], Any], tasks: Sequence[Any], keep: Any) -> None:
+                share(function, tasks[:1], keep)
+                raise Interrupted(1, 2, "flights")
+
+            flyers.share = stopped
+            yield flyers
+
+    monkeypatch.setattr(commands, "crew", one_climb)
+    monkeypatch.setattr(commands, "CLIMB", 1)
+    kept = tmp_path / "found.json"
+    search = (*SHORT, "--with", "losses", "--tries", "2", "--json", str(kept))
+    assert main(["adversary", *search]) == command.INTERRUPTED
+    assert len(msgspec.json.decode(kept.read_bytes())["spares_m"]) == 1
+    assert main(["adversary", *SHORT, "--attack", str(kept)]) == 0
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from skytether.lab.adversary import (
     shrunk,
     spare_m,
 )
-from skytether.lab.commands.pool import Flags, crew
+from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.mission import Mission
@@ -46,6 +46,18 @@ class Kept(msgspec.Struct, frozen=True):
     """Flight with the least spare distance."""
     spares_m: Sequence[float]
     """Spare distance of each flight, see `spare_m` [m]."""
+
+
+class Attack(msgspec.Struct, frozen=True):
+    """Part of an `Approach` that is read again: an infinite distance is null in JSON."""
+
+    moves: Moves
+
+
+class Attacked(msgspec.Struct, frozen=True):
+    """Part of `Kept` that is read again."""
+
+    nearest: Attack
 
 
 ATTACK_BYTES_MAX = 16_000_000
@@ -100,10 +112,17 @@ def adversary(argv: Sequence[str]) -> None:
     else:
         found, spares_m = _search(options, title)
     _finish(options, argv, title, found, spares_m)
+    if spares_m and len(spares_m) < options.tries:
+        said = f"interrupted with {len(spares_m)} of {options.tries} flights done"
+        raise CommandError(said, command.INTERRUPTED)
 
 
 def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float]]:
-    """Flight with the least spare distance, and the spare distances of all flights [m]."""
+    """Flight with the least spare distance, and the spare distances of all flights [m].
+
+    Raises:
+        CommandError: interrupted before any climb was done.
+    """
     command.check_count("--tries", options.tries, TRIES_MAX)
     command.check_count("--moves", options.moves, MOVES_MAX)
     pool, patience = Flags(workers=options.workers), 0 if options.random else PATIENCE
@@ -128,9 +147,13 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
             least_m = min(min(each.spares_m) for each in done.values())
             flyers.advance(len(climbed.spares_m), f"{least_m:.3f} m left")
 
-        flyers.share(climb, tasks, keep)
-    spares_m = [each for number in numbers for each in done[number].spares_m]
-    bests = [done[number].best for number in numbers]
+        try:
+            flyers.share(climb, tasks, keep)
+        except Interrupted:
+            if not done:
+                raise
+    spares_m = [each for number in sorted(done) for each in done[number].spares_m]
+    bests = [done[number].best for number in sorted(done)]
     return min(bests, key=lambda each: spare_m(options.config, each)), spares_m
 
 
@@ -145,7 +168,7 @@ def _moves(text: str) -> Moves:
         return loads(text)
     try:
         content = files.read(Path(text), ATTACK_BYTES_MAX)
-        return msgspec.json.decode(content, type=Kept).nearest.moves
+        return msgspec.json.decode(content, type=Attacked).nearest.moves
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
     except msgspec.DecodeError as error:
