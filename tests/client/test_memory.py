@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lives import Lives, Restart
 from skytether.client.memory import FlownMotion, Kept, Memory, age_max_ns, recall
 from skytether.client.vehicle import Frame
-from skytether.lab.lives import Lives, Restart
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import BegunAnew, ModeChanged

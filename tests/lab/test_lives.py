@@ -1,6 +1,6 @@
 """Missions whose server dies: what an operator has set, and vehicles that are found in a zone."""
 
-from skytether.lab.lives import Death, Lives
+from lives import Death, Lives
 from skytether.shared.core.events import InZone
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.schema import Scenario
