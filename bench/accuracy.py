@@ -18,8 +18,8 @@ from bench.contestants import by_axis
 from bench.harness import TextTable, progress
 from bench.problems import derive, gradients, listening
 from bench.reference import NoReference, Reference
-from skytether.server.control.exact import ExactSolver
-from skytether.server.control.mpc import LATER, Problem, make_mpc, pose
+from skytether.server.mpc.exact import ExactSolver
+from skytether.server.mpc.problem import LATER, Problem, make_mpc, pose
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim.flight import fly

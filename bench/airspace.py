@@ -8,11 +8,11 @@ from collections import deque
 
 import numpy as np
 
-from skytether.server.control.desired import Desired
-from skytether.server.control.planner import Planner
-from skytether.server.control.scheme import foresight
+from skytether.server.common.desired import Desired
+from skytether.server.common.scheme import foresight
 from skytether.server.controller import BLOCK
 from skytether.server.endpoint import Server
+from skytether.server.mpc.hierarchical import Planner
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram

@@ -1,4 +1,4 @@
-"""Solvers for the same QPs: each a `server.control.solver.Solver` for one vehicle, set up once.
+"""Solvers for the same QPs: each a `server.mpc.solver.Solver` for one vehicle, set up once.
 
 The QP of an axis is given to a solver in one of two forms: condensed, in the H inputs alone, or
 sparse, in inputs and states, with (4) as constraints. In the sparse form the free response is
@@ -19,10 +19,10 @@ import osqp
 from scipy import sparse
 from scipy.linalg import block_diag
 
-from skytether.server.control.exact import ExactSolver
-from skytether.server.control.mpc import Problem
-from skytether.server.control.osqp_solver import OsqpSolver
-from skytether.server.control.solver import Solver
+from skytether.server.mpc.exact import ExactSolver
+from skytether.server.mpc.osqp_solver import OsqpSolver
+from skytether.server.mpc.problem import Problem
+from skytether.server.mpc.solver import Solver
 from skytether.shared.law.model import Array, Flags
 
 Factory = Callable[[Problem], Solver]

@@ -43,7 +43,7 @@ import tyro
 from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, crew, writing
 from skytether.lab.journal import Journal
-from skytether.server.control.scheme import Foresight
+from skytether.server.common.scheme import Foresight
 from skytether.server.endpoint import Server
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.routes import Routes

@@ -8,10 +8,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from skytether.server.control import planner
-from skytether.server.control.exact import ExactSolver
-from skytether.server.control.moves import GENERATOR, TRACKER
-from skytether.server.control.mpc import (
+from skytether.server.mpc import hierarchical as planner
+from skytether.server.mpc.appraisal import GENERATOR, TRACKER
+from skytether.server.mpc.exact import ExactSolver
+from skytether.server.mpc.problem import (
     FIRST,
     Problem,
     gradient,
@@ -21,7 +21,7 @@ from skytether.server.control.mpc import (
     simd_batch,
     simd_memory,
 )
-from skytether.server.control.solver import Solver
+from skytether.server.mpc.solver import Solver
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import ControlConfig, Scenario

@@ -1,10 +1,10 @@
 """Algorithm of the server: what is computed at a step of n vehicles, without any datagram.
 
-    observations → x̂(k), x̂(k+d) (`replay` or `estimator`) → X_p(k+d), U(k+d), V, cost gap, deviation
-    (`planner`) → event? (`trigger`) → what is sent, remembered.
+    observations → x̂(k), x̂(k+d) (`schemes`) → X_p(k+d), U(k+d), V, cost gap, deviation
+    (`mpc.hierarchical`) → event? (`trigger`) → what is sent, remembered.
 
 With the schemes "predictive" and "none" d is 0; with "trajectory" nothing is planned, and
-`trajectory`, or on a mission `mission_planner`, stands in place of estimator and planner. Every
+`schemes.trajectory`, or on a mission `missions.mission_planner`, stands in place of both. Every
 vehicle is planned for at every step, for planning is a small part of what a step costs.
 """
 
@@ -15,16 +15,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.budget import SharedBudget
-from skytether.server.control.clock import UNSEEN, ClockMap, Seen, shortest_ns
-from skytether.server.control.committed import Replay
-from skytether.server.control.desired import Desired
-from skytether.server.control.planner import Planner
-from skytether.server.control.predictive import Estimator
-from skytether.server.control.scheme import DOUBTS, Figures, Foresight, Scheme, foresight
-from skytether.server.control.trajectory import Guidance
+from skytether.server import missions
+from skytether.server.budget import SharedBudget
+from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from skytether.server.common.desired import Desired
+from skytether.server.common.scheme import DOUBTS, Figures, Foresight, Scheme, foresight
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
+from skytether.server.mpc import exact, hierarchical
+from skytether.server.mpc.hierarchical import Planner
+from skytether.server.schemes import committed, knots, predictive, sent_horizons, trajectory
+from skytether.server.schemes.committed import Replay
+from skytether.server.schemes.predictive import Estimator
+from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
@@ -43,11 +46,11 @@ BLOCK = 128
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
 _SCHEMES = {
-    "predictive": ("control.predictive", "control.planner", "control.exact"),
-    "none": ("control.predictive", "control.planner", "control.exact"),
-    "committed": ("control.committed", "control.memory", "control.planner", "control.exact"),
-    "trajectory": ("control.trajectory", "control.knots", "control.exact"),
-    "mission": ("missions", "control.knots"),
+    "predictive": (predictive, hierarchical, exact),
+    "none": (predictive, hierarchical, exact),
+    "committed": (committed, sent_horizons, hierarchical, exact),
+    "trajectory": (trajectory, knots, exact),
+    "mission": (missions, knots),
 }
 """Modules and packages whose kernels plan by each scheme, and for missions; the others' kernels are
 called with any of them."""
@@ -57,8 +60,7 @@ def other_schemes(scenario: Scenario) -> set[str]:
     """Names of the modules whose kernels are not called where a scenario is flown."""
     scheme = "mission" if scenario.is_mission else scenario.control.scheme
     others = {*chain.from_iterable(_SCHEMES.values())}.difference(_SCHEMES[scheme])
-    server = __name__.rpartition(".")[0]
-    names = tuple(f"{server}.{each}." for each in others)
+    names = tuple(f"{each.__name__}." for each in others)
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 

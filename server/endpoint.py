@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skytether.server.control.clock import ClockMap
+from skytether.server.common.clock import ClockMap
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception

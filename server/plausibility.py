@@ -39,9 +39,9 @@ class Statement:
     since: int
     """First step flown with that horizon."""
     forward: int
-    """F of `server.control.clock` [ns]."""
+    """F of `server.common.clock` [ns]."""
     backward: int
-    """G of `server.control.clock` [ns]."""
+    """G of `server.common.clock` [ns]."""
     count: int
     """Number of doubted ones in a row that agree, itself included; 0 unless it is doubted."""
 
@@ -99,7 +99,7 @@ class Plausibility:
         Args:
             row: the vehicle.
             observation: what it says.
-            F, G: of the observation and its echo, see `server.control.clock` [ns].
+            F, G: of the observation and its echo, see `server.common.clock` [ns].
 
         Returns:
             a `Belief`.

@@ -6,7 +6,7 @@ CLOSE ends a session. All else is dropped and counted by its reason.
 
 from collections import Counter, deque
 
-from skytether.server.control.clock import ClockMap, Contradiction
+from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.server.controller import Controller
 from skytether.server.gate import Call, Gate
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.control.clock import ClockMap
-from skytether.server.control.knots import inputs_along
-from skytether.server.control.law import axes_of
-from skytether.server.control.scheme import Packing
+from skytether.server.common.clock import ClockMap
+from skytether.server.common.compiled import axes_of
+from skytether.server.common.scheme import Packing
 from skytether.server.controller import BLOCK, Controller, Decisions
+from skytether.server.schemes.knots import inputs_along
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from skytether.server.control.clock import ClockMap
+from skytether.server.common.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import SentMotion

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.clock import EXACT, StepError
+from skytether.server.common.clock import EXACT, StepError
 from skytether.server.missions.compiled_motion import Metric, position_at
 from skytether.server.missions.possible_motions import (
     KNOTS,

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.scheme import FIGURES, Figures, Foresight
+from skytether.server.common.scheme import FIGURES, Figures, Foresight
 from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes

@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from skytether.server.control.clock import ClockMap, StepError
+from skytether.server.common.clock import ClockMap, StepError
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
 from skytether.shared.base.kernel import B1, F1, I1, kernel

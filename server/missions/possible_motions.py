@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.control.clock import EXACT, StepError
+from skytether.server.common.clock import EXACT, StepError
 from skytether.server.missions.compiled_motion import Metric, bounding_box, last_step
 from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, making_kernel, making_part, part
 from skytether.shared.law.model import Array, Indices

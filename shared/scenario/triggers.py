@@ -27,7 +27,7 @@ from skytether.shared.scenario.schema import ControlConfig
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a class like `Trigger`."""
 Figures = NDArray[np.void]
-"""Figures of plans, a record for each vehicle, see `server.control.moves.FIGURES`; shape
+"""Figures of plans, a record for each vehicle, see `server.mpc.appraisal.FIGURES`; shape
 (n,)."""
 
 
@@ -132,7 +132,7 @@ class Situation(NamedTuple):
 class Compared(IntEnum):
     """Figure that a trigger compares with its threshold, by the column of the record that has it.
 
-    `server.control.moves.PlanFigures` says what each is.
+    `server.mpc.appraisal.PlanFigures` says what each is.
     """
 
     NOTHING = 0

@@ -149,7 +149,7 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
     Of the figures that a trigger may compare it has those that the scheme computes; what they are
-    is said by `server.control.moves.PlanFigures`.
+    is said by `server.mpc.appraisal.PlanFigures`.
 
     Args:
         axes: spatial axes.

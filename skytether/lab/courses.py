@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.server.control.law import lead_to, step
-from skytether.server.control.trajectory import along, follow, guided_to
+from skytether.server.common.compiled import lead_to, step
+from skytether.server.schemes.trajectory import along, follow, guided_to
 from skytether.shared.base.kernel import F1, kernel
 from skytether.shared.law.model import Array, Axis
 from skytether.shared.law.rule import Held, bounded

@@ -37,10 +37,10 @@ from skytether.lab.invariants import (
 from skytether.lab.saboteur import NETEM, OBSERVER, SABOTEUR, SERVER, Observer, Saboteur
 from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
-from skytether.server.control.clock import BUCKET_NS, BUCKETS, RECENT
-from skytether.server.control.planner import Planner
-from skytether.server.control.solver import Solver
+from skytether.server.common.clock import BUCKET_NS, BUCKETS, RECENT
 from skytether.server.endpoint import Server
+from skytether.server.mpc.hierarchical import Planner
+from skytether.server.mpc.solver import Solver
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from skytether.client import clamp
 from skytether.client import filter as kalman
 from skytether.client.filter import Spread
-from skytether.server.control.law import advance, lead_to, step
-from skytether.server.control.trajectory import follow, guided_to, regulated
+from skytether.server.common.compiled import advance, lead_to, step
+from skytether.server.schemes.trajectory import follow, guided_to, regulated
 from skytether.shared.base.kernel import F1, F2, F3, R1, kernel, part, record, records, shared
 from skytether.shared.law import leap
 from skytether.shared.law.model import Axis

@@ -21,7 +21,7 @@ from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.client.simulated.weather import Weather
 from skytether.client.vehicle import Measurement, Vehicle
-from skytether.server.control import committed
+from skytether.server.schemes import committed
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.model import Array, white_acceleration

@@ -29,7 +29,7 @@ from skytether.lab.adversary import (
 )
 from skytether.lab.commands.adversary import Kept
 from skytether.lab.commands.pool import Interrupted
-from skytether.server.control.clock import ClockMap
+from skytether.server.common.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import VehicleMotions

@@ -42,8 +42,8 @@ from bench.harness import (
 )
 from bench.problems import RecordedProblems, listening, record
 from bench.reference import Reference
-from skytether.server.control.exact import ExactSolver
 from skytether.server.controller import BLOCK
+from skytether.server.mpc.exact import ExactSolver
 
 pytestmark = pytest.mark.long
 

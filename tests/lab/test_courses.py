@@ -10,10 +10,10 @@ import pytest
 from helpers import uncompile
 from skytether.client.compensator import Compensator
 from skytether.lab.courses import FollowedCourse, PlannedCourse
-from skytether.server.control import trajectory
-from skytether.server.control.committed import Replay
-from skytether.server.control.scheme import Foresight
-from skytether.server.control.trajectory import Guidance
+from skytether.server.common.scheme import Foresight
+from skytether.server.schemes import trajectory
+from skytether.server.schemes.committed import Replay
+from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reading

@@ -354,7 +354,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     """Two thirds of a round trip more than they are made for: by many metres."""
     monkeypatch.setattr(Controller, "able", _able_whatever_the_delay)
     monkeypatch.setattr(
-        "skytether.server.control.committed.committed_max", lambda terms: terms.horizon
+        "skytether.server.schemes.committed.committed_max", lambda terms: terms.horizon
     )
     monkeypatch.setattr(
         "skytether.client.compensator.Compensator._comes_too_late", lambda *_: False

@@ -20,7 +20,7 @@ from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.server import sessions
-from skytether.server.control.clock import ClockMap
+from skytether.server.common.clock import ClockMap
 from skytether.server.endpoint import Server
 from skytether.server.missions import trajectory_qp, vehicle_motions, waypoints, yielding
 from skytether.server.missions.compiled_motion import pieces_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skytether.server.control.clock import EXACT, ClockMap, Contradiction, StepError
+from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.mission_state import LONGEST
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions

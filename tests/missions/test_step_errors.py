@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
-from skytether.server.control.clock import EXACT, ClockMap, Contradiction, StepError
+from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.separation import too_near

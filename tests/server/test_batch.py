@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from helpers import packaged
 from skytether.server import sessions
-from skytether.server.control.desired import Desired
+from skytether.server.common.desired import Desired
 from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import NoAnswer, SessionEnded

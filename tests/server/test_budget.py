@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from skytether.client.fleet import apart_ns
 from skytether.lab.crowd import judge
-from skytether.server.control import budget as budgets
-from skytether.server.control import rate as rates
-from skytether.server.control.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
-from skytether.server.control.clock import ClockMap
-from skytether.server.control.rate import RateControl
+from skytether.server import budget as budgets
+from skytether.server import rate as rates
+from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
+from skytether.server.common.clock import ClockMap
+from skytether.server.rate import RateControl
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array

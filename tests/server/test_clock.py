@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.server.control import clock as clocks
-from skytether.server.control.clock import ECHOES, ClockMap, half_trip_ns, shortest_ns
+from skytether.server.common import clock as clocks
+from skytether.server.common.clock import ECHOES, ClockMap, half_trip_ns, shortest_ns
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 

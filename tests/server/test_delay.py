@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.netem.fate import Fates
-from skytether.server.control import delay
-from skytether.server.control.delay import (
+from skytether.server.schemes import delay_bound as delay
+from skytether.server.schemes.delay_bound import (
     DelayBound,
     acknowledge,
     at_least,

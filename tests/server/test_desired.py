@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
-from skytether.server.control.desired import EMPTY, PAGE, PAGES, Desired, _led
-from skytether.server.control.live import MEMORY_S, REST_S, LivePoint
+from skytether.server.common.desired import EMPTY, PAGE, PAGES, Desired, _led
+from skytether.server.common.moving_setpoint import MEMORY_S, REST_S, LivePoint
 from skytether.server.controller import BLOCK
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
@@ -446,7 +446,7 @@ def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.Monke
 
     assert MEMORY_S == 0.2
     assert spread() < 0.07
-    monkeypatch.setattr("skytether.server.control.live.MEMORY_S", 1e-6)
+    monkeypatch.setattr("skytether.server.common.moving_setpoint.MEMORY_S", 1e-6)
     assert spread() > 0.5
 
 

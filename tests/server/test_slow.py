@@ -16,7 +16,7 @@ import pytest
 import skytether.netem.proxy
 from skytether.client.compensator import Compensator
 from skytether.netem.fate import Fates
-from skytether.server.control.clock import ClockMap, Contradiction
+from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import (
     Finished,

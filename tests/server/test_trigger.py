@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether
-from skytether.server.control.scheme import FIGURES, Figures
+from skytether.server.common.scheme import FIGURES, Figures
 from skytether.shared.law.model import Flags, Indices, discretise
 from skytether.shared.scenario.registry import TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig

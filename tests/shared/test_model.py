@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from skytether.server.control.law import advance as shared
+from skytether.server.common.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
 

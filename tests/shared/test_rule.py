@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.client.compensator import Compensator
-from skytether.server.control import law
-from skytether.server.control.clock import ClockMap
-from skytether.server.control.committed import Replay
-from skytether.server.control.scheme import Foresight, foresight
+from skytether.server.common import compiled as law
+from skytether.server.common.clock import ClockMap
+from skytether.server.common.scheme import Foresight, foresight
+from skytether.server.schemes.committed import Replay
 from skytether.shared.base.kernel import part
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Axis, advance

@@ -1,1 +1,0 @@
-"""The schemes of the server: clock maps, estimates, plans and solvers."""

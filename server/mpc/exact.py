@@ -1,0 +1,382 @@
+"""Exact solver of the QPs of `mpc`: an active set, and a Riccati pass for each guess of it.
+
+A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the optimal control problem
+
+    minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0
+
+so that, with the set of inputs at their bound given, a backward pass over 2 x 2 matrices solves it
+in O(H), where a factorisation of 𝓗 takes O(H³). The forward pass finds the input v that each stage
+would choose for itself: beyond the bound it belongs into the set, within it belongs out. A set that
+finds itself again is the optimum. From the shifted horizon of the step before that takes one or two
+rounds. A set can wander in a circle instead (long steps, a tiny R, corners of the reference); then
+only the input that is furthest on the wrong side changes it, a round for each. What even that does
+not end goes to DAQP, a dual active-set method, and its answer is believed once it meets the
+optimality conditions.
+"""
+
+from typing import NamedTuple
+
+import daqp
+import numpy as np
+
+from skytether.server.common.compiled import advance, axis_at
+from skytether.server.mpc.problem import (
+    MPC,
+    WIDTH,
+    Problem,
+    SimdBatch,
+    column,
+    set_previous,
+    simd_batch,
+    simd_memory,
+)
+from skytether.server.mpc.solver import NEAR, SolverFailed
+from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lanes, part
+from skytether.shared.law.model import Array, Axis, Flags
+
+ROUNDS_MAX = 8
+"""Rounds in which the whole set may change; five have been the most on recorded flights."""
+PIVOTS_MAX = 200
+"""Further rounds, in which one input enters the set or leaves it."""
+SNAP = 1e-12
+"""Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
+RESIDUAL_MAX = 1e-7
+"""Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
+
+# A stage of a backward pass: what depends on the active set alone. The cost to go from the stage is
+# ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
+K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
+"""Columns of `Workspace.free`: k = s / c, 1 / c and F = A - B k."""
+
+
+class Workspace(NamedTuple):
+    """What a solver has from problem to problem."""
+
+    free: F4
+    """Backward passes with every input free, for FIRST and LATER weights and each axis; shape
+    (2, axes, H, 7)."""
+    memory: F3
+    """Scratch of a single vehicle, see `mpc.simd_memory`."""
+    together: F3
+    """Scratch of WIDTH vehicles."""
+
+
+Three = tuple[float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@part
+def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, Three]:
+    """A stage of a backward pass: its columns from S0 to F11, and P before W is added.
+
+    Args:
+        model: eq. (4) on one axis.
+        rho: weight of the input.
+        after: P of the stage behind, as (P00, P01, P11).
+        free: whether the input is free, not at its bound.
+    """
+    a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
+    p00, p01, p11 = after
+    pb0, pb1 = p00 * b0 + p01 * b1, p01 * b0 + p11 * b1
+    inverse = 1.0 / (rho + b0 * pb0 + b1 * pb1)
+    s0, s1 = pb0, pb0 * a01 + pb1 * a11
+    k0, k1 = s0 * inverse, s1 * inverse
+    e01, e11 = p00 * a01 + p01 * a11, p01 * a01 + p11 * a11
+    p01, p11 = e01, a01 * e01 + a11 * e11
+    # Chosen, not branched to, so that stages of several vehicles are computed side by side.
+    p00 = p00 - s0 * k0 if free else p00
+    p01 = p01 - s0 * k1 if free else p01
+    p11 = p11 - s1 * k1 if free else p11
+    f0, f1 = (1.0 - b0 * k0, a01 - b0 * k1), (-b1 * k0, a11 - b1 * k1)
+    return (s0, s1, k0, k1, inverse, f0[0], f0[1], f1[0], f1[1]), (p00, p01, p11)
+
+
+@inline
+def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> float:
+    """Input that a stage would choose for itself at x = 0 [m/s]."""
+    return -(model.b0 * q0 + model.b1 * q1 + g) * inverse
+
+
+@lanes
+def _first_set(bound: float, simd: SimdBatch) -> None:
+    """Fill in the first active set: that of the horizon before. Sum up the gradient."""
+    near, L = NEAR * bound, len(simd.p)
+    side, held, total = simd.side, simd.held, simd.total
+    g, previous = simd.gradient, simd.previous
+    for lane in range(L):
+        held[lane], total[lane] = 0.0, 0.0
+    for i in range(len(g)):
+        for lane in range(L):
+            before = previous[i, lane]
+            at = 1.0 if before >= near else -1.0 if before <= -near else 0.0
+            side[i, lane] = at
+            held[lane] += abs(at)
+            total[lane] += g[i, lane]
+
+
+@lanes
+def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
+    """Make a round in which every input of every vehicle is free.
+
+    Args:
+        stages: the backward pass of that; shape (H, 7).
+    """
+    model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
+    b0, b1 = model.b0, model.b1
+    q0, q1, x0, x1 = simd.p, simd.v, simd.leader_p, simd.leader_v
+    g, u, side, own = simd.gradient, simd.inputs, simd.side, simd.own
+    changed, held = simd.changed, simd.held
+    for lane in range(L):
+        q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
+        changed[lane], held[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        k0, k1, inverse = stages[i, K0], stages[i, K1], stages[i, INVERSE]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(L):
+            g_, p_, v_ = g[i, lane], q0[lane], q1[lane]
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            q0[lane] = f00 * p_ + f10 * v_ - k0 * g_
+            q1[lane] = f01 * p_ + f11 * v_ - k1 * g_
+    for i in range(len(g)):
+        k0, k1 = stages[i, K0], stages[i, K1]
+        f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
+        for lane in range(L):
+            own_, p_, v_ = own[i, lane], x0[lane], x1[lane]
+            chosen = own_ - (k0 * p_ + k1 * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            free = verdict == 0.0
+            value = chosen if free else verdict * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            x0[lane] = f00 * p_ + f01 * v_ + b0 * own_ if free else then_p
+            x1[lane] = f10 * p_ + f11 * v_ + b1 * own_ if free else then_v
+            u[i, lane], side[i, lane] = value, verdict
+            changed[lane] += abs(verdict)
+            held[lane] += abs(verdict)
+
+
+@lanes
+def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
+    """Make the backward pass of a round with an active set of each vehicle's own.
+
+    The passes for the matrices and for the vectors go together: what only the latter needs of a
+    stage is then never stored.
+    """
+    model, bound, W, L = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(simd.p)
+    a01, a11 = model.a01, model.a11
+    p00, p01, p11, q0, q1 = simd.p00, simd.p01, simd.p11, simd.p, simd.v
+    g, side, own = simd.gradient, simd.side, simd.own
+    k0, k1, f00, f01, f10, f11 = simd.k0, simd.k1, simd.f00, simd.f01, simd.f10, simd.f11
+    H = len(g)
+    for lane in range(L):
+        p00[lane], p01[lane], p11[lane] = W[H - 1, 0], 0.0, W[H - 1, 1]
+        q0[lane], q1[lane] = 0.0, 0.0
+    for i in range(H - 1, -1, -1):
+        weight = mpc.weights.inputs[which, i]
+        add_p, add_v = (W[i - 1, 0], W[i - 1, 1]) if i > 0 else (0.0, 0.0)
+        for lane in range(L):
+            g_, p_, v_, at = g[i, lane], q0[lane], q1[lane], side[i, lane]
+            matrix = (p00[lane], p01[lane], p11[lane])
+            stage, after = stage_of(model, weight, matrix, at == 0.0)
+            s0, s1, k0_, k1_, inverse, f00_, f01_, f10_, f11_ = stage
+            own[i, lane] = own_input(model, p_, v_, g_, inverse)
+            free_p = f00_ * p_ + f10_ * v_ - k0_ * g_
+            free_v = f01_ * p_ + f11_ * v_ - k1_ * g_
+            held_p = p_ + s0 * (at * bound)
+            held_v = a01 * p_ + a11 * v_ + s1 * (at * bound)
+            q0[lane] = free_p if at == 0.0 else held_p
+            q1[lane] = free_v if at == 0.0 else held_v
+            k0[i, lane], k1[i, lane] = k0_, k1_
+            f00[i, lane], f01[i, lane], f10[i, lane], f11[i, lane] = f00_, f01_, f10_, f11_
+            p00[lane], p01[lane], p11[lane] = after[0] + add_p, after[1], after[2] + add_v
+
+
+@lanes
+def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
+    """Make the forward pass of a round: what each stage would choose is its verdict on the set.
+
+    Args:
+        singly: whether only the input that is furthest on the wrong side may change the set.
+    """
+    model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
+    b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
+    u, side, own, changed, held = simd.inputs, simd.side, simd.own, simd.changed, simd.held
+    k0, k1, f00, f01, f10, f11 = simd.k0, simd.k1, simd.f00, simd.f01, simd.f10, simd.f11
+    worst, worst_at = simd.worst, simd.worst_at
+    for lane in range(L):
+        x0[lane], x1[lane], changed[lane], held[lane] = 0.0, 0.0, 0.0, 0.0
+        worst[lane], worst_at[lane] = 0.0, -1.0
+    for i in range(len(u)):
+        for lane in range(L):
+            own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
+            chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
+            verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
+            # An input that would leave its bound stays at it for this round.
+            stays = at if at != 0.0 or singly else verdict
+            value = chosen if stays == 0.0 else stays * bound
+            then_p, then_v = advance(model, p_, v_, value)
+            free_p = f00[i, lane] * p_ + f01[i, lane] * v_ + b0 * own_
+            free_v = f10[i, lane] * p_ + f11[i, lane] * v_ + b1 * own_
+            # Closed loop, x ← F x + B own: the chain of stages does not wait for `chosen`.
+            x0[lane] = free_p if stays == 0.0 else then_p
+            x1[lane] = free_v if stays == 0.0 else then_v
+            u[i, lane] = value
+            changed[lane] += 0.0 if verdict == at else 1.0
+            if singly:
+                wrong = abs(chosen) - bound if at == 0.0 else bound - chosen * at
+                if verdict != at and wrong > worst[lane]:
+                    worst[lane], worst_at[lane] = wrong, i
+            else:
+                side[i, lane] = verdict
+                held[lane] += abs(verdict)
+
+
+@lanes
+def _change_worst(simd: SimdBatch) -> None:
+    """Let the input that is furthest on the wrong side enter or leave each vehicle's active set."""
+    for lane in range(len(simd.p)):
+        i = int(simd.worst_at[lane])
+        if i >= 0:
+            at = simd.side[i, lane]
+            simd.side[i, lane] = 0.0 if at != 0.0 else np.sign(simd.inputs[i, lane])
+
+
+@lanes
+def _any(number: F1) -> bool:
+    """Whether a number is above 0 for any vehicle."""
+    found = False
+    for lane in range(len(number)):
+        found |= number[lane] > 0.0
+    return found
+
+
+@part
+def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, settled: B1) -> int:
+    """Fill in the optimal inputs of one axis.
+
+    Args:
+        mpc, axis: the problem.
+        which: FIRST or LATER weights.
+        simd: gradient and previous are read, whose active set is the first; inputs are filled in
+            [m/s].
+        free: of `Workspace`.
+        settled: set to False for a vehicle without an answer; shape (L,).
+
+    Returns:
+        number of rounds.
+
+    Source: eqs. (6), (8), (10).
+    """
+    changed, total, x0, x1 = simd.changed, simd.total, simd.leader_p, simd.leader_v
+    _first_set(mpc.bounds[axis], simd)
+    rounds = 0
+    while rounds < ROUNDS_MAX + PIVOTS_MAX:
+        singly = rounds >= ROUNDS_MAX
+        rounds += 1
+        # Where no vehicle has an input at its bound, one table of stages serves all of them.
+        if singly or _any(simd.held):
+            _backward(mpc, axis, which, simd)
+            _forward(mpc, axis, simd, singly)
+        else:
+            _round_free(mpc, axis, simd, free[which, axis])
+        # A vehicle whose set is right finds the same again, to the last bit.
+        if not _any(changed):
+            break
+        if singly:
+            _change_worst(simd)
+    for lane in range(len(settled)):
+        finite = np.isfinite(total[lane] + x0[lane] + x1[lane])
+        settled[lane] = settled[lane] and changed[lane] == 0.0 and finite
+    return rounds
+
+
+@kernel
+def _table(mpc: MPC, work: Workspace) -> None:
+    """Fill in the backward passes with every input free."""
+    W = mpc.weights.states
+    for which in range(2):
+        for axis in range(len(mpc.model)):
+            model, P = axis_at(mpc.model, axis), (W[-1, 0], 0.0, W[-1, 1])
+            for i in range(len(W) - 1, -1, -1):
+                stage, P = stage_of(model, mpc.weights.inputs[which, i], P, True)
+                if i > 0:
+                    P = (P[0] + W[i - 1, 0], P[1], P[2] + W[i - 1, 1])
+                for at in range(7):
+                    work.free[which, axis, i, at] = stage[2 + at]
+
+
+@kernel
+def _solve(
+    mpc: MPC, which: int, work: Workspace, gradient: F3, guess: F3, inputs: F3, settled: B1
+) -> None:
+    """Fill in inputs (n, axes, H) of n vehicles, and which are right, (axes n,); `active_sets`."""
+    alone, together, n = simd_batch(work.memory), simd_batch(work.together), len(gradient)
+    for axis in range(len(mpc.model)):
+        first = 0
+        while first < n:
+            simd = together if n - first >= WIDTH else alone
+            L, at = len(simd.p), axis * n + first
+            for lane in range(L):
+                set_previous(guess[first + lane, axis], 0, False, simd, lane)
+                for stage in range(gradient.shape[2]):
+                    simd.gradient[stage, lane] = gradient[first + lane, axis, stage]
+            active_sets(mpc, axis, which, simd, work.free, settled[at : at + L])
+            for lane in range(L):
+                column(simd.inputs, lane, inputs[first + lane, axis])
+            first += L
+
+
+def workspace(mpc: MPC) -> Workspace:
+    """A workspace for the problems of an MPC."""
+    axes, H = len(mpc.model), len(mpc.weights.states)
+    work = Workspace(np.empty((2, axes, H, 7)), simd_memory(H, 1), simd_memory(H, WIDTH))
+    _table(mpc, work)
+    return work
+
+
+class ExactSolver:
+    """See `server.mpc.solver.Solver`; the answer depends on the problem alone, to rounding.
+
+    Source: eq. (10).
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self.work = workspace(problem.mpc)
+        self.fallbacks = 0
+        """Number of problems that DAQP had to solve."""
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """See `Solver`."""
+        inputs = np.empty_like(gradient)
+        n, axes, _ = gradient.shape
+        settled = np.ones((axes, n), dtype=np.bool_)
+        mpc, which = self._problem.mpc, self._problem.which
+        _solve(mpc, which, self.work, gradient, guess, inputs, settled.reshape(-1))
+        solved: Flags = np.all(np.isfinite(gradient), axis=(1, 2))
+        for vehicle, axis in np.argwhere(~settled.T & solved[:, None]):
+            self.fallbacks += 1
+            try:
+                inputs[vehicle, axis] = self._dual(int(axis), gradient[vehicle, axis])
+            except SolverFailed:
+                solved[vehicle] = False
+        inputs[~solved] = guess[~solved]
+        return inputs, solved
+
+    def _dual(self, axis: int, gradient: Array) -> Array:
+        problem = self._problem
+        hessian = problem.hessian[axis]
+        bound = np.full(len(gradient), problem.mpc.bounds[axis])
+        # Without rows here, DAQP takes the bounds as simple bounds, which cost it least.
+        nothing = np.zeros((0, len(gradient)))
+        answer, _, status, info = daqp.solve(
+            hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
+        )
+        # It may leave an input that is at its bound a rounding error inside.
+        answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
+        inputs: Array = np.clip(answer, -bound, bound)
+        slope = hessian @ inputs + gradient
+        # Optimal: no slope inside, and none back inside at a bound.
+        slope = np.where(np.abs(inputs) >= bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
+        if not np.abs(slope).max() <= RESIDUAL_MAX * (1.0 + np.abs(gradient).max()):
+            raise SolverFailed(f"DAQP status {status}", info["iterations"])
+        return inputs

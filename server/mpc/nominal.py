@@ -1,0 +1,89 @@
+"""Nominal motion of a vehicle: the plan that a trajectory is made from where the server sees ahead.
+
+It is the MPC of eq. (9) for an undisturbed vehicle, from where it is led at step k along the
+desired trajectory, as far as the server sees that, within the bounds of the input, eq. (6). Its
+states are what the vehicle is told to follow, so a trajectory asks for nothing that the vehicle
+cannot fly: it begins to turn before a turn that is too sharp, and smooths one that is not worth the
+effort.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.common.compiled import advance, axis_at
+from skytether.server.mpc.exact import Workspace, active_sets, workspace
+from skytether.server.mpc.problem import (
+    FIRST,
+    MPC,
+    column,
+    gradient,
+    lead,
+    make_mpc,
+    set_previous,
+    set_target,
+    simd_batch,
+)
+from skytether.shared.base.kernel import B1, F3, I1, part
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import ControlConfig
+
+
+class Nominal(NamedTuple):
+    """The problem, and what is remembered of every vehicle to begin the next search with."""
+
+    mpc: MPC
+    """The problem of eq. (9), without S-term."""
+    work: Workspace
+    """Scratch of the solver."""
+    inputs: F3
+    """Inputs planned last [m/s]; shape (capacity, axes, H)."""
+    step: I1
+    """Step that they were planned at, or -1; shape (capacity,)."""
+    settled: B1
+    """Scratch: whether a plan is found; shape (1,)."""
+
+
+def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal:
+    """The problem of a scenario, for up to `capacity` vehicles."""
+    mpc, H = make_mpc(terms, control), terms.horizon
+    return Nominal(
+        mpc=mpc,
+        work=workspace(mpc),
+        inputs=np.zeros((capacity, terms.axes, H)),
+        step=np.full(capacity, -1, dtype=np.int64),
+        settled=np.zeros(1, dtype=np.bool_),
+    )
+
+
+@part
+def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) -> bool:
+    """Fill in the nominal states of a vehicle from k on; False where no plan is found.
+
+    Args:
+        row: of the vehicle.
+        desired: states from k on [m, m/s]; shape (axes, H + 1 or more, 2).
+        states: what is filled in, behind the first stage, which is where the vehicle is led at k
+            [m, m/s]; shape (axes, H + 1 or fewer, 2).
+    """
+    mpc, settled, simd = nominal.mpc, nominal.settled, simd_batch(nominal.work.memory)
+    gap, H = k - nominal.step[row], nominal.inputs.shape[2]
+    fresh = nominal.step[row] < 0 or not 0 <= gap <= H
+    nominal.step[row], settled[0] = -1, True
+    for axis in range(len(states)):
+        model, u = axis_at(mpc.model, axis), nominal.inputs[row, axis]
+        p, v = states[axis, 0, 0], states[axis, 0, 1]
+        simd.p[0], simd.v[0], simd.w[0] = p, v, 0.0
+        set_target(desired[axis, : H + 1], simd, 0)
+        set_previous(u, gap, fresh, simd, 0)
+        lead(mpc, axis, simd)
+        gradient(mpc, axis, FIRST, simd, simd.target_v)
+        active_sets(mpc, axis, FIRST, simd, nominal.work.free, settled)
+        if not settled[0]:
+            return False
+        column(simd.inputs, 0, u)
+        for stage in range(states.shape[1] - 1):
+            p, v = advance(model, p, v, u[stage])
+            states[axis, stage + 1, 0], states[axis, stage + 1, 1] = p, v
+    nominal.step[row] = k
+    return True

@@ -1,0 +1,88 @@
+"""OSQP as a solver of the QPs of `server.mpc.problem`, the reference to compare the exact one with.
+
+OSQP's interface checks little: a wrong length gives NaN, one NaN stays in its warm start for good,
+and an iteration limit does not raise. So everything is checked here, before and after, and each
+solve states its own warm start, so that an answer depends on its problem and its guess alone.
+"""
+
+import numpy as np
+import osqp
+from scipy import sparse
+
+from skytether.server.mpc.problem import Problem
+from skytether.server.mpc.solver import NEAR, SolverFailed
+from skytether.shared.law.model import Array, Flags
+
+ITERATIONS_MAX = 4000
+TOLERANCE = 1e-9
+"""Tolerance of both residuals: inputs are right to about 1e-8 m/s, in 30 iterations, not 20."""
+RHO_PER_CURVATURE = 2.5
+"""OSQP's step size over the mean curvature of the Hessian: fewest iterations in the worst case."""
+
+
+class OsqpSolver:
+    """OSQP, set up once per axis; only vectors change afterwards.
+
+    Source: eq. (10).
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._hessian = problem.hessian
+        self._u_max = problem.mpc.bounds
+        self._axes = [_set_up(H, b) for H, b in zip(self._hessian, self._u_max, strict=True)]
+
+    def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
+        """See `Solver`."""
+        inputs = guess.copy()
+        solved = np.ones(len(gradient), dtype=np.bool_)
+        for vehicle in range(len(gradient)):
+            try:
+                for axis in range(len(self._axes)):
+                    inputs[vehicle, axis] = self._solve_axis(
+                        axis, gradient[vehicle, axis], guess[vehicle, axis]
+                    )
+            except SolverFailed:
+                inputs[vehicle] = guess[vehicle]
+                solved[vehicle] = False
+        return inputs, solved
+
+    def _solve_axis(self, axis: int, gradient: Array, guess: Array) -> Array:
+        # One NaN would stay in OSQP's warm start for all vehicles after this one.
+        if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
+            raise SolverFailed("problem not finite")
+        problem, bound = self._axes[axis], self._u_max[axis]
+        # Multipliers that make the guess stationary where it is at its bound, and nowhere else.
+        slope = self._hessian[axis] @ guess + gradient
+        multipliers = np.where(np.abs(guess) >= NEAR * bound, -slope, 0.0)
+        problem.update(q=gradient)
+        problem.warm_start(x=guess, y=multipliers)
+        result = problem.solve(raise_error=False)
+        if result.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
+            raise SolverFailed(result.info.status, result.info.iter)
+        if not np.isfinite(result.x).all():
+            raise SolverFailed("answer not finite", result.info.iter)
+        clipped: Array = np.clip(result.x, -bound, bound)
+        return clipped
+
+
+def _set_up(hessian: Array, bound: float) -> osqp.OSQP:
+    H = len(hessian)
+    problem = osqp.OSQP()
+    problem.setup(
+        P=sparse.csc_matrix(np.triu(hessian)),
+        q=np.zeros(H),
+        A=sparse.eye(H, format="csc"),
+        l=np.full(H, -bound),
+        u=np.full(H, bound),
+        verbose=False,
+        eps_abs=TOLERANCE,
+        eps_rel=TOLERANCE,
+        max_iter=ITERATIONS_MAX,
+        rho=RHO_PER_CURVATURE * float(np.trace(hessian)) / H,
+        # A step size that adapted would carry one vehicle's past into the next one's answer.
+        adaptive_rho=False,
+        scaling=0,
+        check_termination=5,
+        polishing=False,
+    )
+    return problem

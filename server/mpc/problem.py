@@ -1,0 +1,417 @@
+"""The optimal control problem, eq. (5)-(9), as algebra: problem → QP → plan.
+
+Eliminating the states of eq. (4), X = Φ x + Γ U, leaves a box-constrained QP in the H inputs of
+each axis,
+
+    minimise  ½ Uᵀ 𝓗 U + gᵀ U   subject to  |U| ≤ u_max,
+
+whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradient g follows the state, the
+target and the horizon before. W holds Q at the stages 1 … H-1 and P at H.
+
+What is done at every step is done in O(H), by recursion along the horizon, on one axis, and for
+several vehicles side by side. Each pass is a chain in which every stage waits for the one before,
+about ten cycles a stage, while the processor could do many times as much: so the innermost loop
+goes over vehicles, which the compiler turns into vector instructions. A single vehicle is a batch
+of one. Vehicles do not mix, and a vehicle gets the same bits alone as in a batch, which BLAS,
+multiplying by Γ, does not promise.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from skytether.server.common.compiled import Axes, advance, axes_of, axis_at
+from skytether.shared.base.kernel import F1, F2, F3, S1, inline, lanes, part, shared
+from skytether.shared.law.model import Array, Axis, Model
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import ControlConfig
+
+Inputs = F1 | S1
+"""Inputs of a horizon, as they are computed or as they are sent [m/s]; shape (H,)."""
+
+
+class Weights(NamedTuple):
+    """The weights of eq. (9), for the first step of a flight and for all later ones.
+
+    Without a horizon before there is no S-term (E8): the first of two rows leaves it out.
+    """
+
+    states: F2
+    """W, diagonal; shape (H, 2)."""
+    inputs: F2
+    """R + S, of all that weighs the input itself; shape (2, H)."""
+    changes: F2
+    """S of the stages 0 … H-2, and 0 of the last; shape (2, H)."""
+    input: float
+    """R."""
+    target: F1
+    """Weight of the desired velocity: R / g where the input has a target of its own (E7), for it
+    takes the input v / g to fly at v, else 0; shape (axes,)."""
+
+
+FIRST, LATER = 0, 1
+"""Rows of `Weights`: at the first step of a flight, and afterwards."""
+
+
+class MPC(NamedTuple):
+    """The problem of eq. (9), but for what changes: state, target and horizon before."""
+
+    model: Axes
+    """Model, eq. (4); shape (axes,)."""
+    bounds: F1
+    """Bound u_max of the input [m/s]; shape (axes,)."""
+    weights: Weights
+    """Q, P, R and S."""
+
+
+def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
+    """The problem of a scenario.
+
+    Source: eqs. (5), (6), (9).
+    """
+    H = terms.horizon
+    # Stages 1 … H: no input changes the state at stage 0, so its Q of eq. (5) is left out.
+    states = np.tile(np.array(control.state_weight), (H, 1))
+    states[-1] = control.terminal_weight
+    changes = np.zeros((2, H))
+    # Eq. (9) sums S up to H - 2 only: the last input has no counterpart in the horizon before.
+    changes[LATER, :-1] = control.change_weight
+    weights = Weights(
+        states=states,
+        inputs=control.input_weight + changes,
+        changes=changes,
+        input=control.input_weight,
+        target=control.input_weight * control.input_reference / np.array(terms.gain),
+    )
+    return MPC(axes_of(terms.model), np.array(terms.u_max), weights)
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Solver set-up that all QPs with one Hessian share."""
+
+    model: Model
+    """Model, eq. (4)."""
+    mpc: MPC
+    """Weights, bounds and model of the QPs."""
+    which: int
+    """FIRST or LATER weights."""
+    hessian: Array
+    """𝓗 of each axis; shape (axes, H, H)."""
+
+
+def pose(model: Model, mpc: MPC, which: int) -> Problem:
+    """The QPs for the FIRST step or for LATER ones.
+
+    Source: eqs. (5), (9).
+    """
+    axes, H = len(model.b0), len(mpc.weights.states)
+    forced = np.zeros((axes, H, 2, H))
+    """Γ: what the inputs add to the states 1 … H."""
+    response = model.B
+    for stage in range(H):
+        for later in range(stage, H):
+            # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
+            forced[:, later, :, later - stage] = response
+        response = model.step(response, 0.0)
+    # In full, for it is made twice a flight; what every step needs is done in O(H) below.
+    hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
+    return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
+
+
+# -- passes along the horizon, side by side -------------------------------------------------------
+
+WIDTH = 16
+"""Vehicles that are planned for side by side: LLVM makes no vectors of shorter loops."""
+
+
+class SimdBatch(NamedTuple):
+    """Scratch of some vehicles' problems on one axis; L = WIDTH or 1 vehicles, the last index."""
+
+    p: F1
+    """Position, or costate of it, at the stage under way; shape (L,)."""
+    v: F1
+    """Velocity, or costate of it; shape (L,)."""
+    leader_p: F1
+    """Position of the vehicle that is followed [m]; shape (L,)."""
+    leader_v: F1
+    """Velocity of the vehicle that is followed [m/s]; shape (L,)."""
+    w: F1
+    """Disturbance ŵ [m/s]; shape (L,)."""
+    p00: F1
+    """Entry for position of the matrix P of the backward pass; shape (L,)."""
+    p01: F1
+    """Entry for position and velocity; shape (L,)."""
+    p11: F1
+    """Entry for velocity; shape (L,)."""
+    total: F1
+    """Sum of a gradient, which is not finite where one of its numbers is not; shape (L,)."""
+    changed: F1
+    """Number of inputs that entered or left the active set in the last round; shape (L,)."""
+    held: F1
+    """Number of inputs in the active set; shape (L,)."""
+    worst: F1
+    """Largest violation by an input that must enter or leave the active set; shape (L,)."""
+    worst_at: F1
+    """Stage of that input, -1 without one; shape (L,)."""
+    target_p: F2
+    """Desired positions at the stages 0 … H [m]; shape (H + 1, L)."""
+    target_v: F2
+    """Desired velocities [m/s]; shape (H + 1, L)."""
+    leader_speed: F2
+    """Velocities of the vehicle that is followed [m/s]; shape (H + 1, L)."""
+    drift_p: F2
+    """See `lead`, on position; shape (H, L)."""
+    drift_v: F2
+    """The drift on velocity; shape (H, L)."""
+    previous: F2
+    """Horizon of the step before, shifted [m/s]; shape (H, L)."""
+    gradient: F2
+    """Gradient g; shape (H, L)."""
+    inputs: F2
+    """Optimal inputs, not rounded yet [m/s]; shape (H, L)."""
+    side: F2
+    """-1 or 1 where the input is at that bound, 0 where it is free; shape (H, L)."""
+    own: F2
+    """Input that each stage would choose for itself at x = 0 [m/s]; shape (H, L)."""
+    k0: F2
+    """Backward pass for the active sets under way, column K0 of `exact`; shape (H, L)."""
+    k1: F2
+    """Column K1."""
+    f00: F2
+    """Column F00."""
+    f01: F2
+    """Column F01."""
+    f10: F2
+    """Column F10."""
+    f11: F2
+    """Column F11."""
+
+
+def simd_memory(H: int, width: int) -> Array:
+    """Memory of a `SimdBatch`: one array, since each costs time in a call."""
+    return np.zeros((len(SimdBatch._fields), H + 1, width))
+
+
+@shared
+def simd_batch(memory: F3) -> SimdBatch:
+    """The batch in what `simd_memory` made."""
+    H = memory.shape[1] - 1
+    return SimdBatch(
+        p=memory[0, 0],
+        v=memory[1, 0],
+        leader_p=memory[2, 0],
+        leader_v=memory[3, 0],
+        w=memory[4, 0],
+        p00=memory[5, 0],
+        p01=memory[6, 0],
+        p11=memory[7, 0],
+        total=memory[8, 0],
+        changed=memory[9, 0],
+        held=memory[10, 0],
+        worst=memory[11, 0],
+        worst_at=memory[12, 0],
+        target_p=memory[13],
+        target_v=memory[14],
+        leader_speed=memory[15],
+        drift_p=memory[16, :H],
+        drift_v=memory[17, :H],
+        previous=memory[18, :H],
+        gradient=memory[19, :H],
+        inputs=memory[20, :H],
+        side=memory[21, :H],
+        own=memory[22, :H],
+        k0=memory[23, :H],
+        k1=memory[24, :H],
+        f00=memory[25, :H],
+        f01=memory[26, :H],
+        f10=memory[27, :H],
+        f11=memory[28, :H],
+    )
+
+
+@lanes
+def set_previous(inputs: Inputs, gap: int, fresh: bool, simd: SimdBatch, lane: int) -> None:
+    """Fill in the horizon of the step before as seen `gap` steps later; zeros without one.
+
+    Its last input is repeated.
+    """
+    H = len(inputs)
+    for stage in range(H):
+        simd.previous[stage, lane] = 0.0 if fresh else inputs[min(stage + gap, H - 1)]
+
+
+@lanes
+def set_target(states: F2, simd: SimdBatch, lane: int) -> None:
+    """Fill in the desired states at the stages 0 … H [m, m/s]; shape (H + 1, 2)."""
+    for stage in range(len(states)):
+        simd.target_p[stage, lane] = states[stage, 0]
+        simd.target_v[stage, lane] = states[stage, 1]
+
+
+@lanes
+def set_inputs(inputs: Inputs, simd: SimdBatch, lane: int) -> None:
+    """Fill in inputs that were found elsewhere [m/s]; shape (H,)."""
+    for stage in range(len(inputs)):
+        simd.inputs[stage, lane] = inputs[stage]
+
+
+@lanes
+def column(numbers: F2, lane: int, to: Inputs) -> None:
+    """Copy one vehicle's number of each stage."""
+    for stage in range(len(to)):
+        to[stage] = numbers[stage, lane]
+
+
+@lanes
+def lead(mpc: MPC, axis: int, simd: SimdBatch) -> None:
+    """Fill in the drift W (Φ x - target): how far off the vehicle would come without any input.
+
+    Read: p and v at stage 0, the disturbance w that is added to every input on its way, target.
+    """
+    model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
+    p, v, w = simd.p, simd.v, simd.w
+    target_p, target_v = simd.target_p, simd.target_v
+    drift_p, drift_v = simd.drift_p, simd.drift_v
+    for i in range(len(drift_p)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(L):
+            p_, v_ = advance(model, p[lane], v[lane], w[lane])
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane] = weight_p * (p_ - target_p[i + 1, lane])
+            drift_v[i, lane] = weight_v * (v_ - target_v[i + 1, lane])
+
+
+@inline
+def rounded(u: float) -> float:
+    """The input as it is sent, in float32, see `planner`."""
+    return np.float64(np.float32(u))
+
+
+@lanes
+def follow(mpc: MPC, axis: int, simd: SimdBatch) -> None:
+    """Fly one vehicle by the inputs, and fill in the drift of another toward it, in one go.
+
+    Read: p, v and w of the one that follows; leader_p, leader_v and inputs of the other.
+
+    Source: eq. (7).
+    """
+    model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
+    p, v, leader_p, leader_v, w = simd.p, simd.v, simd.leader_p, simd.leader_v, simd.w
+    leader_speed, u = simd.leader_speed, simd.inputs
+    drift_p, drift_v = simd.drift_p, simd.drift_v
+    for lane in range(L):
+        leader_speed[0, lane] = leader_v[lane]
+    for i in range(len(u)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(L):
+            q_, s_ = advance(model, leader_p[lane], leader_v[lane], rounded(u[i, lane]))
+            leader_p[lane], leader_v[lane] = q_, s_
+            leader_speed[i + 1, lane] = s_
+            p_, v_ = advance(model, p[lane], v[lane], w[lane])
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane] = weight_p * (p_ - q_)
+            drift_v[i, lane] = weight_v * (v_ - s_)
+
+
+@inline
+def adjoint(
+    model: Axis, co: tuple[float, float], drift_p: float, drift_v: float
+) -> tuple[float, float]:
+    """Costate λ of eq. (4) a stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is an input's effect.
+
+    Args:
+        model: eq. (4) on one axis.
+        co: λ of the stage behind, on position and velocity; 0 behind the last.
+        drift_p, drift_v: derivative of the cost by the state that the stage leads to.
+    """
+    return co[0] + drift_p, model.a01 * co[0] + model.a11 * co[1] + drift_v
+
+
+@inline
+def pulled(S: float, previous: float, T: float, target_v: float, R: float, w: float) -> float:
+    """S- and R-terms of the gradient of one input, with its sign turned.
+
+    Args:
+        S, T, R: weights of change, desired velocity and input, see `Weights`.
+        previous: this input in the horizon before [m/s].
+        target_v: desired velocity [m/s].
+        w: what is added to the input on its way [m/s].
+    """
+    return S * previous + T * target_v - R * w
+
+
+@lanes
+def gradient(mpc: MPC, axis: int, which: int, simd: SimdBatch, target_v: F2) -> None:
+    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of eq. (4), less R and S terms.
+
+    Args:
+        mpc, axis: the problem.
+        which: FIRST or LATER weights.
+        simd: drift, previous and w are read.
+        target_v: desired velocities [m/s]; shape (H + 1, L).
+
+    Source: eqs. (5), (9).
+    """
+    model, weights, L = axis_at(mpc.model, axis), mpc.weights, len(simd.p)
+    R, T = weights.input, weights.target[axis]
+    p, v, w, g, previous = simd.p, simd.v, simd.w, simd.gradient, simd.previous
+    drift_p, drift_v = simd.drift_p, simd.drift_v
+    for lane in range(L):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(g) - 1, -1, -1):
+        S = weights.changes[which, i]
+        for lane in range(L):
+            co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
+            p[lane], v[lane] = co
+            toward = pulled(S, previous[i, lane], T, target_v[i, lane], R, w[lane])
+            g[i, lane] = model.b0 * co[0] + model.b1 * co[1] - toward
+
+
+@lanes
+def slope(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
+    """Turn g into 𝓗 U + g, with U as it is sent: 0 where U is optimal and within its bounds.
+
+    Args:
+        mpc, axis: the problem.
+        which: FIRST or LATER weights.
+        simd: gradient and inputs are read; the gradient is filled in anew.
+    """
+    model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
+    p, v, u, g = simd.p, simd.v, simd.inputs, simd.gradient
+    drift_p, drift_v = simd.drift_p, simd.drift_v
+    for lane in range(L):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(u)):
+        weight_p, weight_v = W[i, 0], W[i, 1]
+        for lane in range(L):
+            p_, v_ = advance(model, p[lane], v[lane], rounded(u[i, lane]))
+            p[lane], v[lane] = p_, v_
+            drift_p[i, lane], drift_v[i, lane] = weight_p * p_, weight_v * v_
+    for lane in range(L):
+        p[lane], v[lane] = 0.0, 0.0
+    for i in range(len(u) - 1, -1, -1):
+        weight = mpc.weights.inputs[which, i]
+        for lane in range(L):
+            co = adjoint(model, (p[lane], v[lane]), drift_p[i, lane], drift_v[i, lane])
+            p[lane], v[lane] = co
+            g[i, lane] += model.b0 * co[0] + model.b1 * co[1] + weight * rounded(u[i, lane])
+
+
+@part
+def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: float) -> float:
+    """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
+
+    Args:
+        x: by how much position [m] and velocity [m/s] are others at stage 0; with 0 what is added
+            is ΔUᵀ 𝓗 ΔU.
+        change: ΔU [m/s]; shape (H,).
+    """
+    model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs
+    p, v = x
+    for i in range(len(change)):
+        u = change[i]
+        p, v = advance(model, p, v, u)
+        cost += W[i, 0] * p * p + W[i, 1] * v * v + rho[LATER, i] * u * u
+    return cost

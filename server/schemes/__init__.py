@@ -1,0 +1,1 @@
+"""Schemes of delay compensation, and what they share."""

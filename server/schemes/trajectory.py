@@ -1,0 +1,506 @@
+"""Trajectories: the vehicle is told the desired trajectory, and which one it holds is estimated.
+
+What is sent at step k is the trajectory to be followed from there on: where the server sees ahead,
+the nominal motion of the vehicle along what it sees (`server.mpc.nominal`), or what it sees
+itself where the horizon is shorter than the time h below; and else the state of the target at k. It
+is sent as a spline with as few uniform knots as keep within `control.spline_error_m` of it
+(`shared.law.spline`); of a state that is one. The vehicle regulates itself along the spline, so all
+that is known of the vehicle is its newest observation.
+
+Which trajectory it follows is not certain: every observation acknowledges the one in force, and
+those sent since may be on their way, or lost. With the share ℓ of losses and the share S(t) of
+delays longer than t, both as measured, one that was sent t before an observation that does not know
+of it will come with the probability
+
+    π = (1 - ℓ) S(t) / ((1 - ℓ) S(t) + ℓ)
+
+and from the delay bound d on it is lost (`schemes.delay_bound`). The newest that comes is the one
+that is followed. So the expected gap is
+
+    E[ Q_p Σ (Δp + h Δv)² ]          Δp, Δv: trajectory followed - the one known now
+
+over the axes and these cases, with the weight Q_p on the position [1/m²] and h = (1 + K_v) / K_p,
+the time by which the regulator itself weighs the two: K_p (Δp + h Δv) is by how much the input
+would be another. It is the mean of that at k + d, when a packet of now is in force at the latest,
+k + 2 d, when it is known whether it came, and k + 3 d, when one that is sent then would be: looking
+at k + d alone, a trajectory that ends is replaced too late if a packet is lost. Where nothing has
+come into force the vehicle hovers where it was observed.
+
+This is the scheme "trajectory", and stands in place of its planner.
+"""
+
+from collections import Counter
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.common.clock import ClockMap, Seen, half_trip_ns, shortest_ns
+from skytether.server.common.desired import Desired, Window
+from skytether.server.common.scheme import FIGURES, Figures, Foresight, Splines
+from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
+from skytether.server.schemes import delay_bound as delay
+from skytether.server.schemes.committed import LEARNED, LOSS, MARGIN
+from skytether.server.schemes.delay_bound import SAMPLES, DelayBound, acknowledge, at_least, begin
+from skytether.server.schemes.knots import fewest_knots, spline_at
+from skytether.shared.base.kernel import (
+    B1,
+    F1,
+    F2,
+    F3,
+    F4,
+    I1,
+    inline,
+    kernel,
+    part,
+    record,
+    records,
+    shared,
+)
+from skytether.shared.law import spline
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
+
+ROOM = 64
+"""Number of trajectories that are remembered of each vehicle: the newest that were sent."""
+CHANCES = 3
+"""Number of delay bounds ahead at whose ends trajectories are compared."""
+SURE = 1e-3
+"""Probability below which what is left of the cases is not looked at."""
+RUNS_OUT = 1e-2
+"""Largest probability that all trajectories are lost that are to follow one that ends."""
+TINY = 1e-9
+"""Smallest K_p, for weights that ask for none [1/s]."""
+
+along, guided_to = shared(spline.along), shared(spline.guided_to)
+shared(spline.guided)
+regulated = shared(spline.regulated)
+follow = shared(spline.follow)
+"""The rule of flight along a spline, compiled for kernels."""
+
+
+class Followed:
+    """Record: what is known of one vehicle."""
+
+    in_force: int
+    """Step that the trajectory in force at its newest observation was made for, or NO_HORIZON."""
+    since: int
+    """First step flown with it."""
+    acknowledged: int
+    """Step that the trajectory last seen to have come into force was made for, or NO_HORIZON."""
+    judged: int
+    """Step up to which trajectories were seen in force, lost or overtaken."""
+    sent: int
+    """Number of trajectories sent so far."""
+    first: int
+    """Number of the first that may be held: those before were dropped aboard."""
+    loss: float
+    """Share of trajectories that were lost lately, ℓ."""
+
+
+class SentTrajectory:
+    """Record: a trajectory that was sent."""
+
+    step: int
+    """Step k of its first knot."""
+    due: int
+    """Step at which it is in force, or lost."""
+    ends: int
+    """Step after the last at which it is flown."""
+    spacing: int
+    """Steps from one knot to the next."""
+    count: int
+    """Number of its knots."""
+
+
+VEHICLE, SENT = record(Followed), record(SentTrajectory)
+
+
+class Settings(NamedTuple):
+    """Constants shared by all vehicles."""
+
+    dt_ns: int
+    """Length of a step [ns]."""
+    dt_s: float
+    """Length of a step [s]."""
+    age_max: int
+    """Largest age of an observation that counts [steps]."""
+    seen: int
+    """Steps that the server sees ahead, H at most."""
+    bounds: F1
+    """Largest velocity on each axis [m/s]; shape (axes,)."""
+    weight: float
+    """Weight Q_p on the position [1/m²]."""
+    lead_s: F1
+    """Time h of each axis [s]; shape (axes,)."""
+    error_m: float
+    """Largest distance of a spline from what is seen on an axis, if its knots suffice [m]."""
+    plans: bool
+    """Whether what is seen is planned along, and not told as it is."""
+
+
+class Memory(NamedTuple):
+    """State of every vehicle, and the horizons sent to it."""
+
+    observed: I1
+    """Step of the newest observation, or -1; shape (capacity,)."""
+    vehicles: Annotated[NDArray[np.void], records(VEHICLE, 1)]
+    """Shape (capacity,)."""
+    state: F3
+    """State in the newest observation [m, m/s]; shape (capacity, axes, 2)."""
+    sent: Annotated[NDArray[np.void], records(SENT, 2)]
+    """Trajectories that were sent, a ring; shape (capacity, ROOM)."""
+    knots: F4
+    """Knots of these trajectories as they are read aboard [m, m/s]; shape
+    (capacity, ROOM, axes, 2 KNOTS_MAX)."""
+
+
+class Guidance:
+    """The `Scheme` "trajectory" for up to `capacity` vehicles, and what is sent to them.
+
+    Args:
+        terms: the rule of flight.
+        control: weights and `delay_bound`.
+        regulator: K and λ of the regulator aboard; shape (axes, 3).
+        desired: what the server knows of the desired trajectories.
+        clock: knows half of the smallest round trip, which is a first guess at the delay bound.
+        block: number of vehicles that are decided on at a time.
+    """
+
+    solve_ns = -1
+    """See `server.mpc.hierarchical.Planner`: there is nothing to solve."""
+
+    def __init__(
+        self,
+        terms: Terms,
+        control: ControlConfig,
+        regulator: Array,
+        desired: Desired,
+        clock: ClockMap,
+        capacity: int,
+        block: int,
+    ) -> None:
+        axes, given = terms.axes, control.delay_bound
+        # TINY: weights that ask for no gain on position would divide by 0.
+        lead_s = (1.0 + regulator[:, 1]) / np.maximum(regulator[:, 0], TINY)
+        # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
+        # the spline goes straight on: measured, such plans led up to 12 m away (docs/studies.md).
+        plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
+        self.counts: Counter[str] = Counter()
+        self._desired, self._clock = desired, clock
+        self._loop_gain = np.array(terms.gain)
+        self._settings = Settings(
+            dt_ns=terms.dt_ns,
+            dt_s=terms.dt_s,
+            age_max=terms.age_max,
+            seen=desired.seen,
+            bounds=self._loop_gain * terms.u_max,
+            weight=control.state_weight[0],
+            lead_s=lead_s,
+            error_m=control.spline_error_m,
+            plans=bool(plans),
+        )
+        self._memory = Memory(
+            observed=np.full(capacity, -1, dtype=np.int64),
+            vehicles=np.zeros(capacity, dtype=VEHICLE),
+            state=np.zeros((capacity, axes, 2)),
+            sent=np.zeros((capacity, ROOM), dtype=SENT),
+            knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
+        )
+        fixed_s = None if given == "auto" else given
+        self.delay_bound = delay.delay_bound(capacity, terms.dt_s, committed_max(terms), fixed_s)
+        self.observed_step: Indices = self._memory.observed
+        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        """Costs of flying on; those of a block come first."""
+        self.planned = np.zeros((block, axes, 2))
+        """States at k of the trajectories sent last [m, m/s]; shape (block, axes, 2)."""
+        self._nominal = make_nominal(terms, control, capacity if plans else 0)
+        self._intended = np.zeros((block, axes, desired.seen + 1, 2))
+        """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
+        2)."""
+        for row in range(capacity):
+            self.forget(row)
+
+    def forget(self, row: int) -> None:
+        """See `Scheme`."""
+        self._memory.observed[row] = -1
+        self._memory.vehicles[row] = (NO_HORIZON, 0, NO_HORIZON, -1, 0, 0, LOSS)
+        delay.forget(self.delay_bound, row)
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """See `Scheme`; a vehicle that takes nothing holds nothing either."""
+        known = self._memory.vehicles[row]
+        if observation.step <= self.observed_step[row]:
+            return False
+        self.observed_step[row] = observation.step
+        known["in_force"], known["since"] = observation.in_force, observation.since
+        self._memory.state[row] = observation.state
+        # A vehicle that takes none has dropped what it held, and drops what is under way.
+        if not observation.takes:
+            known["first"], known["in_force"] = known["sent"], NO_HORIZON
+        return True
+
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """See `Scheme`: what was observed, as it is."""
+        n = len(rows)
+        found.estimate[:n] = found.start[:n] = self._memory.state[rows]
+
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """Fill in `figures` and `planned`, and the velocity of now in place of a plan.
+
+        Args:
+            rows: the vehicles; shape (n,).
+            step: k of each; shape (n,).
+            found: what is filled in.
+        """
+        lost, unsolved = _appraise(
+            self._settings,
+            self._memory,
+            self.delay_bound,
+            self._clock.seen,
+            self._nominal,
+            self._desired.window(rows, step, found.ahead),
+            rows,
+            step,
+            self.figures,
+            self.planned,
+            self._intended,
+        )
+        if lost:
+            self.counts["horizons_lost"] += lost
+        if unsolved:
+            self.counts["unsolved"] += unsolved
+        n = len(rows)
+        found.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
+
+    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+        """See `Scheme`; only what is sent is made, and counts."""
+        bound, intended = self.delay_bound, self._intended
+        _remember(self._settings, self._memory, bound, intended, rows, step, event, found.told)
+
+
+@inline
+def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
+    """State of a trajectory at a stage on one axis, position [m] and velocity [m/s].
+
+    Args:
+        intended: states from k on [m, m/s]; shape (seen + 1, 2).
+    """
+    # Behind what is seen the trajectory goes straight on, as the spline will.
+    last = min(stage, settings.seen)
+    v = intended[last, 1]
+    return intended[last, 0] + (stage - last) * settings.dt_s * v, v
+
+
+@inline
+def _followed(
+    settings: Settings, memory: Memory, row: int, number: int, axis: int, step: int
+) -> tuple[float, float]:
+    """State of a trajectory that was sent at a step on one axis [m, m/s]; of none, where it hovers.
+
+    Args:
+        number: of the trajectory; negative for none.
+    """
+    if number < 0:
+        return memory.state[row, axis, 0], 0.0
+    slot = number % ROOM
+    sent = memory.sent[row, slot]
+    knots = memory.knots[row, slot, axis, : 2 * sent.count]
+    return spline_at(knots, sent.spacing, settings.dt_s, step - sent.step)
+
+
+@part
+def _listen(
+    settings: Settings, memory: Memory, bound: DelayBound, clock: Seen, row: int
+) -> tuple[int, int]:
+    """Take what the newest observation says of delays and losses.
+
+    Returns:
+        number of the trajectory in force there, or -1 where that is none, or unknown; and how many
+        are newly known to be lost.
+    """
+    dt_ns, known, observed = settings.dt_ns, memory.vehicles[row], memory.observed[row]
+    if bound.steps[row] == 0:
+        begin(bound, row, -(-half_trip_ns(clock, row) // dt_ns) + MARGIN)
+    at_least(bound, row, -(-shortest_ns(clock, row) // dt_ns))
+    oldest = max(known.first, known.sent - ROOM)
+    flown, lost = -1, 0
+    for number in range(known.sent - 1, oldest - 1, -1):
+        sent = memory.sent[row, number % ROOM]
+        if sent.step == known.in_force:
+            flown = number
+        if sent.step <= known.in_force:
+            break
+        if known.judged < sent.due <= observed:
+            lost += 1
+            memory.vehicles[row].loss += LEARNED * (1.0 - memory.vehicles[row].loss)
+    memory.vehicles[row].judged = observed
+    if flown >= 0 and known.in_force != known.acknowledged:
+        memory.vehicles[row].loss -= LEARNED * memory.vehicles[row].loss
+        acknowledge(bound, row, known.since - known.in_force)
+        memory.vehicles[row].acknowledged = known.in_force
+    return flown, lost
+
+
+@part
+def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
+    """Probability that a packet comes, of which an observation so many steps later knows nothing.
+
+    Args:
+        loss: share of packets that are lost.
+        since: steps from sending to the observation; negative if that was made before.
+    """
+    left = 1.0 - loss
+    if since > 0:
+        known, later = min(bound.seen[row], SAMPLES), 0
+        for slot in range(known):
+            # Laplace's rule below, (later + 1) / (known + 1): without samples the share is 1, and
+            # never quite 0.
+            later += bound.samples[row, slot] > since
+        left *= (later + 1) / (known + 1)
+    return left / (left + loss)
+
+
+@part
+def _gap(
+    settings: Settings, memory: Memory, intended: F3, row: int, number: int, k: int, d: int
+) -> tuple[float, float]:
+    """Mean of Q_p Σ (Δp + h Δv)² of a trajectory that may be followed, and |Δp| at k + d [m].
+
+    Args:
+        intended: what would be sent now, from k on [m, m/s]; shape (axes, seen + 1, 2).
+        number: of the trajectory; negative for none.
+    """
+    gap, away = 0.0, 0.0
+    for stage in range(d, CHANCES * d + 1, d):
+        for axis in range(len(settings.bounds)):
+            p, v = _ahead(settings, intended[axis], stage)
+            led_p, led_v = _followed(settings, memory, row, number, axis, k + stage)
+            off = led_p - p + settings.lead_s[axis] * (led_v - v)
+            gap += off * off / CHANCES
+            if stage == d:
+                away += (led_p - p) ** 2
+    return settings.weight * gap, np.sqrt(away)
+
+
+@part
+def _intend(
+    settings: Settings, nominal: Nominal, row: int, k: int, desired: F3, intended: F3
+) -> bool:
+    """Fill in the trajectory that would be sent now; False where no plan is found.
+
+    Args:
+        desired: states from k on [m, m/s]; shape (axes, seen + 1 or more, 2).
+        intended: what is filled in; where the server sees ahead, its first stage is where the
+            vehicle is led at k [m, m/s]; shape (axes, seen + 1, 2).
+    """
+    if settings.plans and plan_nominal(nominal, row, k, desired, intended):
+        return True
+    for axis in range(len(intended)):
+        bound = settings.bounds[axis]
+        for stage in range(settings.seen + 1):
+            v = desired[axis, stage, 1]
+            intended[axis, stage, 0] = desired[axis, stage, 0]
+            intended[axis, stage, 1] = max(-bound, min(v, bound))
+    return not settings.plans
+
+
+@kernel
+def _appraise(
+    settings: Settings,
+    memory: Memory,
+    bound: DelayBound,
+    clock: Seen,
+    nominal: Nominal,
+    window: Window,
+    rows: I1,
+    steps: I1,
+    figures: Figures,
+    planned: F3,
+    intended: F4,
+) -> tuple[int, int]:
+    """Fill in what `Guidance.plan` says.
+
+    Returns:
+        how many trajectories are newly known to be lost, and how many plans were not found.
+    """
+    lost, unsolved, axes = 0, 0, len(settings.bounds)
+    for i in range(len(rows)):
+        row, k, plan = rows[i], steps[i], figures[i]
+        flown, newly = _listen(settings, memory, bound, clock, row)
+        lost += newly
+        known, d, observed = memory.vehicles[row], bound.steps[row], memory.observed[row]
+        newest, ends, held = flown, -1, np.inf
+        if flown >= 0:
+            held = ends = memory.sent[row, flown % ROOM].ends
+        oldest = max(known.first, known.sent - ROOM, flown + 1)
+        for number in range(oldest, known.sent):
+            sent = memory.sent[row, number % ROOM]
+            if sent.step > known.in_force and sent.due > observed:
+                newest, ends = number, max(ends, sent.ends)
+        # Only if the new one would be young enough: otherwise one would be sent at each step.
+        plan.fresh = ends <= k + d <= observed + settings.age_max
+        for axis in range(axes):
+            p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
+            if not plan.fresh:
+                p, v = _followed(settings, memory, row, newest, axis, k)
+            intended[i, axis, 0, 0], intended[i, axis, 0, 1] = p, v
+            planned[i, axis, 0], planned[i, axis, 1] = p, v
+        place, first = window.place[i], window.first[i]
+        desired = window.states[place, :axes, first:]
+        if not _intend(settings, nominal, row, k, desired, intended[i]):
+            unsolved += 1
+        share, expected = 1.0, 0.0
+        for number in range(newest, flown, -1):
+            sent = memory.sent[row, number % ROOM]
+            if number < oldest or sent.due <= observed or share <= SURE:
+                break
+            comes = _arrives(bound, row, known.loss, observed - sent.step)
+            gap, _ = _gap(settings, memory, intended[i], row, number, k, d)
+            expected += share * comes * gap
+            share *= 1.0 - comes
+        if share > SURE:
+            gap, _ = _gap(settings, memory, intended[i], row, flown, k, d)
+            expected += share * gap
+        plan.row, plan.step, plan.start, plan.gap = row, k, k, 1
+        plan.solved = True
+        plan.state_gap, plan.expected_gap = 0.0, expected
+        plan.cost_gap, plan.deviation_m = 0.0, 0.0
+        if not plan.fresh:
+            plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
+        # What is held ends soon, and all that was sent since may be lost: the vehicle would brake.
+        soon = held <= k + CHANCES * d <= observed + settings.age_max
+        plan.fresh |= soon and share > RUNS_OUT
+    return lost, unsolved
+
+
+@kernel
+def _remember(
+    settings: Settings,
+    memory: Memory,
+    bound: DelayBound,
+    intended: F4,
+    rows: I1,
+    steps: I1,
+    event: B1,
+    told: Splines,
+) -> None:
+    """Make and write down the trajectories that are sent, see `Guidance.remember`."""
+    for i in range(len(rows)):
+        if not event[i]:
+            continue
+        row, dt_s = rows[i], settings.dt_s
+        count, spacing = fewest_knots(intended[i], dt_s, settings.error_m, told.knots[i])
+        told.number[i], told.spacing[i] = count, spacing
+        slot = memory.vehicles[row].sent % ROOM
+        memory.vehicles[row].sent += 1
+        sent = memory.sent[row, slot]
+        sent.step, sent.due = steps[i], steps[i] + bound.steps[row]
+        sent.ends = memory.observed[row] + settings.age_max + 1
+        sent.spacing, sent.count = spacing, count
+        for axis in range(len(settings.bounds)):
+            for number in range(2 * count):
+                memory.knots[row, slot, axis, number] = told.knots[i, axis, number]

@@ -1,0 +1,245 @@
+"""The exact solver: right to rounding, the same whatever came before, and never a guess."""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from bench.problems import gradients
+from skytether.server.mpc import exact
+from skytether.server.mpc.exact import ExactSolver, active_sets, workspace
+from skytether.server.mpc.hierarchical import make_solver
+from skytether.server.mpc.osqp_solver import OsqpSolver
+from skytether.server.mpc.problem import (
+    LATER,
+    Problem,
+    make_mpc,
+    pose,
+    set_previous,
+    simd_batch,
+)
+from skytether.shared.base.kernel import part
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
+
+PAPER = reading.load("paper")
+U_MAX = np.array([1.8, 1.0])
+
+
+def make(
+    tau_s: tuple[float, ...] = (0.855, 0.3),
+    u_max: tuple[float, ...] = (1.8, 1.0),
+    **control: Any,
+) -> Problem:
+    """The paper's problem, with some keys of `control` changed."""
+    replace = msgspec.structs.replace
+    model = replace(PAPER.model, tau_s=tau_s, u_max=u_max)
+    scenario = replace(PAPER, model=model, control=replace(PAPER.control, **control))
+    terms = scenario.terms()
+    return pose(terms.model, make_mpc(terms, scenario.control), LATER)
+
+
+ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
+"""Long steps and hardly a cost of the input: here sets wander in circles."""
+
+
+@cache
+def active_sets_with(**constants: float) -> Callable[..., int]:
+    """`active_sets` compiled with other constants than those of its module."""
+    names = {**vars(exact), **constants}
+    first = exact.lanes(FunctionType(exact._first_set.py_func.__code__, names))
+    return part(FunctionType(exact.active_sets.py_func.__code__, {**names, "_first_set": first}))
+
+
+@pytest.fixture
+def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sets that wander are given up at once."""
+    changed = {**vars(exact), "active_sets": active_sets_with(PIVOTS_MAX=0)}
+    monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
+
+
+def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
+    """Random gradients, of moving targets and states `scale` away, and random guesses."""
+    rng = np.random.default_rng(seed)
+    axes, H = problem.hessian.shape[:2]
+    x = rng.normal(0.0, scale, (count, axes, 2))
+    target = np.cumsum(rng.normal(0.0, 0.2 * scale, (count, axes, H + 1, 2)), axis=2)
+    guess = np.clip(rng.normal(0.0, 1.0, (count, axes, H)), -U_MAX[:, None], U_MAX[:, None])
+    return gradients(problem, x, target, guess, np.zeros(x.shape[:2])), guess
+
+
+def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
+    """Violation of the optimality conditions, relative to the gradient."""
+    slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
+    at_bound = np.abs(inputs) >= U_MAX[:, None]
+    wrong = np.where(at_bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
+    return float((np.abs(wrong) / (1.0 + np.abs(gradient).max(axis=2, keepdims=True))).max())
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 40, 100])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
+    """Bounded least squares of scipy, from bounds never to nearly always active."""
+    problem = make(horizon=horizon)
+    gradient, guess = problems(problem, 20, scale, seed=horizon)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
+    assert solved.all()
+    for n in range(20):
+        for axis, bound in enumerate(U_MAX):
+            root = np.linalg.cholesky(problem.hessian[axis])
+            aim = -np.linalg.solve(root, gradient[n, axis])
+            reference = lsq_linear(root.T, aim, (-bound, bound), method="bvls", tol=1e-15).x
+            np.testing.assert_allclose(inputs[n, axis], reference, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    scale=st.sampled_from([0.1, 1.0, 3.0, 30.0]),
+    horizon=st.sampled_from([1, 7, 50]),
+    input_reference=st.booleans(),
+    change_weight=st.sampled_from([0.0, 0.033, 5.0]),
+)
+def test_every_answer_is_optimal_and_within_its_box(
+    seed: int, scale: float, horizon: int, *, input_reference: bool, change_weight: float
+) -> None:
+    problem = make(horizon=horizon, input_reference=input_reference, change_weight=change_weight)
+    gradient, guess = problems(problem, 10, scale, seed)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
+    assert solved.all()
+    assert (np.abs(inputs) <= U_MAX[:, None]).all()
+    assert residual(problem, inputs, gradient) < 1e-10
+
+
+@pytest.mark.parametrize(("pivots", "fewest", "most"), [(True, 0, 5), (False, 100, 600)])
+def test_problems_that_cycle_are_solved_all_the_same(
+    request: pytest.FixtureRequest, pivots: bool, fewest: int, most: int
+) -> None:
+    """One input at a time, and without that by DAQP; as exactly either way."""
+    if not pivots:
+        request.getfixturevalue("no_pivots")
+    problem = make((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 300, 3.0, seed=1)
+    solver = ExactSolver(problem)
+    inputs, solved = solver.solve(gradient, guess)
+    assert solved.all()
+    assert fewest <= solver.fallbacks <= most
+    assert (np.abs(inputs) <= U_MAX[:, None]).all()
+    assert residual(problem, inputs, gradient) < 1e-10
+
+
+@pytest.mark.usefixtures("no_pivots")
+def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such an answer is right to rounding and yet has a slope: no reason to refuse it."""
+    dual = exact.daqp.solve
+
+    def nearly(*args: object, **keys: object) -> object:
+        answer, *rest = dual(*args, **keys)
+        return answer * (1.0 - 4e-16), *rest
+
+    monkeypatch.setattr(exact.daqp, "solve", nearly)
+    problem = make((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 100, 3.0, seed=1)
+    solver = ExactSolver(problem)
+    inputs, solved = solver.solve(gradient, guess)
+    assert solved.all()
+    assert solver.fallbacks > 10
+    assert residual(problem, inputs, gradient) < 1e-10
+
+
+@pytest.mark.usefixtures("no_pivots")
+def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
+    problem = make((0.4, 0.6), **ROUGH)
+    gradient, guess = problems(problem, 300, 3.0, seed=1)
+    right, _ = ExactSolver(problem).solve(gradient, guess)
+
+    def wrong(hessian: Array, *_: object, **__: object) -> tuple[Array, float, int, dict[str, int]]:
+        return np.zeros(len(hessian)), 0.0, -4, {"iterations": 9}
+
+    monkeypatch.setattr(exact.daqp, "solve", wrong)
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
+    assert 0 < (~solved).sum() < 300
+    np.testing.assert_array_equal(inputs[~solved], guess[~solved])
+    np.testing.assert_array_equal(inputs[solved], right[solved])
+
+
+def test_a_problem_that_is_not_finite_fails_alone() -> None:
+    problem = make()
+    gradient, guess = problems(problem, 3, 1.0, seed=2)
+    alone, _ = ExactSolver(problem).solve(gradient[2:], guess[2:])
+    gradient[0, 1, 5], gradient[1, 0, 0] = np.nan, np.inf
+    inputs, solved = ExactSolver(problem).solve(gradient, guess)
+    assert solved.tolist() == [False, False, True]
+    np.testing.assert_array_equal(inputs[:2], guess[:2])
+    np.testing.assert_array_equal(inputs[2:], alone)
+
+
+def test_a_batch_equals_its_singles_on_every_run() -> None:
+    problem = make()
+    gradient, guess = problems(problem, 50, 2.0, seed=3)
+    solver = ExactSolver(problem)
+    together, _ = solver.solve(gradient, guess)
+    for n in range(50):
+        alone, _ = solver.solve(gradient[n : n + 1], guess[n : n + 1])
+        np.testing.assert_array_equal(alone[0], together[n])
+
+
+def test_the_guess_decides_nothing_but_the_time() -> None:
+    problem = make()
+    gradient, guess = problems(problem, 50, 2.0, seed=4)
+    solver = ExactSolver(problem)
+    from_guess, _ = solver.solve(gradient, guess)
+    from_zero, _ = solver.solve(gradient, np.zeros_like(guess))
+    np.testing.assert_allclose(from_guess, from_zero, rtol=0, atol=1e-12)
+
+
+def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
+    """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
+    problem = make((0.855, 0.855), (1.8, 1.8))
+    gradient, guess = problems(problem, 20, 10.0, seed=6)
+    inputs, _ = ExactSolver(problem).solve(gradient, guess)
+    assert (np.abs(inputs) == 1.8).mean() > 0.5
+    rounded = inputs.astype(np.float32).astype(np.float64)
+    assert np.abs(rounded).max() < 1.8
+    work, settled = workspace(problem.mpc), np.ones(1, dtype=np.bool_)
+    simd = simd_batch(work.memory)
+
+    def rounds(solve: Callable[..., int], at: tuple[int, ...]) -> int:
+        set_previous(rounded[at], 0, False, simd, 0)
+        simd.gradient[:, 0] = gradient[at]
+        return solve(problem.mpc, at[1], LATER, simd, work.free, settled)
+
+    for at in np.ndindex(20, 2):
+        assert rounds(active_sets, at) == 1
+        np.testing.assert_array_equal(simd.inputs[:, 0], inputs[at])
+    strict = active_sets_with(NEAR=1.0)
+    assert max(rounds(strict, at) for at in np.ndindex(20, 2)) > 1
+
+
+def test_osqp_agrees_to_its_tolerance() -> None:
+    problem = make()
+    gradient, guess = problems(problem, 50, 2.0, seed=5)
+    exactly, _ = ExactSolver(problem).solve(gradient, guess)
+    nearly, solved = OsqpSolver(problem).solve(gradient, guess)
+    assert solved.all()
+    np.testing.assert_allclose(nearly, exactly, rtol=0, atol=1e-6)
+
+
+def test_a_scenario_names_its_solver() -> None:
+    assert PAPER.control.solver == "exact"
+    kinds = {"exact": ExactSolver, "osqp": OsqpSolver}
+    for name, kind in kinds.items():
+        control = msgspec.structs.replace(PAPER.control, solver=name)
+        assert type(make_solver(control, make())) is kind
