@@ -356,7 +356,7 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
     # Too few are left for a whole batch; alone each gets the same bits
-    # (tests/server/test_planner.py).
+    # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
     return undone
