@@ -82,7 +82,7 @@ def test_a_documented_flight_flies(
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "fleet swap" in line or "--mission" in line:
-        line += " --settle 0 --duration 30"
+        line += " --settle 0 --duration 12"
     line = re.sub(r"--vehicles \d+0\b", "--vehicles 5", line)
     if re.search(r"--duration (20|600)\b", line):
         line += " --settle 0 --duration 4"
