@@ -50,7 +50,7 @@ K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
 
 
 class Workspace(NamedTuple):
-    """What a solver has from problem to problem."""
+    """Tables and scratch memory of a solver, reused from problem to problem."""
 
     free: F4
     """Backward passes with every input free, for FIRST and LATER weights and each axis; shape

@@ -56,8 +56,8 @@ class SimulatedFlavour:
     spool_s: float
     """Time from the take-off command until it climbs [s]."""
     wander_mps: float
-    """Standard deviation of the error of the velocity that it estimates, along each axis [m/s]: it
-    moves as much beside that, and does not notice."""
+    """Standard deviation of the error of its velocity estimate, along each axis [m/s]. The true
+    velocity is off by this error from the one that it controls."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]

@@ -28,9 +28,9 @@ STILL_MPS = 0.1
 """Speed below which the vehicle counts as at rest [m/s]."""
 
 WANDER_NS = 3 * SECOND_NS
-"""Time constant of the error of the velocity that it estimates [ns]."""
+"""Correlation time of the error of the velocity estimate [ns]."""
 WANDER_TIME_S = 0.6
-"""Error of the position that it estimates, as time of that error of the velocity [s]."""
+"""Ratio of the error of the position estimate to the error of the velocity estimate [s]."""
 
 Vector = tuple[float, float, float]
 REST: Vector = (0.0, 0.0, 0.0)
@@ -130,7 +130,7 @@ class PilotedVehicle(ABC):
         """Velocity at which it moves beside the one that it estimates, as with accelerometers that
         have failed [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
-        """Error of the velocity that it estimates: it moves as much beside that [m/s]."""
+        """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST
         """Displacement of the position that it reports [m]."""
         self.said: list[tuple[Severity, str]] = []
@@ -482,7 +482,7 @@ class PilotedVehicle(ABC):
         return x, y, z
 
     def _stray(self) -> None:
-        """Let the error of the velocity that it estimates go on: a Gauss-Markov process."""
+        """Advance the error of the velocity estimate by a tick: a Gauss-Markov process."""
         if self.flying and self.flavour.wander_mps:
             share = TICK_NS / WANDER_NS
             drawn = sqrt(2.0 * share) * self._noise.standard_normal(3)

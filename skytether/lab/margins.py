@@ -42,7 +42,8 @@ threshold, and well above what rounding on the wire adds beside noise of some ce
 FLOOR = 1e-9
 """Share of its largest value below which a mean square is rounding."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
-"""Time [s] and mean round trips until there are sessions, and a stationary delay bound."""
+"""Time [s], plus a number of mean round trips, before a push: by then sessions are open and the
+delay bound is stationary."""
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
 """Time for which the answer to wind counts, and time before that in which it builds up [s]."""
 SMALL = 0.05
