@@ -32,26 +32,14 @@ def clamped(
     # Before any min and max: with a NaN their result depends on the order of their arguments.
     if not all(map(math.isfinite, (*wanted, *told))):
         return None
-    speed = math.hypot(*told)
-    excess = 1.0 - speed_max / speed if speed > speed_max + ROUNDING else 0.0
-    axes = zip(wanted, told, before, u_max, strict=True)
-    return [limited(u, part, excess, last, change_max, most) for u, part, last, most in axes]
-
-
-def limited(
-    u: float, part: float, excess: float, before: float, change_max: float, bound: float
-) -> float:
-    """Input of one axis that may be flown [m/s].
-
-    Args:
-        u: input that was chosen [m/s].
-        part: part of it that is no feedback [m/s].
-        excess: share of that part that is left out.
-        before: input that was flown until now [m/s].
-        change_max: largest change from that [m/s]; may be infinite.
-        bound: u_max of the axis [m/s].
-    """
-    near = min(max(u - excess * part, before - change_max), before + change_max)
-    # The bound comes last and so always holds; `before` is within it, so that the largest change
-    # holds too.
-    return min(max(near, -bound), bound)
+    excess = 0.0
+    if speed_max < math.inf:
+        speed = math.hypot(*told)
+        excess = 1.0 - speed_max / speed if speed > speed_max + ROUNDING else 0.0
+    flown = []
+    for u, part, last, most in zip(wanted, told, before, u_max, strict=True):
+        near = min(max(u - excess * part, last - change_max), last + change_max)
+        # The bound comes last and so always holds; `before` is within it, so that the largest
+        # change holds too.
+        flown.append(min(max(near, -most), most))
+    return flown

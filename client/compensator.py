@@ -1,42 +1,22 @@
 """Uplink delay compensator, eq. (11): which input to fly now, from a horizon made earlier.
 
-The rule itself is `shared.law.rule`, which the server's replay flies by as well. Here is what it
-needs aboard: the newest horizon, where its first inputs have led so far, and the step it came into
-force. The horizon of the newest generation wins, in whatever order they arrive (E11). Without a
-horizon the input that was flown last is braked along, and from a standstill that is hovering.
-
-A horizon that is a spline (the scheme "trajectory") is flown by the rule of `shared.law.spline`.
+Here is which horizon is in force: that of the newest generation wins, in whatever order they arrive
+(E11). What is flown by it is in `client.followers`. Without a horizon the input that was flown last
+is braked along, and from a standstill that is hovering.
 """
-
-import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.law import rule, spline
-from skytether.shared.law.model import Array, advance
-from skytether.shared.law.rule import Held, bounded, lasting, late_max
-from skytether.shared.law.spline import Guide, along
+from skytether.client.followers import Constants, Follower, HorizonFollower, SplineFollower
+from skytether.shared.law.model import Array
+from skytether.shared.law.rule import lasting, late_max
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import (
-    AXES_MAX,
-    DISTURBANCE,
-    FEEDBACK,
-    GAIN_P,
-    GAIN_V,
-    LED_P,
-    LED_V,
-    NO_HORIZON,
-    Horizon,
-    Trajectory,
-)
+from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Trajectory
 
 FOREVER = 2**30
 """Stages for which a place is held: none come after."""
-ZEROS = (0.0,) * AXES_MAX
-"""Disturbance and input before of each axis where none are known [m/s]."""
 
 
 class Compensator:
@@ -50,35 +30,17 @@ class Compensator:
     """
 
     def __init__(self, terms: Terms, regulator: Array | None = None) -> None:
-        self._regulator = np.zeros((terms.axes, 3)) if regulator is None else regulator
-        self._H = terms.horizon
-        self._age_max = terms.age_max
-        self._indexed = terms.indexed
-        self._commits, self._dt_s = terms.commits, terms.dt_s
-        self._late_max = late_max(terms.horizon)
-        self._brake, self._join = terms.brake, terms.join
-        self._bounds = terms.u_max
-        self._model = terms.model.axes()
+        self._terms = terms
+        regulator = np.zeros((terms.axes, 3)) if regulator is None else regulator
+        self._constants = Constants.of(terms, regulator)
+        self._H, self._age_max, self._join = terms.horizon, terms.age_max, terms.join
+        self._late_max, self._brake = late_max(terms.horizon), terms.brake
         self.begins = 0
         """Step of stage 0: that which the horizon was made for, or that at which it was dropped."""
-        self.held: list[Held] = []
-        """The horizon on each axis; without one the input that was flown when it was dropped."""
-        self.guides: list[Guide] = []
-        """Spline on each axis; empty where inputs are held."""
-        self.knots = np.zeros((terms.axes, 0, 2), dtype=np.float32)
-        """Knots of the newest spline that was sent; shape (axes, knots, 2)."""
-        self.feeds_back = False
-        """Whether what is flown is told and feedback on top of that."""
-        self.lead: list[tuple[float, float]] = []
-        """State x̄ that the horizon leads to, of each axis at stage `lead_stage` [m, m/s]."""
-        self.lead_stage = 0
-        self._length = 0
-        """Number of stages for which the horizon is flown."""
-        self._hold([[0.0]] * terms.axes, 1)
+        self.follower: Follower = self._braking(np.zeros(terms.axes))
+        """What is flown by; without a horizon the input that was flown when it was dropped."""
         self._chosen = 0
         """Step chosen for last."""
-        self.told = [0.0] * terms.axes
-        """Input of each axis at the step chosen for last, without the feedback [m/s]."""
         self.in_force = NO_HORIZON
         """Step that the horizon was made for, k_h, or NO_HORIZON."""
         self.newest = NO_HORIZON
@@ -122,7 +84,7 @@ class Compensator:
             return False
         # Without compensation the one input lasts for as long as its observation is young enough.
         given = self._age_max + self._H
-        if self._indexed and isinstance(horizon, Horizon):
+        if self._terms.indexed and isinstance(horizon, Horizon):
             given = horizon.inputs.shape[1]
         length = lasting(given, horizon.step, observed, self._age_max)
         if not 0 <= observed < step:
@@ -140,11 +102,8 @@ class Compensator:
             self.go_on_along(horizon.step, observed, horizon.spacing, horizon.knots)
             return True
         self._put_in_force(horizon.step, observed)
-        self._hold(
-            horizon.inputs.tolist(),
-            length,
-            horizon.feedback.tolist() if horizon.feedback.size else (),
-        )
+        feedback = horizon.feedback if horizon.feedback.size else None
+        self.follower = HorizonFollower(self._constants, horizon.inputs, length, feedback)
         return True
 
     def go_on_along(
@@ -159,9 +118,8 @@ class Compensator:
             knots: position [m] and velocity [m/s] of each; shape (axes, knots, 2).
         """
         self._put_in_force(made_for, observed)
-        self.knots = knots
         length = lasting(self._age_max + self._H, made_for, observed, self._age_max)
-        self._guide(knots.reshape(len(knots), -1).tolist(), spacing, length)
+        self.follower = SplineFollower(self._constants, knots, spacing, length)
 
     def _put_in_force(self, made_for: int, observed: int) -> None:
         """Let a horizon be in force from the step on that is chosen next."""
@@ -178,94 +136,27 @@ class Compensator:
         """
         self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
-        # A horizon of one input, which is over: the rule of flight brakes along it from the next
-        # step on.
-        self.begins = step
-        self._hold(flown_last[:, None].tolist(), 1)
+        self.begins, self.follower = step, self._braking(flown_last)
 
-    def _hold(
-        self, inputs: list[list[float]], length: int, feedback: Sequence[Sequence[float]] = ()
-    ) -> None:
-        """Fly by a horizon from now on.
+    def _braking(self, flown: Array) -> HorizonFollower:
+        """A horizon of one input, which is over: the rule of flight brakes along it."""
+        return HorizonFollower(self._constants, flown[:, None], 1)
 
-        Args:
-            inputs: its inputs [m/s]; shape (axes, n).
-            length: number of them that are flown.
-            feedback: its feedback, see `wire.protocol.Horizon`; empty without.
-        """
-        last = [each[length - 1 if self._indexed else 0] for each in inputs]
-        within = [bounded(u, bound) for u, bound in zip(last, self._bounds, strict=True)]
-        # No math.hypot: it rounds otherwise in 17 % of cases, and the server's replay has a plain
-        # root.
-        speed = math.sqrt(sum(u * u for u in within))
-        told = feedback or [[0.0] * FEEDBACK] * len(inputs)
-        self.held = [
-            Held(
-                model=model,
-                inputs=each,
-                length=length,
-                indexed=self._indexed,
-                speed=speed,
-                brake=self._brake,
-                bound=bound,
-                feeds_back=bool(feedback),
-                gain_p=columns[GAIN_P],
-                gain_v=columns[GAIN_V],
-                disturbance=columns[DISTURBANCE],
-            )
-            for model, each, bound, columns in zip(
-                self._model, inputs, self._bounds, told, strict=True
-            )
-        ]
-        self.guides, self.feeds_back = [], bool(feedback)
-        self._length = length
-        self.lead = [(columns[LED_P], columns[LED_V]) for columns in told]
-        self.lead_stage = 0
-
-    def rest(self, step: int, state: Sequence[tuple[float, float]]) -> None:
+    def rest(self, step: int, state: Array) -> None:
         """Hold the present place until a horizon comes, or what is held is dropped.
 
         Args:
             step: k, the step whose input is chosen next.
-            state: position [m] and velocity [m/s] of each axis.
+            state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
-        self.begins = step
-        self._guide([[position, 0.0] for position, _ in state], 1, FOREVER)
+        self.begins, knot = step, np.zeros((len(state), 1, 2))
+        knot[:, 0, 0] = state[:, 0]
+        self.follower = SplineFollower(self._constants, knot, 1, FOREVER)
 
     @property
     def rests(self) -> bool:
         """Whether a place is held."""
-        return bool(self.guides) and self.in_force == NO_HORIZON
-
-    def _guide(self, knots: list[list[float]], spacing: int, length: int) -> None:
-        """Fly along a spline from now on, for so many stages."""
-        last = [
-            bounded(along(model, each, spacing, self._dt_s, length - 1), bound)
-            for model, each, bound in zip(self._model, knots, self._bounds, strict=True)
-        ]
-        speed = math.hypot(*last)
-        self.guides = [
-            Guide(
-                model=model,
-                knots=each,
-                spacing=spacing,
-                dt_s=self._dt_s,
-                length=length,
-                last=u,
-                speed=speed,
-                brake=self._brake,
-                bound=bound,
-                gain_p=gain_p,
-                gain_v=gain_v,
-                lag=lag,
-            )
-            for model, each, u, bound, (gain_p, gain_v, lag) in zip(
-                self._model, knots, last, self._bounds, self._regulator.tolist(), strict=True
-            )
-        ]
-        self._length, self.feeds_back = length, True
-        self.lead = [(each[0], each[1]) for each in knots]
-        self.lead_stage = 0
+        return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
         """Whether a horizon that would come into force at a stage is of no use any more.
@@ -276,109 +167,31 @@ class Compensator:
             length: number of its inputs that may be flown.
         """
         ended = bool(self._brake) and stage >= length  # braking is not begun anew
-        return ended or (self._commits and stage > committed + self._late_max)
+        return ended or (self._terms.commits and stage > committed + self._late_max)
 
     def choose(
-        self,
-        step: int,
-        state: Sequence[tuple[float, float]],
-        disturbance: Sequence[float] = ZEROS,
-        before: Sequence[float] = ZEROS,
-    ) -> list[float]:
-        """Input u* for `step` on each axis [m/s].
+        self, step: int, state: Array, disturbance: Array, before: Array
+    ) -> tuple[list[float], list[float]]:
+        """Input u* for `step` on each axis, and what of it is told, without the feedback [m/s].
 
         Args:
             step: k, never smaller than before.
-            state: position [m] and velocity [m/s] of each axis at the step.
-            disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
-                spline [m/s].
-            before: input flown until now, of each axis; counts only along a spline [m/s].
+            state, disturbance, before: see `Follower.input_at`.
 
         Source: eq. (11).
         """
-        stage = self._go_on(step)
-        if self.guides:
-            return self._follow(stage, state, disturbance, before)
-        if self.feeds_back:
-            self._lead_to(stage)
-        axes = zip(self.held, self.lead, state, strict=True)
-        flown = [rule.step(held, stage, *lead, *x) for held, lead, x in axes]
-        self.told = [told for _, told, _, _ in flown]
-        return [u for u, _, _, _ in flown]
-
-    def covers(self, step: int) -> bool:
-        """Whether the horizon has an input for a step."""
-        return self.in_force != NO_HORIZON and step - self.begins < self._length
-
-    def alike_until(self, step: int) -> int:
-        """Last step up to which `covered` stays as it is at a step, and nothing is braked."""
-        if self.in_force != NO_HORIZON:
-            return self.begins + self._length - 1 if self.covered else step
-        return FOREVER if self.rests else step
-
-    def _go_on(self, step: int) -> int:
-        """Advance to a step; returns its stage in the horizon."""
         if self._new:
             self.since, self._new = step, False
-        self._chosen = step
-        self.covered = self.covers(step)
-        return step - self.begins
+        self._chosen, self.covered = step, self._covers(step)
+        flown, told = self.follower.input_at(
+            step - self.begins, state, disturbance, before
+        ).tolist()
+        return flown, told
 
-    def note(self, step: int, told: list[float]) -> None:
-        """Note what was chosen for a step elsewhere; `lead` is left as it was.
+    def _covers(self, step: int) -> bool:
+        """Whether the horizon has an input for a step."""
+        return self.in_force != NO_HORIZON and step - self.begins < self.follower.length
 
-        Args:
-            step: k, never smaller than before.
-            told: what is flown but for the feedback, of each axis [m/s].
-        """
-        self._go_on(step)
-        self.told = told
-
-    def _follow(
-        self,
-        stage: int,
-        state: Sequence[tuple[float, float]],
-        disturbance: Sequence[float],
-        before: Sequence[float],
-    ) -> list[float]:
-        """Input along the spline at a stage, see `choose`."""
-        flown = []
-        # Not strict: ZEROS has as many axes as there can be.
-        axes = zip(self.guides, disturbance, before, strict=False)
-        for axis, (guide, w, last) in enumerate(axes):
-            lead = spline.guided_to(guide, self.lead_stage, stage, *self.lead[axis])
-            self.lead[axis] = lead
-            flown.append(spline.follow(guide, stage, *lead, *state[axis], w, last))
-        self.lead_stage = stage
-        self.told = [told for _, told in flown]
-        return [u for u, _ in flown]
-
-    def foresee(
-        self, states: Sequence[tuple[float, float]], flown: Sequence[float] | None = None
-    ) -> list[tuple[float, float]]:
-        """State of each axis a step after the one chosen for last, as the server foresees it.
-
-        Args:
-            states: position [m] and velocity [m/s] of each axis at that step.
-            flown: input flown there [m/s]; None for what the rule of flight makes of the states.
-        """
-        stage = self._chosen - self.begins
-        if self.guides:  # what the wind does is flown off
-            # What λ keeps of the input before is left out: it lasts for a few steps only.
-            led = zip(self.guides, self.lead, states, strict=True)
-            told = [spline.regulated(guide, stage, *lead, *x, 0.0)[0] for guide, lead, x in led]
-            return [advance(m, *x, u) for m, x, u in zip(self._model, states, told, strict=True)]
-        if flown is None:
-            axes = zip(self.held, self.lead, states, strict=True)
-            flown = [rule.step(held, stage, *lead, *x)[0] for held, lead, x in axes]
-        flying = zip(self.held, states, flown, strict=True)
-        return [advance(held.model, p, v, u + held.disturbance) for held, (p, v), u in flying]
-
-    def _lead_to(self, stage: int) -> None:
-        """Roll x̄ on to a stage, unless it is there already."""
-        if stage > self.lead_stage:
-            self.lead = [
-                rule.lead_to(held, self.lead_stage, stage, *lead)
-                for held, lead in zip(self.held, self.lead, strict=True)
-            ]
-            self.lead_stage = stage
+    def foresee(self, states: Array, flown: Array | None = None) -> Array:
+        """State of each axis a step after the one chosen for last, see `Follower.foresee`."""
+        return self.follower.foresee(self._chosen - self.begins, states, flown)

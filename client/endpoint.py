@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
+from skytether.client.followers import SplineFollower
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import FlownMotion, Kept, Memory
 from skytether.client.pilot import Pilot
@@ -37,6 +38,7 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
@@ -77,7 +79,6 @@ class Client(Endpoint):
         boot_id: number that no other life of this vehicle has had.
         link: how messages become datagrams.
         recorder: takes one row a step.
-        pilot: class of what flies the vehicle.
         keeps: whether what the next life must know is kept, see `client.memory`.
         before: what the life before has kept; None of none.
     """
@@ -92,7 +93,6 @@ class Client(Endpoint):
         boot_id: int,
         link: ClientLink | None = None,
         recorder: Recorder | None = None,
-        pilot: type[Pilot] = Pilot,
         keeps: bool = False,
         before: Kept | None = None,
     ) -> None:
@@ -132,7 +132,7 @@ class Client(Endpoint):
             out=self._out,
             events=self._events,
         )
-        self._pilot = pilot(scenario, vehicle, flies, self._failsafe, recorder)
+        self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
         """Event with which a flight ends that has had no plan."""
         self._land_after_s = scenario.vehicle.land_after_s
@@ -178,7 +178,7 @@ class Client(Endpoint):
         return self._pilot.began_ns
 
     @property
-    def disturbance(self) -> Sequence[float]:
+    def disturbance(self) -> Array:
         """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
         return self._pilot.disturbance
 
@@ -238,12 +238,14 @@ class Client(Endpoint):
         if pilot.next_ns is None:  # the flight of the life before may still go on
             return msgspec.structs.replace(self._memory.before, frame=self._flies.frame)
         motion = None
-        if self._is_mission and compensator.in_force != NO_HORIZON:
+        flown = compensator.follower
+        in_force = self._is_mission and compensator.in_force != NO_HORIZON
+        if in_force and isinstance(flown, SplineFollower):
             motion = FlownMotion(
                 step=compensator.in_force,
                 observed=compensator.observed,
-                spacing=compensator.guides[0].spacing,
-                numbers=compensator.knots.tobytes(),
+                spacing=flown.spacing,
+                numbers=flown.sent.tobytes(),
             )
         return Kept(
             boot_id=self._memory.boot_id,

@@ -231,22 +231,6 @@ class Failsafe:
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
-    def calm_until_ns(self, now_ns: int) -> int:
-        """Time up to which `step` changes nothing as long as nothing comes [ns].
-
-        Args:
-            now_ns: time of a step that has just been handled; also returned where the next one may
-                change something.
-        """
-        waits = self.mode not in CALM or self.reason in LOCKING or self.reason is Reason.UNARMED
-        if waits or not self.armed or self.has_leapt or self.is_lost(now_ns):
-            return now_ns
-        assert self._heard_ns is not None
-        lost_ns = self._heard_ns + self._timeout_ns
-        if (self.mode, Reason.OLD) not in self._table:
-            return lost_ns
-        return max(now_ns, min(lost_ns, self._horizon_ns + self._timeout_ns))
-
     # -- what arrives ------------------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:

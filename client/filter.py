@@ -17,17 +17,17 @@ so that one that is missing is simply left out. A measurement that is had late t
 was made at. There the filter stands; the estimate is its state, rolled on to the present with the
 inputs that have acted since. A constant error of a sensor it cannot tell from the truth.
 
-The covariance P does not depend on what is measured: axes that are alike share it.
+The covariance P does not depend on what is measured.
 """
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from skytether.client.vehicle import Measurement
-from skytether.shared.law.model import Axis, advance, white_acceleration
+from skytether.shared.base.compilable import Numbers, Table, compilable
+from skytether.shared.law.model import Array, Axis, advance, white_acceleration
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
@@ -92,6 +92,63 @@ def by_velocity(P: Spread, variance: float) -> tuple[Gain, Spread]:
     )
 
 
+@compilable
+def advanced(x: Table, P: Table, model: Table, noise: Table, inputs: Numbers) -> None:
+    """Advance all axes by a step, in place.
+
+    Args:
+        x: state [p, v, w] of each axis; shape (axes, 3).
+        P: covariance of each axis, rows of `Spread`.
+        model: rows of `Axis`.
+        noise: Q of each axis, rows of `Spread`.
+        inputs: input that acts, of each axis [m/s].
+    """
+    for i in range(len(x)):
+        axis = Axis(model[i, 0], model[i, 1], model[i, 2], model[i, 3])
+        x[i, 0], x[i, 1] = advance(axis, x[i, 0], x[i, 1], inputs[i] + x[i, 2])
+        _write(P, i, widened(axis, _spread(P, i), _spread(noise, i)))
+
+
+@compilable
+def corrected(
+    x: Table,
+    P: Table,
+    measured: Table,
+    has_position: bool,
+    has_velocity: bool,
+    variance_p: float,
+    variance_v: float,
+) -> None:
+    """Correct all axes by a measurement, in place.
+
+    Args:
+        x, P: see `advanced`.
+        measured: positions [m] and velocities [m/s]; shape (2, axes).
+        has_position, has_velocity: whether they were measured.
+        variance_p, variance_v: their variances [m²], [m²/s²].
+    """
+    for i in range(len(x)):
+        spread = _spread(P, i)
+        if has_position:
+            (kp, kv, kw), spread = by_position(spread, variance_p)
+            off = measured[0, i] - x[i, 0]
+            x[i, 0], x[i, 1], x[i, 2] = x[i, 0] + kp * off, x[i, 1] + kv * off, x[i, 2] + kw * off
+        if has_velocity:
+            (kp, kv, kw), spread = by_velocity(spread, variance_v)
+            off = measured[1, i] - x[i, 1]
+            x[i, 0], x[i, 1], x[i, 2] = x[i, 0] + kp * off, x[i, 1] + kv * off, x[i, 2] + kw * off
+        _write(P, i, spread)
+
+
+def _spread(table: Table, i: int) -> Spread:
+    return Spread(table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5])
+
+
+def _write(table: Table, i: int, spread: Spread) -> None:
+    table[i, 0], table[i, 1], table[i, 2] = spread.pp, spread.pv, spread.pw
+    table[i, 3], table[i, 4], table[i, 5] = spread.vv, spread.vw, spread.ww
+
+
 class Kalman:
     """Filter of a scenario's vehicle.
 
@@ -102,107 +159,72 @@ class Kalman:
 
     def __init__(self, scenario: Scenario, delay: int) -> None:
         terms, sensor = scenario.terms(), scenario.sensor
-        self._model = terms.model.axes()
-        # One covariance for axes of the same numbers: it does not depend on what is measured.
-        alike = sorted(set(self._model))
-        self.kinds = [alike.index(axis) for axis in self._model]
-        """Which of the axes that differ each one is like."""
-        q, dt = sensor.process_noise, terms.dt_s
-        self.noise = []
-        for axis in alike:
-            tau_s = terms.tau_s[self._model.index(axis)]
+        axes, q, dt = terms.axes, sensor.process_noise, terms.dt_s
+        self._model = terms.model
+        self._rows = np.stack(terms.model, -1)
+        self._noise = np.zeros((axes, len(Spread._fields)))
+        walk = (DRIFT * q) ** 2 * dt
+        for axis, tau_s in enumerate(terms.tau_s):
             (a, _), (b, c) = (q * white_acceleration(np.array([tau_s]), dt)[0]).tolist()
-            walk = (DRIFT * q) ** 2 * dt
-            self.noise.append(Spread(a * a, a * b, 0.0, b * b + c * c, 0.0, walk))
-        self._alike = alike
-        self.variances = (
+            self._noise[axis] = Spread(a * a, a * b, 0.0, b * b + c * c, 0.0, walk)
+        self._variances = (
             max(sensor.position_noise_m, LEAST) ** 2,
             max(sensor.velocity_noise_mps, LEAST) ** 2,
         )
-        self.spreads: list[Spread] = []
-        """P of each kind of axis; empty before the first measurement."""
-        self.x: list[tuple[float, float, float]] = []
-        """State of each axis, `delay` steps ago."""
-        nothing = [0.0] * terms.axes
-        self._acted: deque[tuple[list[float], Sequence[float]]] = deque(
-            [(nothing, ())] * delay, delay + 1
+        self.P = np.zeros((axes, len(Spread._fields)))
+        """Covariance of each axis, rows of `Spread`."""
+        self.x = np.zeros((axes, 3))
+        """State of each axis, `delay` steps ago; shape (axes, 3)."""
+        self._acted: deque[tuple[Array, Array | None]] = deque(
+            [(np.zeros(axes), None)] * delay, delay + 1
         )
         """Inputs that have acted since, see `advance` [m/s]."""
-        self._late = [each.late for each in terms.dead_times]
+        self._late = np.array([each.late for each in terms.dead_times])
 
-    def begin(self, measured: Measurement) -> None:
-        """Take the first measurement, which has a position; the vehicle stands."""
-        assert measured.position is not None
+    def begin(self, measured: Measurement, numbers: Array) -> None:
+        """Take the first measurement, which has a position; the vehicle stands.
+
+        Args:
+            measured: the measurement.
+            numbers: its positions [m] and velocities [m/s]; shape (2, axes).
+        """
         v, w = BEGIN_MPS
+        self.x[:] = 0.0
+        self.x[:, 0] = numbers[0]
         if measured.velocity is not None:
-            v = self.variances[1] ** 0.5
-        velocity = measured.velocity or [0.0] * len(self._model)
-        P = Spread(self.variances[0], 0.0, 0.0, v * v, 0.0, w * w)
-        self.spreads = [P] * len(self._alike)
-        self.x = [(p, v, 0.0) for p, v in zip(measured.position, velocity, strict=True)]
+            v = self._variances[1] ** 0.5
+            self.x[:, 1] = numbers[1]
+        self.P[:] = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
 
-    def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
+    def advance(self, due: Array, swing: Array | None = None) -> None:
         """Advance by a step, over which these inputs act, see `shared.law.dead_time`.
 
         Args:
             due: the input that acts at its end, of each axis [m/s].
-            swing: by how much more acts at its begin [m/s]; empty without.
+            swing: by how much more acts at its begin [m/s]; None without.
         """
         self._acted.append((due, swing))
         inputs, more = self._acted.popleft()
-        self.x = [
-            (*advance(axis, p, v, u + w), w)
-            for axis, (p, v, w), u in zip(self._model, self.x, inputs, strict=True)
-        ]
-        if more:
-            moved = self._swung([(p, v) for p, v, _ in self.x], more)
-            self.x = [(p, v, w) for (p, v), (_, _, w) in zip(moved, self.x, strict=True)]
-        self.spreads = [
-            widened(axis, P, noise)
-            for axis, P, noise in zip(self._alike, self.spreads, self.noise, strict=True)
-        ]
+        advanced(self.x, self.P, self._rows, self._noise, inputs)
+        if more is not None:
+            self.x[:, :2] += self._late * more[:, None]
 
-    def take(self, measured: Measurement) -> None:
-        """Take what was measured at the step the filter stands at."""
-        for which, (correct, values) in enumerate(
-            zip((by_position, by_velocity), measured[1:], strict=True)
-        ):
-            if values is None:
-                continue
-            variance = self.variances[which]
-            corrected = [correct(P, variance) for P in self.spreads]
-            self.spreads = [P for _, P in corrected]
-            gains = [corrected[kind][0] for kind in self.kinds]
-            self.x = [
-                (p + kp * off, v + kv * off, w + kw * off)
-                for (p, v, w), (kp, kv, kw), off in (
-                    (x, gain, z - x[which])
-                    for x, gain, z in zip(self.x, gains, values, strict=True)
-                )
-            ]
+    def take(self, measured: Measurement, numbers: Array) -> None:
+        """Take what was measured at the step the filter stands at, see `begin`."""
+        _, position, velocity = measured
+        has_position, has_velocity = position is not None, velocity is not None
+        corrected(self.x, self.P, numbers, has_position, has_velocity, *self._variances)
 
-    def estimate(self) -> list[tuple[float, float]]:
-        """Position [m] and velocity [m/s] of each axis at the present step."""
-        present = [(p, v) for p, v, _ in self.x]
+    def estimate(self) -> Array:
+        """Position [m] and velocity [m/s] of each axis at the present step; shape (axes, 2)."""
+        present = self.x[:, :2].copy()
         # From the step of the newest measurement to the present, by what has acted since.
         for inputs, more in self._acted:
-            present = [
-                advance(axis, p, v, u + w)
-                for axis, (p, v), (_, _, w), u in zip(
-                    self._model, present, self.x, inputs, strict=True
-                )
-            ]
-            if more:
-                present = self._swung(present, more)
+            present = self._model.step(present, inputs + self.x[:, 2])
+            if more is not None:
+                present += self._late * more[:, None]
         return present
 
-    def _swung(
-        self, states: list[tuple[float, float]], swing: Sequence[float]
-    ) -> list[tuple[float, float]]:
-        """States at the end of a step at whose begin another input acted, see `advance`."""
-        axes = zip(states, self._late, swing, strict=True)
-        return [(p + late[0] * u, v + late[1] * u) for (p, v), late, u in axes]
-
-    def disturbance(self) -> list[float]:
-        """Disturbance w that acts on each axis like an input [m/s]."""
-        return [w for _, _, w in self.x]
+    def disturbance(self) -> Array:
+        """Disturbance w that acts on each axis like an input [m/s]; shape (axes,)."""
+        return self.x[:, 2].copy()

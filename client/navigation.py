@@ -8,17 +8,20 @@ to predict over a dead time, and to fly along a spline.
 
 import math
 from collections.abc import Sequence
-from itertools import chain
 from typing import NamedTuple
+
+import numpy as np
 
 from skytether.client.filter import Kalman
 from skytether.client.vehicle import Measurement
+from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.dead_time import OnTheirWay
 from skytether.shared.law.leap import (
     NOISE_M,
     NOISE_MPS,
     displacement,
+    most_m,
     position_leaps,
     velocity_leaps,
 )
@@ -80,20 +83,18 @@ class Navigation:
         """Inputs on their way; None where the model has each act at once."""
         self._delay_ns = known.delay * scenario.dt_ns
         """Time from measuring to having it that the filter itself reckons with [ns]."""
-        self._motions = list(zip(terms.tau_s, terms.gain, strict=True))
+        self._tau_s, self._gain = np.array(terms.tau_s), np.array(terms.gain)
         self._begun = False
         self.leaps = Leaps(scenario)
         """Check of each measurement against the one before."""
-        self.is_simple = known.prompt and self._inputs is None
-        """Whether the whole state is measured at each step, and each input acts at once."""
         self.leapt = False
         """Whether what was measured since the last step is what no vehicle can have come to."""
-        self._nothing = [math.nan] * axes
-        self.measured = [(math.nan, math.nan)] * axes
+        self._nothing = np.full((2, axes), math.nan)
+        self.measured: Array = np.full((axes, 2), math.nan)
         """Measurements that came since the last step, position [m] and velocity [m/s] of each
-        axis; NaN where nothing is."""
+        axis; NaN where nothing is. Shape (axes, 2)."""
         self.estimate = self.measured
-        """State now, position [m] and velocity [m/s] of each axis."""
+        """State now, position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
         self.predicted = self.estimate
         """State in which the next input will meet the vehicle, which is flown by and reported;
         without a dead time the estimate."""
@@ -108,49 +109,42 @@ class Navigation:
             command: the input flown since then [m/s]; shape (axes,).
             now_ns: begin of the step [ns; the client's clock].
         """
-        position = velocity = self._nothing
-        due: list[float] = command.tolist()
-        swing: Sequence[float] = ()
+        due, swing = command, None
         if self._inputs is not None:
-            due, swing = self._inputs.issue(due)
+            due, swing = self._inputs.issue(command)
         if self._begun:
             self.filter.advance(due, swing)
-        self.leapt = False
+        self.leapt, told = False, self._nothing
         for measured in measurements if self._begun else _newest(measurements):
-            self.leapt |= self.leaps.leaps(measured)
+            numbers = measured.numbers()
+            self.leapt |= self.leaps.leaps(measured, numbers)
+            told = numbers if told is self._nothing else np.where(np.isnan(numbers), told, numbers)
             if self._begun:
-                self.filter.take(self._carried(measured, now_ns - self._delay_ns, due))
+                carried = self._carried(measured, now_ns - self._delay_ns, due)
+                if carried is not measured:
+                    numbers = carried.numbers()
+                self.filter.take(carried, numbers)
             else:
-                self.filter.begin(measured)
+                self.filter.begin(measured, numbers)
                 self._begun = True
-            position, velocity = measured.position or position, measured.velocity or velocity
-        self.measured = list(zip(position, velocity, strict=True))
+        self.measured = told.T
         if self._begun:
             self.estimate = self.predicted = self.filter.estimate()
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
-            numbers = chain.from_iterable(self.predicted)
             # Told as float32, a larger number would reach the server as infinity.
-            self.is_known = all(-FLOAT_MAX <= number <= FLOAT_MAX for number in numbers)
+            self.is_known = all_within(self.predicted, FLOAT_MAX)
 
     def begin_anew(self) -> None:
         """Begin with the next measurement: the frame has changed, and with it the position."""
         self._begun, self.leaps = False, Leaps(self._scenario)
 
-    def note(self, estimate: list[tuple[float, float]]) -> None:
-        """Note the finite estimate of a step that was computed elsewhere, without a leap.
-
-        Filter, leaps and `measured` are left as they were.
-        """
-        self.leapt = False
-        self.estimate = self.predicted = estimate
-
     @property
-    def disturbance(self) -> Sequence[float]:
+    def disturbance(self) -> Array:
         """Disturbance ŵ that the filter has found on each axis [m/s]; 0 without a filter."""
         return self.filter.disturbance()
 
-    def _carried(self, measured: Measurement, to_ns: int, due: list[float]) -> Measurement:
+    def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
         """A measurement carried to a later time by the model; an earlier time changes nothing.
 
         A real vehicle measures when it likes. For a time in which an input acted that is another
@@ -166,16 +160,16 @@ class Navigation:
         age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
         if age <= 0.0:
             return measured
-        known = measured.velocity or [v for _, v in self.filter.estimate()]
-        acting = zip(self._motions, due, self.filter.disturbance(), strict=True)
-        position, velocity = list(measured.position or ()), []
-        for i, ((tau, gain), u, w) in enumerate(acting):
-            # Eq. (1) in closed form: the input is constant over the time that is bridged.
-            left, steady = math.exp(-age / tau), gain * u + w
-            velocity.append(steady + (known[i] - steady) * left)
-            if position:
-                position[i] += steady * age + (known[i] - steady) * tau * (1.0 - left)
-        return Measurement(to_ns, position or None, velocity if measured.velocity else None)
+        _, position, velocity = measured
+        known = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
+        # Eq. (1) in closed form: the input is constant over the time that is bridged.
+        left, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
+        if position is not None:
+            bridged = steady * age + (known - steady) * self._tau_s * (1.0 - left)
+            position = (position + bridged).tolist()
+        if velocity is not None:
+            velocity = (steady + (known - steady) * left).tolist()
+        return Measurement(to_ns, position, velocity)
 
 
 def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
@@ -196,70 +190,103 @@ class Leaps:
         self.off_m: list[float] = []
         """Displacement of the newest position from where the vehicle can have come to, on each axis
         [m]; empty unless it has leapt."""
-        self.noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
-        self.noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
-        self._position: tuple[int, list[float]] | None = None
-        """Newest position [m] of each axis, and its stamp."""
-        self._velocity: tuple[int, list[float]] | None = None
-        """Newest velocity [m/s] of each axis, and its stamp."""
+        self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
+        self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
+        self._position = self._velocity = np.full(scenario.model.axes, math.nan)
+        """Newest position [m] and velocity [m/s] of each axis; NaN before any."""
+        self._position_ns = self._velocity_ns = 0
+        """Their stamps."""
 
-    def leaps(self, measured: Measurement) -> bool:
-        """Remember a measurement; whether no vehicle can have come so far since the last one."""
+    def leaps(self, measured: Measurement, numbers: Array) -> bool:
+        """Remember a measurement; whether no vehicle can have come so far since the last one.
+
+        Args:
+            measured: the measurement.
+            numbers: its positions and velocities, NaN for what is not measured; shape (2, axes).
+        """
         stamp_ns, position, velocity = measured
-        before, found = self._velocity, False
-        if velocity is not None:
-            if before is not None:
-                time, noise = (stamp_ns - before[0]) / SECOND_NS, self.noise_mps
-                for v, after_v in zip(before[1], velocity, strict=True):
-                    found |= velocity_leaps(v, after_v, time, noise)
-            # Also after a leap: else whatever is measured after it would be one, too.
-            self._velocity = stamp_ns, velocity
+        p, v = self._position, self._velocity
+        time_p, time_v = (
+            (stamp_ns - each) / SECOND_NS for each in (self._position_ns, self._velocity_ns)
+        )
+        leaps = has_leapt(p, v, numbers, time_p, time_v, self._noise_m, self._noise_mps)
         self.off_m = []
+        if leaps and position is not None:
+            moves = zip(p.tolist(), v.tolist(), position, velocity or v.tolist(), strict=True)
+            off_m = [displacement(*each, time_p) for each in moves]
+            if any(abs(off) > most_m(time_p, self._noise_m) for off in off_m):
+                self.off_m = off_m
+        # Also after a leap: else whatever is measured after it would be one, too.
         if position is not None:
-            if self._position is not None and before is not None:
-                since_ns, elsewhere = self._position
-                time, noise = (stamp_ns - since_ns) / SECOND_NS, self.noise_m
-                moves = list(
-                    zip(elsewhere, before[1], position, velocity or before[1], strict=True)
-                )
-                if any(position_leaps(*each, time, noise) for each in moves):
-                    found = True
-                    self.off_m = [displacement(*each, time) for each in moves]
-            self._position = stamp_ns, position
-        return found
+            self._position, self._position_ns = numbers[0], stamp_ns
+        if velocity is not None:
+            self._velocity, self._velocity_ns = numbers[1], stamp_ns
+        return leaps
 
-    def took(self, measured: Measurement) -> None:
-        """Note a whole state that has not leapt."""
-        stamp_ns, position, velocity = measured
-        assert position is not None
-        assert velocity is not None
-        self._position, self._velocity = (stamp_ns, position), (stamp_ns, velocity)
+
+@compilable
+def all_within(table: Table, most: float) -> bool:
+    """Whether all numbers have at most this magnitude; a NaN has not."""
+    within = True
+    for row in range(table.shape[0]):
+        for column in range(table.shape[1]):
+            within &= abs(table[row, column]) <= most
+    return within
+
+
+@compilable
+def has_leapt(
+    position: Numbers,
+    velocity: Numbers,
+    measured: Table,
+    time_p: float,
+    time_v: float,
+    noise_m: float,
+    noise_mps: float,
+) -> bool:
+    """Whether no vehicle can have come to what is measured; what is NaN has not leapt.
+
+    Args:
+        position, velocity: of each axis, as they were measured last [m], [m/s].
+        measured: positions and velocities now; shape (2, axes).
+        time_p, time_v: times since then [s].
+        noise_m, noise_mps: what noise may add to a change [m], [m/s].
+    """
+    leaps = False
+    for i in range(len(position)):
+        p, v, after_p, after_v = position[i], velocity[i], measured[0, i], measured[1, i]
+        leaps |= velocity_leaps(v, after_v, time_v, noise_mps)
+        if math.isnan(after_v):
+            after_v = v
+        leaps |= position_leaps(p, v, after_p, after_v, time_p, noise_m)
+    return leaps
 
 
 class Newest:
     """Stand-in for a filter: each number as it was measured last."""
 
     def __init__(self, axes: int) -> None:
-        self._nothing = [0.0] * axes
-        self._position: list[float] = []
-        self._velocity: list[float] = []
+        self._zero = np.zeros(axes)
+        self._state = np.full((axes, 2), math.nan)
 
-    def begin(self, measured: Measurement) -> None:
+    def begin(self, measured: Measurement, numbers: Array) -> None:
         """Take the first measurement."""
-        self.take(measured)
+        self.take(measured, numbers)
 
-    def advance(self, due: list[float], swing: Sequence[float] = ()) -> None:
+    def advance(self, due: Array, swing: Array | None = None) -> None:
         """Advance by a step, in which no number changes by itself."""
 
-    def disturbance(self) -> list[float]:
+    def disturbance(self) -> Array:
         """Disturbance of each axis, of which nothing is known: 0 [m/s]."""
-        return self._nothing
+        return self._zero
 
-    def take(self, measured: Measurement) -> None:
+    def take(self, measured: Measurement, numbers: Array) -> None:
         """Keep a measurement, in place of the one before."""
-        self._position = measured.position or self._position
-        self._velocity = measured.velocity or self._velocity
+        if measured.position is not None:
+            self._state[:, 0] = numbers[0]
+        if measured.velocity is not None:
+            self._state[:, 1] = numbers[1]
 
-    def estimate(self) -> list[tuple[float, float]]:
-        """Position [m] and velocity [m/s] of each axis."""
-        return list(zip(self._position, self._velocity, strict=True))
+    def estimate(self) -> Array:
+        """Position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
+        return self._state.copy()

@@ -8,7 +8,6 @@ at epoch + k Δt, and every stamp that control uses is read here. What the vehic
 
 import math
 from collections.abc import Sequence
-from itertools import chain
 
 import numpy as np
 
@@ -66,7 +65,7 @@ class Pilot:
         recorder: Recorder | None,
     ) -> None:
         self._terms = scenario.terms()
-        self._dt_ns = self._terms.dt_ns
+        self._dt_ns, self._is_mission = self._terms.dt_ns, bool(self._terms.join)
         self.steps = scenario.steps
         """Steps of the flight."""
         self._number, self._vehicle = number, vehicle
@@ -118,7 +117,7 @@ class Pilot:
         return (self.step - self._covered_last) * self._dt_ns
 
     @property
-    def disturbance(self) -> Sequence[float]:
+    def disturbance(self) -> Array:
         """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
         return self._navigation.disturbance
 
@@ -240,17 +239,18 @@ class Pilot:
         # Asked first: `choose` goes on to this step.
         had_plan = compensator.covered
         self._rest()
-        before = self._input.tolist()
-        wanted = compensator.choose(self.step, known.predicted, known.disturbance, before)
+        wanted, told = compensator.choose(
+            self.step, known.predicted, known.disturbance, self._input
+        )
         if failsafe.mode is Mode.LAND:
             wanted = wanted if compensator.rests else [0.0] * self._terms.axes
-            if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE][0] > 0.0:
+            if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
-        told = compensator.told if compensator.feeds_back else wanted
+        told = told if compensator.follower.feeds_back else wanted
         speed_max = self._speed_max(had_plan, compensator.covered)
         flown = clamped(
             wanted,
-            before,
+            self._input.tolist(),
             self._terms.u_max,
             self._change_max,
             told=told,
@@ -279,7 +279,7 @@ class Pilot:
             flown = told = [0.0] * self._terms.axes
         # The braking curve is for what is told; feedback is bounded by u_max alone
         # (docs/failsafe.md). What the fence adds is no part of it either: it may push for ever.
-        if compensator.feeds_back:
+        if compensator.follower.feeds_back:
             self._speed = min(math.hypot(*told), speed_max)
         else:
             self._speed = math.hypot(*flown)
@@ -296,13 +296,13 @@ class Pilot:
 
     def _is_to_rest(self) -> bool:
         """Whether the vehicle hovers on a mission, and holds no place yet."""
-        hovers = self._terms.join and self._failsafe.mode in HOVERING
+        hovers = self._is_mission and self._failsafe.mode in HOVERING
         compensator = self.compensator
-        return bool(hovers) and compensator.in_force == NO_HORIZON and not compensator.rests
+        return hovers and compensator.in_force == NO_HORIZON and not compensator.rests
 
     def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
         """Input that the fence lets pass; down to the ground it lets a vehicle that lands."""
-        within = fence.limited(flown, self._navigation.predicted, self._terms.u_max)
+        within = fence.limited(flown, self._navigation.predicted.tolist(), self._terms.u_max)
         if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:
             within[ALTITUDE] = flown[ALTITUDE]
         return within
@@ -342,7 +342,7 @@ class Pilot:
             session: session that it is sent in.
         """
         failsafe, compensator = self._failsafe, self.compensator
-        states, flown = self._navigation.predicted, self._input.tolist()
+        states = self._navigation.predicted
         if session.number is None or not self._navigation.is_known:
             return None
         if not self._reporter.is_due(
@@ -350,7 +350,7 @@ class Pilot:
             self.flown,
             failsafe.mode,
             states,
-            flown,
+            self._input,
             session.asked,
         ):
             return None
@@ -366,7 +366,7 @@ class Pilot:
             echo.heard,
             failsafe.mode,
             int(failsafe.takes),
-            np.array(states),
+            states,
             NO_INPUT if self._terms.splines else self._input,
             session.said,
             session.hearing.silence,
@@ -393,6 +393,6 @@ class Pilot:
     def _known(self) -> Sequence[float]:
         """State, measured and reported state, and input, number by number, for the record."""
         known, truth = self._navigation, self._vehicle.truth()
-        states = known.estimate if truth is None else truth.tolist()
-        numbers = chain.from_iterable((*states, *known.measured, *known.predicted))
-        return [*numbers, *self._input.tolist()]
+        states = known.estimate if truth is None else truth
+        told = (states, known.measured, known.predicted, self._input)
+        return [number for each in told for number in each.ravel().tolist()]

@@ -5,21 +5,35 @@ vehicle, from the observation that it sent last and by the horizon that it holds
 to about the same, the server knows what it needs, and the vehicle may be silent.
 """
 
-from collections.abc import Iterable, Sequence
-from math import hypot
+import math
+
+import numpy as np
 
 from skytether.client.compensator import Compensator
+from skytether.shared.base.compilable import Numbers, Table, compilable
+from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.observing import Unreported, is_always, make_report
 from skytether.shared.wire.protocol import Mode
 
-States = Sequence[tuple[float, float]]
-"""Position [m] and velocity [m/s] of each axis."""
 RETRY_STEPS = 4
 """Number of steps after which a vehicle that waits for its first horizon reports once more. Later
 it waits as long again as it has waited, so that a long wait costs few packets."""
-NEVER = 2**30
-"""Number of steps that no flight has."""
+
+
+@compilable
+def distance_m(tau_s: Numbers, believed: Table, states: Table) -> float:
+    """Distance of two states [m]; a velocity that is off by Δv counts for τ Δv.
+
+    Args:
+        tau_s: time constant of each axis [s].
+        believed, states: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+    """
+    total = 0.0
+    for i in range(len(states)):
+        off_p, off_v = believed[i, 0] - states[i, 0], believed[i, 1] - states[i, 1]
+        total += (off_p + tau_s[i] * off_v) ** 2
+    return math.sqrt(total)
 
 
 class BelievedState:
@@ -31,22 +45,18 @@ class BelievedState:
     """
 
     def __init__(self, terms: Terms, compensator: Compensator) -> None:
-        self._tau_s, self._compensator = terms.tau_s, compensator
-        self._states: States = ()
+        self._tau_s, self._compensator = np.array(terms.tau_s), compensator
+        self._states = np.zeros((terms.axes, 2))
 
-    def off_m(self, states: States) -> float:
-        """Distance of the vehicle from it [m].
+    def off_m(self, states: Array) -> float:
+        """Distance of the vehicle from it [m], see `distance_m`; states of shape (axes, 2)."""
+        return distance_m(self._tau_s, self._states, states)
 
-        A velocity that is off by Δv counts for the τ Δv by which it would lead astray.
-        """
-        axes = zip(self._tau_s, self._states, states, strict=True)
-        return hypot(*((p - q) + tau * (v - w) for tau, (p, v), (q, w) in axes))
-
-    def told(self, states: States, flown: Sequence[float]) -> None:
+    def told(self, states: Array, flown: Array) -> None:
         """Advance from an observation to the next step.
 
         Args:
-            states: what it says.
+            states: what it says; shape (axes, 2).
             flown: input that is flown from there on, of each axis [m/s].
         """
         self._states = self._compensator.foresee(states, flown)
@@ -87,8 +97,8 @@ class Reporter:
         session: int,
         step: int,
         mode: Mode,
-        states: States,
-        flown: Sequence[float],
+        states: Array,
+        flown: Array,
         silence: int,
     ) -> bool:
         """Whether an observation of this step is sent; asked once, and taken for sent where it is.
@@ -97,7 +107,7 @@ class Reporter:
             session: number of the session.
             step: k; it has just begun.
             mode: what the vehicle does.
-            states: what is known of its state.
+            states: what is known of its state; shape (axes, 2).
             flown: input that is flown from here on, of each axis [m/s].
             silence: longest silence that the server asks for [half steps]; 0 for none.
         """
@@ -118,35 +128,6 @@ class Reporter:
         else:
             self.belief.silent()
         return due
-
-    def silent_for(self, session: int, mode: Mode, silence: int, off_m: Iterable[float]) -> int:
-        """Number of next steps of which no observation is due, if nothing comes.
-
-        Args:
-            session, mode, silence: see `is_due`.
-            off_m: distance from the believed state at each of these steps [m].
-        """
-        if mode is Mode.READY or session != self._session:
-            return 0
-        is_news = (self._compensator.in_force, mode, self._compensator.repeated) != self._known
-        wants, dt_s, count = self._wants, self._dt_s, 0
-        for steps, off in enumerate(off_m, start=self._step + 1 - self._told):
-            if 0 < silence <= 2 * steps or wants(Unreported(off, is_news, steps, dt_s)):
-                break
-            count += 1
-        return count
-
-    def silent_until(self, silence: int) -> int:
-        """Last step up to which the server asks for no observation.
-
-        Args:
-            silence: see `is_due`.
-        """
-        return self._told + (silence - 1) // 2 if silence > 0 else self._step + NEVER
-
-    def was_silent(self, step: int) -> None:
-        """Note that no observation was due at any step up to this one; `belief` is there."""
-        self._step = step
 
     def _waits(self, step: int, mode: Mode) -> bool:
         """Whether a vehicle that waits for a horizon says so, at once or once more.

@@ -6,11 +6,13 @@ real talks to its autopilot through a `port`, which is driven as any endpoint is
 time. `client.vehicles` has the table of all.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import msgspec
+import numpy as np
 
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
@@ -20,7 +22,7 @@ from skytether.shared.telemetry.record import Reason
 
 
 class Measurement(NamedTuple):
-    """Part of a vehicle's state, as it was measured."""
+    """Part of a vehicle's state, as it was measured: position, velocity, or both."""
 
     stamp_ns: int
     """Time at which the state was so [ns; the client's clock]."""
@@ -28,6 +30,14 @@ class Measurement(NamedTuple):
     """Position on each axis [m]; None where it was not measured."""
     velocity: list[float] | None
     """Velocity on each axis [m/s]; None where it was not measured."""
+
+    def numbers(self) -> Array:
+        """Positions and velocities, NaN where not measured; shape (2, axes)."""
+        _, position, velocity = self
+        if position is None or velocity is None:
+            missing = [math.nan] * len(position or velocity or ())
+            position, velocity = position or missing, velocity or missing
+        return np.array((position, velocity))
 
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]

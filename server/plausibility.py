@@ -48,7 +48,6 @@ class Statement:
 
 STATEMENT = record(Statement)
 position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.velocity_leaps)
-shared(leap.displacement)
 
 
 class Belief(IntEnum):

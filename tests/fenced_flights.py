@@ -17,6 +17,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.weather import Weather
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.chance import stream
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 
 FLIGHT_S = 20.0
@@ -33,18 +34,17 @@ def scenario(**sections: Any) -> Scenario:
 class Gusts(Weather):
     """Wind that turns round at the worst of times: it blows towards the nearest bound, or away."""
 
-    def __init__(self, flown: Scenario, rng: np.random.Generator, plant_x: list[Any]) -> None:
+    def __init__(self, flown: Scenario, rng: np.random.Generator, plant_x: Array) -> None:
         super().__init__(flown, rng)
         self._rng, self._wind = rng, flown.fence.wind_mps
         self.x = plant_x
         self._towards = 1.0
 
-    def blow(self) -> tuple[list[float], list[tuple[float, float]]]:
-        """Disturbance that acts like an input, of each axis [m/s], without noise."""
+    def push(self) -> Array:
+        """Disturbance that acts like an input, of each axis [m/s]."""
         if self._rng.random() < 0.05:
             self._towards = self._rng.choice([-1.0, 1.0, 1.0])
-        wind = [float(np.sign(p)) * self._wind * self._towards / 2**0.5 for p, _ in self.x]
-        return wind, []
+        return np.sign(self.x[:, 0]) * self._wind * self._towards / 2**0.5
 
 
 def random_scenario(rng: np.random.Generator) -> Scenario:
@@ -79,17 +79,17 @@ def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
     plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))
     plant.weather = Gusts(flown, rng, plant.x)
     known, fence = Navigation(flown), fences(flown)
-    u_max, home = flown.u_max.tolist(), np.array([p for p, _ in plant.x])
+    u_max, home = flown.u_max.tolist(), plant.x[:, 0].copy()
     u, worst = np.zeros(2), -np.inf
     wanted = rng.uniform(-1.0, 1.0, 2) * flown.u_max
     for step in range(round(FLIGHT_S / flown.control.dt)):
-        state = ([p for p, _ in plant.x], [v for _, v in plant.x])
+        state = plant.x.T.tolist()
         now_ns = step * flown.dt_ns
         known.advance([Measurement(now_ns, *state)], u, now_ns=now_ns)
         if rng.random() < 0.03:
             far = rng.random() < 0.7
             wanted = (rng.choice([-1, 1], 2) if far else rng.uniform(-1, 1, 2)) * flown.u_max
-        u = np.array(fence.limited(wanted.tolist(), known.predicted, u_max))
+        u = np.array(fence.limited(wanted.tolist(), known.predicted.tolist(), u_max))
         assert np.all(np.abs(u) <= flown.u_max + 1e-9)
         assert np.hypot(*u) <= flown.fence.speed_mps + 1e-9
         plant.advance(u)

@@ -2,22 +2,21 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from skytether.__main__ import main
-from skytether.client.endpoint import Client
+from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell.driver import Shell
-from skytether.sim import flight
 
 LOOPBACK: Address = ("127.0.0.1", 0)
 
@@ -75,24 +74,14 @@ def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
         time.sleep(0.005)
 
 
-def uncompile(patch: pytest.MonkeyPatch) -> None:
-    """Have vehicles in virtual time fly each step by the methods of `client`, woken for each.
-
-    Usual steps are compiled calls otherwise (`sim.pilot`), in which a method that a test replaces
-    is never called: the test would fly as if it had replaced nothing.
-    """
-    patch.setattr(flight, "AheadClient", PlainClient)
-
-
-class PlainClient(Client):
-    """Client in place of an `AheadClient`."""
-
-    def __init__(self, scenario: Scenario, *args: Any, **keys: Any) -> None:
-        del keys["clock"], keys["world_ns"]
-        super().__init__(scenario, *args, **keys)
-
-    def catch_up(self) -> None:
-        """Do nothing: it flies no step ahead or later."""
+@contextmanager
+def interpreted() -> Iterator[None]:
+    """Vehicles that fly by plain Python, as they do aboard, until the end of the block."""
+    kernel.interpret_all()
+    try:
+        yield
+    finally:
+        kernel.compile_all()
 
 
 @asynccontextmanager

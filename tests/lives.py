@@ -187,7 +187,7 @@ class Lives:
             keeps=True,
             before=before,
         )
-        place = np.array([position for position, _ in self._bodies[number].plant.x])
+        place = self._bodies[number].plant.state()[:, 0]
         lives.append(_Life(client, sink, self.world.now_ns / SECOND_NS, place))
         return client
 

@@ -140,7 +140,7 @@ class Positions:
 
     def _watch(self, leaps: Leaps, measured: Measurement) -> None:
         """Displace the origin with a position that has leapt: the vehicle has not moved so far."""
-        if leaps.leaps(measured) and leaps.off_m and self._is_flown:
+        if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self._is_flown:
             dx, dy, dz = leaps.off_m
             (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
             self.origin = x + dx, y + dy, z + dz

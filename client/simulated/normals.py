@@ -27,25 +27,14 @@ class Normals:
         self._used = 0
         """Number of steps of the block that have passed."""
 
-    def ahead(self, steps: int) -> Array:
-        """Numbers of the next steps, which stay the next ones until they are used.
-
-        Args:
-            steps: number of steps, at least 1.
-
-        Returns:
-            numbers of 1 to so many steps; shape (n, *shape).
-        """
+    def next(self) -> Array:
+        """Numbers of the next step, of the shape given."""
         if self._used == len(self._block):
             self._before = self._rng.bit_generator.state
             self._block = self._rng.standard_normal((BLOCK, *self._shape))
             self._used = 0
-        return self._block[self._used : self._used + steps]
-
-    def use(self, steps: int) -> None:
-        """Go on by so many steps, whose numbers `ahead` has told."""
-        self._used += steps
-        assert self._used <= len(self._block)
+        self._used += 1
+        return self._block[self._used - 1]
 
     def give_back(self) -> None:
         """Leave the stream as if only the numbers of the steps that have passed were drawn."""

@@ -37,15 +37,10 @@ class QuadrotorPlant:
         )
         self.change(vehicle)
 
-    @property
-    def x(self) -> list[tuple[float, float]]:
-        """Position [m] and velocity [m/s] now, of each axis."""
-        position, velocity = self._quadrotor.position(), self._quadrotor.velocity()
-        return list(zip(position.tolist(), velocity.tolist(), strict=True))[: self._axes]
-
     def state(self) -> Array:
-        """Position [m] and velocity [m/s] now, as an array; shape (axes, 2)."""
-        return np.array(self.x)
+        """Position [m] and velocity [m/s] now, of each axis; shape (axes, 2)."""
+        quadrotor = self._quadrotor
+        return np.stack((quadrotor.position(), quadrotor.velocity()), -1)[: self._axes]
 
     def advance(self, command: Array) -> None:
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""

@@ -8,15 +8,33 @@ at all. Until then the vehicle has stood where it starts.
 """
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 
 from skytether.client.navigation import sensing
-from skytether.client.simulated.normals import BLOCK, Normals
+from skytether.client.simulated.normals import Normals
 from skytether.client.vehicle import Measurement
+from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
+
+
+@compilable
+def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, told: Table) -> None:
+    """Measure the whole state.
+
+    Args:
+        state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        bias: b of positions and velocities; shape (2, axes).
+        noise: σ of a position and of a velocity.
+        drawn: n of positions and velocities; shape (2, axes).
+        told: output: positions and velocities measured; shape (2, axes).
+    """
+    for which in range(2):
+        for axis in range(len(state)):
+            told[which, axis] = (
+                state[axis, which] + bias[which, axis] + noise[which] * drawn[which, axis]
+            )
 
 
 class Sensor:
@@ -28,93 +46,59 @@ class Sensor:
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         sensor, self._dt_ns = scenario.sensor, scenario.dt_ns
-        self.delay, self._every_ns, self.is_prompt, self.is_exact = sensing(scenario)
-        self.noise = sensor.position_noise_m, sensor.velocity_noise_mps
+        self.delay, self._every_ns, self._is_prompt, self._is_exact = sensing(scenario)
+        nothing = [0.0] * scenario.model.axes
+        biases = sensor.position_bias_m or nothing, sensor.velocity_bias_mps or nothing
+        self._bias = np.array(biases, dtype=np.float64)
+        """Bias b of positions [m] and of velocities [m/s]; shape (2, axes)."""
+        self._noise = np.array((sensor.position_noise_m, sensor.velocity_noise_mps))
         """Standard deviation σ of a position [m] and of a velocity [m/s]."""
-        nothing = (0.0,) * scenario.model.axes
-        self.bias = sensor.position_bias_m or nothing, sensor.velocity_bias_mps or nothing
-        """Bias b of a position [m] and of a velocity [m/s], on each axis."""
         self._rng = rng
-        noisy = [bool(noise) for noise in self.noise]
-        self._normals = Normals(rng, (sum(noisy), scenario.model.axes)) if any(noisy) else None
+        noisy = self._noise.nonzero()[0].tolist()
+        self._normals = Normals(rng, (len(noisy), len(nothing))) if noisy else None
         """Numbers n of a sensor that measures the whole state at every step."""
-        self._without = np.array([self.bias] * BLOCK)
-        """Numbers n of as many steps without noise; shape (BLOCK, 2, axes)."""
-        self._states: deque[list[Sequence[float]]] = deque(maxlen=self.delay + 1)
+        self._noisy = noisy
+        """Which of position (0) and velocity (1) have noise."""
+        self._drawn = np.zeros_like(self._bias)
+        """Numbers n where not both have noise; shape (2, axes)."""
+        self._states: deque[Array] = deque(maxlen=self.delay + 1)
         """Measurements that are not available yet, the oldest first; each of shape (axes, 2)."""
         self._step = 0
 
-    def measure(self, state: Sequence[Sequence[float]], *, began_ns: int = 0) -> Measurement:
+    def measure(self, state: Array, *, began_ns: int = 0) -> Measurement:
         """Measurements available at the next step, from step 0 on.
 
         Args:
-            state: true position [m] and velocity [m/s] at the step, of each axis.
+            state: true position [m] and velocity [m/s] at the step, of each axis; shape (axes, 2).
             began_ns: begin of step 0 [ns; the client's clock].
         """
-        stamp_ns = began_ns + max(0, self._step - self.delay) * self._dt_ns
-        if self.is_exact:
-            self._step += 1
-            return Measurement(stamp_ns, [p for p, _ in state], [v for _, v in state])
+        step, self._step = self._step, self._step + 1
+        stamp_ns = began_ns + max(0, step - self.delay) * self._dt_ns
+        if self._is_exact:
+            return Measurement(stamp_ns, *state.T.tolist())
         states = self._states
-        states.append(list(state))
+        states.append(state)
         # Before the first measurement is due, the vehicle has stood where it begins.
         while len(states) <= self.delay:
             states.append(states[0])
-        position: list[float] | None
-        velocity: list[float] | None
-        if self.is_prompt:
-            numbers = zip((0, 1), self.draw()[0].tolist(), strict=True)
-            position, velocity = (self._told(states[0], which, drawn) for which, drawn in numbers)
-            self.pass_by()
-        else:
-            position, velocity = (self._measure(states[0], which) for which in (0, 1))
-        self._step += 1
-        return Measurement(stamp_ns, position, velocity)
+        if self._is_prompt:
+            told, drawn = np.empty_like(self._bias), self._drawn
+            if self._normals is not None:
+                drawn = self._normals.next()
+                if len(drawn) < len(told):
+                    self._drawn[self._noisy], drawn = drawn, self._drawn
+            sensed(states[0], self._bias, self._noise, drawn, told)
+            return Measurement(stamp_ns, *told.tolist())
+        return Measurement(stamp_ns, *(self._measure(states[0], which, step) for which in (0, 1)))
 
-    def measured_at(self, step: int) -> None:
-        """Note that it has measured elsewhere at all steps up to this one."""
-        self._step = step + 1
-
-    def draw(self, steps: int = 1) -> Array:
-        """Numbers n of the next steps' measurements, which stay the next ones until `pass_by`.
-
-        Only for a sensor that measures the whole state at every step.
-
-        Args:
-            steps: number of steps, at least 1.
-
-        Returns:
-            numbers of 1 to so many steps, of positions and of velocities; those without noise are
-            the bias, which noise of 0 makes nothing of; shape (n, 2, axes).
-        """
-        if self._normals is None:
-            return self._without[:steps]
-        drawn = self._normals.ahead(steps)
-        if all(self.noise):
-            return drawn
-        told = np.array([self.bias] * len(drawn))
-        told[:, 0 if self.noise[0] else 1] = drawn[:, 0]
-        return told
-
-    def pass_by(self, steps: int = 1) -> None:
-        """Leave the next steps, whose numbers `draw` has told, behind."""
-        if self._normals is not None:
-            self._normals.use(steps)
-
-    def _measure(self, state: list[Sequence[float]], which: int) -> list[float] | None:
-        """Position (0) or velocity (1) of a state, where one is due."""
-        every_ns, time_ns = self._every_ns[which], self._step * self._dt_ns
+    def _measure(self, state: Array, which: int, step: int) -> list[float] | None:
+        """Position (0) or velocity (1) of a state, where one is due at a step."""
+        every_ns, time_ns = self._every_ns[which], step * self._dt_ns
         # Due at the first step at or after a multiple of the interval, though that is no multiple
         # of Δt.
         if not every_ns or time_ns % every_ns >= self._dt_ns:
             return None
-        noisy, bias = self.noise[which], self.bias[which]
-        drawn = self._rng.standard_normal(len(state)).tolist() if noisy else bias
-        return self._told(state, which, drawn)
-
-    def _told(
-        self, state: list[Sequence[float]], which: int, drawn: Sequence[float]
-    ) -> list[float]:
-        """Position (0) or velocity (1) of a state, with bias and the noise that was drawn."""
-        noise, bias = self.noise[which], self.bias[which]
-        return [x[which] + b + noise * n for x, b, n in zip(state, bias, drawn, strict=True)]
+        told = state[:, which] + self._bias[which]
+        if noise := self._noise[which]:
+            told += noise * self._rng.standard_normal(len(state))
+        return told.tolist()

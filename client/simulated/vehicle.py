@@ -22,12 +22,8 @@ WIND = keys_of(InFlight.WIND)
 class Plant(Protocol):
     """Simulated vehicle, advanced step by step."""
 
-    @property
-    def x(self) -> list[tuple[float, float]]:
-        """Position [m] and velocity [m/s] now, of each axis."""
-
     def state(self) -> Array:
-        """Position [m] and velocity [m/s] now, as an array; shape (axes, 2)."""
+        """Position [m] and velocity [m/s] now, of each axis; shape (axes, 2)."""
 
     def advance(self, command: Array) -> None:
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
@@ -53,7 +49,7 @@ class SimulatedVehicle(Vehicle):
         self._began_ns = 0
         self._step = -1
         """Step at whose begin the plant's state is; -1 before the flight."""
-        self._velocity = np.zeros(len(plant.x))
+        self._velocity = np.zeros(len(plant.state()))
 
     def fly(self, velocity: Array) -> None:
         """See `Vehicle`; it is flown from the begin of the step on."""
@@ -73,23 +69,9 @@ class SimulatedVehicle(Vehicle):
             self._measure(told)
         return told
 
-    @property
-    def is_simple(self) -> bool:
-        """Whether the whole state is measured at each step, and told at once."""
-        return self.sensor.is_prompt
-
-    def starts_ns(self, step: int) -> int:
-        """Begin of a step of its flight [ns; the client's clock]."""
-        return self._began_ns + step * self._dt_ns
-
-    def flown_to(self, step: int) -> None:
-        """Note that its plant was flown to a step elsewhere, and measured at each step."""
-        self._step = step
-        self.sensor.measured_at(step)
-
     def _measure(self, told: list[Measurement]) -> None:
         """Add the measurement that is available at the step, if there is one."""
-        measured = self.sensor.measure(self.plant.x, began_ns=self._began_ns)
+        measured = self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
         if measured.position or measured.velocity:
             told.append(measured)
 

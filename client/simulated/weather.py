@@ -8,23 +8,27 @@ A constant acceleration a acts like the input τ a. The covariance of the white 
 a closed form, see `shared.law.model.white_acceleration`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from skytether.client.simulated.normals import BLOCK, Normals
+from skytether.client.simulated.normals import Normals
+from skytether.shared.base.compilable import Table, compilable
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 
-class AirStep(NamedTuple):
-    """Wind over one step."""
+@compilable
+def shoved(x: Table, white: Table, drawn: Table) -> None:
+    """Add white acceleration's part of a step to positions and velocities, in place.
 
-    push: list[float]
-    """Push w + τ a on each axis, which acts like an input [m/s]."""
-    shoves: list[tuple[float, float]]
-    """White acceleration's part of position [m] and velocity [m/s] of each axis; empty without
-    any."""
+    Args:
+        x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        white: square root of its covariance, [L11, L21, L22] of each axis.
+        drawn: two normal numbers an axis.
+    """
+    for i in range(len(x)):
+        n, m = drawn[i, 0], drawn[i, 1]
+        x[i, 0] += white[i, 0] * n
+        x[i, 1] += white[i, 1] * n + white[i, 2] * m
 
 
 class Weather:
@@ -40,18 +44,14 @@ class Weather:
         self._tau = scenario.true_tau_s
         self._gust: Array | None = None
         """Way that the gust blows, of any length; shape (axes,). None between gusts."""
-        self._still = np.zeros((len(self._tau), 2))
-        self._stills = np.zeros((BLOCK, *self._still.shape))
-        self._normals = Normals(rng, self._still.shape)
-        self._drawn: Array | None = None
-        """Wind drawn for the next step and not used yet, where there are gusts."""
+        self._normals = Normals(rng, (len(self._tau), 2))
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:
         """Change the winds from the next step on."""
         self._normals.give_back()
-        white = vehicle.wind * white_acceleration(self._tau, self._dt_s)
-        self.white = white.tolist() if vehicle.wind else []
+        L = vehicle.wind * white_acceleration(self._tau, self._dt_s)
+        self._white = np.stack((L[:, 0, 0], L[:, 1, 0], L[:, 1, 1]), -1) if vehicle.wind else None
         self._gust_mps2 = vehicle.gust_mps2
         # Chance in a step of an event that comes at a constant rate: exact for any length of a
         # step.
@@ -60,53 +60,27 @@ class Weather:
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
         if self._gust_mps2 == 0.0:
             self._gust = None
-        self.calm = self._pushed()
-        """The air over a step, but for white acceleration."""
+        self._push = self._pushed()
+        """Push of steady wind and gust now."""
 
-    def blow(self) -> AirStep:
-        """The air over the next step."""
-        (drawn,) = self.draw()
-        self.pass_by()
-        if not self.white:
-            return self.calm
-        shoves = [
-            (L[0][0] * n, L[1][0] * n + L[1][1] * m)
-            for L, (n, m) in zip(self.white, drawn.tolist(), strict=True)
-        ]
-        return AirStep(self.calm.push, shoves)
+    def push(self) -> Array:
+        """Push w + τ a over the next step, which acts like an input [m/s]; shape (axes,)."""
+        if self._gust_mps2 != 0.0:
+            self._gusts()
+        return self._push
 
-    def draw(self, steps: int = 1) -> Array:
-        """Normal numbers of the white acceleration over the next steps.
-
-        They are the same until `pass_by`: until then the air stays as it is.
+    def shove(self, x: Array) -> None:
+        """Add white acceleration's part of that step to a state, in place.
 
         Args:
-            steps: number of steps, at least 1.
-
-        Returns:
-            numbers of 1 to so many steps, with gusts of one alone; shape (n, axes, 2).
+            x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
-        if self._gust_mps2 == 0.0:
-            if self.white:
-                return self._normals.ahead(steps)
-            return self._stills[:steps]
-        if self._drawn is None:
-            # What gusts draw lies between the numbers of two steps.
-            self._gusts()
-            drawn = self._rng.standard_normal(self._still.shape) if self.white else self._still
-            self._drawn = drawn[None]
-        return self._drawn
-
-    @property
-    def has_gusts(self) -> bool:
-        """Whether gusts begin and end by chance."""
-        return self._gust_mps2 != 0.0
-
-    def pass_by(self, steps: int = 1) -> None:
-        """Let the air of the next steps, which `draw` has told, pass by."""
-        if self._gust_mps2 == 0.0 and self.white:
-            self._normals.use(steps)
-        self._drawn = None
+        if self._white is None:
+            return
+        # What gusts draw lies between the numbers of two steps.
+        gusty = self._gust_mps2 != 0.0
+        drawn = self._rng.standard_normal(x.shape) if gusty else self._normals.next()
+        shoved(x, self._white, drawn)
 
     def _gusts(self) -> None:
         """Gusts begin and end by chance, each blowing one way all along."""
@@ -115,15 +89,15 @@ class Weather:
         if self._gust is not None:
             if chance < self._gust_end_chance:
                 self._gust = None
-                self.calm = self._pushed()
+                self._push = self._pushed()
         elif chance < self._gust_start_chance:
             self._gust = self._rng.standard_normal(len(self._tau))
-            self.calm = self._pushed()
+            self._push = self._pushed()
 
-    def _pushed(self) -> AirStep:
-        """The air now, but for white acceleration."""
+    def _pushed(self) -> Array:
+        """Push of steady wind and gust."""
         if self._gust is None:
-            return AirStep(self._steady_mps.tolist(), [])
+            return self._steady_mps
         gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
         # An acceleration a acts like an input τ a under eq. (1).
-        return AirStep((self._steady_mps + self._tau * gust_mps2).tolist(), [])
+        return self._steady_mps + self._tau * gust_mps2

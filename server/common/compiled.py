@@ -32,8 +32,6 @@ Laws = Annotated[NDArray[np.void], records(AXIS_LAW, 1)]
 
 advance = shared(model.advance)
 bounded, lasting = shared(rule.bounded), shared(rule.lasting)
-shared(rule.entry), shared(rule.remaining), shared(rule.tell)
-shared(rule.leading), shared(rule.lead_on), shared(rule.led_back), shared(rule.flown)
 lead_to, step = shared(rule.lead_to), shared(rule.step)
 
 

@@ -9,7 +9,6 @@ from skytether.shared.law.outlines import Outlines
 from skytether.shared.scenario.zones import Zones
 
 is_near = shared(outlines.is_near)
-shared(outlines._off2), shared(outlines._crosses), shared(outlines._is_left)
 
 
 def comes_near(zones: Zones, points: Array, clearance_m: float) -> bool:

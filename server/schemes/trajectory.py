@@ -75,7 +75,6 @@ TINY = 1e-9
 """Smallest K_p, for weights that ask for none [1/s]."""
 
 along, guided_to = shared(spline.along), shared(spline.guided_to)
-shared(spline.guided)
 regulated = shared(spline.regulated)
 follow = shared(spline.follow)
 """The rule of flight along a spline, compiled for kernels."""

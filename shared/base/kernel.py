@@ -31,6 +31,8 @@ from numba.core.runtime import rtsys
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from skytether.shared.base.compilable import COMPILABLE
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 F1 = Annotated[NDArray[np.float64], numba.float64[::1]]
@@ -280,9 +282,39 @@ def inline(function: F) -> F:
 
 
 def shared(function: F) -> F:
-    """A function of `shared` as it is, which kernels may call from now on as Python does."""
-    callable_: F = register_jitable(error_model="numpy")(function)
-    return callable_
+    """A function of `shared` as it is, which kernels may call as Python does; so what it calls."""
+    for each in _reached(function):
+        if inspect.isfunction(each) and each not in _SHARED:
+            register_jitable(error_model="numpy")(each)
+            _SHARED.add(each)
+    return function
+
+
+_SHARED: set[Callable[..., Any]] = set()
+"""Functions that kernels may call as they are."""
+
+
+def compile_all() -> None:
+    """From now on, fly by machine code what `shared.base.compilable` marks, in this process."""
+    for call in COMPILABLE:
+        if call.func not in _PLAIN:
+            if call.func not in _MACHINE:
+                _MACHINE[call.func] = kernel(shared(call.func))
+            _PLAIN[_MACHINE[call.func]] = call.func
+            call.__setstate__((_MACHINE[call.func], (), {}, {}))
+
+
+def interpret_all() -> None:
+    """Fly by plain Python again what `compile_all` has compiled."""
+    for call in COMPILABLE:
+        if call.func in _PLAIN:
+            call.__setstate__((_PLAIN[call.func], (), {}, {}))
+
+
+_MACHINE: dict[Callable[..., Any], Any] = {}
+"""Kernels by the functions that they were made of."""
+_PLAIN: dict[Any, Callable[..., Any]] = {}
+"""The other way round."""
 
 
 def plain(function: F) -> F:
@@ -351,24 +383,31 @@ def stamp(function: Callable[..., Any]) -> str:
     """A digest of a kernel, and of all types, compiled functions and constants that it reaches."""
     hints = get_type_hints(function, include_extras=True)
     found = {"types": repr([_type_name(hint) for hint in hints.values()])}
-    waiting = [function]
-    while waiting:
-        each = waiting.pop()
+    for each in _reached(function):
         place = f"{each.__module__}.{each.__qualname__}"
-        if place in found:
-            continue
         found[place] = _source(each)
         for name in each.__code__.co_names:
             value: Any = each.__globals__.get(name)
-            if hasattr(value, "py_func"):
-                waiting.append(plain(value))
-            elif inspect.isfunction(value):
-                waiting.append(value)
-            elif isinstance(value, type) and hasattr(value, "_fields"):
+            if isinstance(value, type) and hasattr(value, "_fields"):
                 found[f"{place}: {name}"] = _type_name(value)
             elif isinstance(value, int | float | str | tuple | np.dtype):
                 found[f"{place}: {name}"] = repr(value)
     return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()
+
+
+def _reached(function: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """A function and all that it calls, as Python has them."""
+    reached, waiting = [], [function]
+    while waiting:
+        each = waiting.pop()
+        if each in reached:
+            continue
+        reached.append(each)
+        for called in map(each.__globals__.get, each.__code__.co_names):
+            plain_one: Any = getattr(called, "py_func", called)
+            if inspect.isfunction(plain_one):
+                waiting.append(plain_one)
+    return reached
 
 
 def _source(function: Callable[..., Any]) -> str:

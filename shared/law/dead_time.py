@@ -18,8 +18,10 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.law.model import Axis, advance, discretise
+from skytether.shared.law.model import Array, Axis, advance, discretise
 
 
 class DeadTime(NamedTuple):
@@ -60,30 +62,30 @@ class OnTheirWay:
         """Inputs of each axis, those of n + 1 steps ago first [m/s]; before the flight 0."""
         self._has_rest = any(each.rest for each in dead_times)
 
-    def issue(self, command: Sequence[float]) -> tuple[list[float], Sequence[float]]:
+    def issue(self, command: Array) -> tuple[Array, Array | None]:
         """Issue the input of a step, of each axis [m/s].
 
         Returns:
             what acts at the end of this step on each axis [m/s], and by how much more acts before,
-            until the rest r has passed [m/s]; the latter empty where no axis has a rest.
+            until the rest r has passed [m/s]; the latter None where no axis has a rest.
         """
-        for issued, u in zip(self._issued, command, strict=True):
+        for issued, u in zip(self._issued, command.tolist(), strict=True):
             issued.append(u)
-        due = [issued[1] for issued in self._issued]
-        swing = [issued[0] - issued[1] for issued in self._issued] if self._has_rest else ()
-        return due, swing
+        due = np.array([issued[1] for issued in self._issued])
+        if not self._has_rest:
+            return due, None
+        return due, np.array([issued[0] for issued in self._issued]) - due
 
-    def predict(
-        self, known: Sequence[tuple[float, float]], disturbance: Sequence[float]
-    ) -> list[tuple[float, float]]:
-        """State z in which the next input will meet the vehicle, of each axis [m, m/s].
+    def predict(self, known: Array, disturbance: Array) -> Array:
+        """State z in which the next input will meet the vehicle [m, m/s]; shape (axes, 2).
 
         Args:
-            known: state at the end of the step whose input was issued last, of each axis [m, m/s].
+            known: state at the end of the step whose input was issued last [m, m/s]; shape (axes,
+                2).
             disturbance: what else acts on each axis like an input meanwhile [m/s].
         """
         predicted = []
-        axes = zip(self._axes, self._issued, known, disturbance, strict=True)
+        axes = zip(self._axes, self._issued, known.tolist(), disturbance.tolist(), strict=True)
         for (model, late), issued, (p, v), w in axes:
             # The input of n + 1 steps ago has ceased to act by the end of this step.
             inputs = iter(issued)
@@ -94,4 +96,4 @@ class OnTheirWay:
             for u in inputs:
                 p, v = advance(model, p, v, u + w)  # noqa: PLW2901
             predicted.append((p, v))
-        return predicted
+        return np.array(predicted)

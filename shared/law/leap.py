@@ -44,5 +44,14 @@ def position_leaps(
         time: between the two [s].
         noise: what noise may add to the change of position [m].
     """
-    off = displacement(p, v, after_p, after_v, time)
-    return abs(off) > noise + 0.5 * ACCELERATION_MPS2 * time * time
+    return abs(displacement(p, v, after_p, after_v, time)) > most_m(time, noise)
+
+
+def most_m(time: float, noise: float) -> float:
+    """Largest `displacement` that acceleration and noise explain [m].
+
+    Args:
+        time: between the two positions [s].
+        noise: what noise may add [m].
+    """
+    return noise + 0.5 * ACCELERATION_MPS2 * time * time

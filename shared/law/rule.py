@@ -14,15 +14,16 @@ With feedback aboard the vehicle is led back to where these inputs lead, x̄, al
 ŵ is a disturbance that the inputs reckon with. Once they are braked to nothing it is left out, so
 that x̄ comes to rest, and the vehicle stays there in whatever wind.
 
-This is the one source of that rule: `step` and `lead_to` put its parts together. The client flies
-by it, number by number; the server's replay and the laboratory's linear loop compile the very same
-functions into their kernels, and so know what was flown. Each works on one spatial axis; `speed`
-alone belongs to all of them.
+This is the one source of that rule: `step` and `lead_to` put its parts together for one spatial
+axis, and `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
+compiles the very same functions into its kernels, and so knows what was flown. `speed` alone
+belongs to all axes.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from skytether.shared.base.compilable import Table, compilable
 from skytether.shared.law.model import Array, Axis, advance
 
 
@@ -209,3 +210,78 @@ def step(
         if stage >= 0:
             lead_p, lead_v = lead_on(held, told, share, lead_p, lead_v)
     return flown(stage, told, back, held.bound), told, lead_p, lead_v
+
+
+MODEL = len(Axis._fields)
+"""Columns of the model, which come first in a table with a row an axis."""
+LENGTH, INDEXED, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = range(
+    MODEL, MODEL + len(Held._fields) - 2
+)
+"""Columns of a table of horizons: the fields of `Held` but for model and inputs."""
+
+
+def held_of(table: Table, inputs: Table, axis: int) -> Held:
+    """Horizon on one axis, from a table with a row an axis."""
+    return Held(
+        model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
+        inputs=inputs[axis],
+        length=int(table[axis, LENGTH]),
+        indexed=table[axis, INDEXED] > 0.0,
+        speed=table[axis, SPEED],
+        brake=table[axis, BRAKE],
+        bound=table[axis, BOUND],
+        feeds_back=table[axis, FEEDS_BACK] > 0.0,
+        gain_p=table[axis, GAIN_P],
+        gain_v=table[axis, GAIN_V],
+        disturbance=table[axis, DISTURBANCE],
+    )
+
+
+@compilable
+def fly_horizon(
+    table: Table,
+    inputs: Table,
+    lead: Table,
+    first: int,
+    stage: int,
+    state: Table,
+    flown: Table,
+) -> None:
+    """Fly all axes for a step by the horizon that is held, see `step`.
+
+    Args:
+        table: the horizon but for its inputs, with a row an axis, see `held_of`.
+        inputs: the horizon's inputs [m/s]; shape (axes, n).
+        lead: x̄ at the stage `first` [m, m/s], rolled on to `stage` where that is later and there is
+            feedback; shape (axes, 2).
+        first: stage to which x̄ belongs.
+        stage: k - k_h.
+        state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        flown: output: the inputs flown, and what of them is told [m/s]; shape (2, axes).
+    """
+    for axis in range(len(table)):
+        held = held_of(table, inputs, axis)
+        lead_p, lead_v = lead[axis, 0], lead[axis, 1]
+        if held.feeds_back:
+            lead_p, lead_v = lead_to(held, first, stage, lead_p, lead_v)
+            lead[axis, 0], lead[axis, 1] = lead_p, lead_v
+        u, told, _, _ = step(held, stage, lead_p, lead_v, state[axis, 0], state[axis, 1])
+        flown[0, axis], flown[1, axis] = u, told
+
+
+@compilable
+def foresee_horizon(
+    table: Table, inputs: Table, lead: Table, stage: int, state: Table, ahead: Table
+) -> None:
+    """State of each axis a step later, flown by the horizon from a state at the stage.
+
+    Args:
+        table, inputs, stage, state: see `fly_horizon`.
+        lead: x̄ at the stage [m, m/s]; shape (axes, 2).
+        ahead: output: the state a step later [m, m/s]; shape (axes, 2).
+    """
+    for axis in range(len(table)):
+        held = held_of(table, inputs, axis)
+        p, v = state[axis, 0], state[axis, 1]
+        u, _, _, _ = step(held, stage, lead[axis, 0], lead[axis, 1], p, v)
+        ahead[axis, 0], ahead[axis, 1] = advance(held.model, p, v, u + held.disturbance)

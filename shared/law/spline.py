@@ -19,7 +19,7 @@ vehicle's own filter has found. x is the state in which the input meets the vehi
 flown for longer than `link.age_max_s` after the observation behind it: from there on ū is held, or
 braked to nothing as in `shared.law.rule`, and x̄ follows eq. (4) under that until it rests.
 
-As there, the client flies by these functions, and the server and the laboratory compile them.
+As there, the client flies by these functions, and the server compiles them.
 """
 
 from collections.abc import Sequence
@@ -28,8 +28,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.law.model import Axis, advance
-from skytether.shared.law.rule import bounded, led_back, remaining
+from skytether.shared.law.rule import MODEL, bounded, led_back, remaining
 
 Knots = Sequence[float] | NDArray[np.floating[Any]]
 """Knots of one axis: position [m] and velocity [m/s] of one after the other; shape (2 n,)."""
@@ -172,3 +173,82 @@ def follow(
     """
     wanted, told = regulated(guide, stage, lead_p, lead_v, p, v, w)
     return guide.lag * before + (1.0 - guide.lag) * wanted, told
+
+
+SPACING, DT_S, LENGTH, LAST, SPEED, BRAKE, BOUND, GAIN_P, GAIN_V, LAG = range(
+    MODEL, MODEL + len(Guide._fields) - 2
+)
+"""Columns of a table of splines: the fields of `Guide` but for model and knots."""
+
+
+def guide_of(table: Table, knots: Table, axis: int) -> Guide:
+    """Spline on one axis, from a table with a row an axis."""
+    return Guide(
+        model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
+        knots=knots[axis],
+        spacing=int(table[axis, SPACING]),
+        dt_s=table[axis, DT_S],
+        length=int(table[axis, LENGTH]),
+        last=table[axis, LAST],
+        speed=table[axis, SPEED],
+        brake=table[axis, BRAKE],
+        bound=table[axis, BOUND],
+        gain_p=table[axis, GAIN_P],
+        gain_v=table[axis, GAIN_V],
+        lag=table[axis, LAG],
+    )
+
+
+@compilable
+def fly_spline(
+    table: Table,
+    knots: Table,
+    lead: Table,
+    first: int,
+    stage: int,
+    state: Table,
+    disturbance: Numbers,
+    before: Numbers,
+    flown: Table,
+) -> None:
+    """Fly all axes for a step along a spline, see `follow`.
+
+    Args:
+        table: the spline but for its knots, with a row an axis, see `guide_of`.
+        knots: shape (axes, 2 n).
+        lead: x̄ at the stage `first` [m, m/s], put to that at `stage`; shape (axes, 2).
+        first: stage to which x̄ belongs.
+        stage: steps since the first knot.
+        state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        disturbance: ŵ of each axis [m/s].
+        before: input flown until now, of each axis [m/s].
+        flown: output: the inputs flown, and ū [m/s]; shape (2, axes).
+    """
+    for axis in range(len(table)):
+        guide = guide_of(table, knots, axis)
+        lead_p, lead_v = guided_to(guide, first, stage, lead[axis, 0], lead[axis, 1])
+        lead[axis, 0], lead[axis, 1] = lead_p, lead_v
+        p, v, w = state[axis, 0], state[axis, 1], disturbance[axis]
+        u, told = follow(guide, stage, lead_p, lead_v, p, v, w, before[axis])
+        flown[0, axis], flown[1, axis] = u, told
+
+
+@compilable
+def foresee_spline(
+    table: Table, knots: Table, lead: Table, stage: int, state: Table, ahead: Table
+) -> None:
+    """State of each axis a step later, flown along the spline from a state at the stage.
+
+    What λ keeps of the input before is left out: it lasts for a few steps only. What the wind does
+    is flown off.
+
+    Args:
+        table, knots, stage, state: see `fly_spline`.
+        lead: x̄ at the stage [m, m/s]; shape (axes, 2).
+        ahead: output: the state a step later [m, m/s]; shape (axes, 2).
+    """
+    for axis in range(len(table)):
+        guide = guide_of(table, knots, axis)
+        p, v = state[axis, 0], state[axis, 1]
+        u, _ = regulated(guide, stage, lead[axis, 0], lead[axis, 1], p, v, 0.0)
+        ahead[axis, 0], ahead[axis, 1] = advance(guide.model, p, v, u)

@@ -24,6 +24,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
+from skytether.client.endpoint import Client
 from skytether.client.memory import recall
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
@@ -42,7 +43,6 @@ from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import Track, nearest, track
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.ahead import AheadClient
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER
 from skytether.sim.world import Clock, World
 
@@ -256,7 +256,7 @@ class Body(SimulatedVehicle):
     def lose_client(self, sensor: Sensor) -> None:
         """Fly without a client from the present step on, and then by one with another sensor."""
         if self._step >= 0:
-            self._lost_ns, self._step = self.starts_ns(self._step), -1
+            self._lost_ns, self._step = self._began_ns + self._step * self._dt_ns, -1
         self.sensor = sensor
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
@@ -267,7 +267,7 @@ class Body(SimulatedVehicle):
                 is_held = at_ns < self._lost_ns + HOLD_NS
                 self.plant.advance(self._velocity if is_held else 0.0 * self._velocity)
                 at_ns += self._dt_ns
-                self.unflown.append((at_ns / SECOND_NS, [p for p, _ in self.plant.x]))
+                self.unflown.append((at_ns / SECOND_NS, self.plant.state()[:, 0].tolist()))
             self._lost_ns = None
         return super().measurements(now_ns=now_ns)
 
@@ -275,7 +275,7 @@ class Body(SimulatedVehicle):
 class Life(NamedTuple):
     """Run of a vehicle's client."""
 
-    client: AheadClient
+    client: Client
     sink: io.BytesIO
     """Record of its steps."""
 
@@ -325,22 +325,20 @@ class Raid:
         self._running = Running(self._server, self._kept)
         return self._server
 
-    def _new_client(self, number: int) -> AheadClient:
+    def _new_client(self, number: int) -> Client:
         """The next life of a vehicle's client."""
         lives, sink, world = self._lives[number], io.BytesIO(), self._world
         keeps = isinstance(self._bodies[number], Body) and self._scenario.vehicle.memory != "none"
         before, now_ns = None, CLOCK.local(world.now_ns)
         if lives and (kept := world.memory(f"client {number}")):
             before = recall(*kept, now_ns, self._scenario.terms())
-        client = AheadClient(
+        client = Client(
             self._scenario,
             self._bodies[number],
             server=AIR,
             vehicle=number,
             boot_id=BOOT_ID + len(lives),
             recorder=Recorder(client_columns(self._scenario.model.axes), sink),
-            clock=CLOCK,
-            world_ns=lambda: world.now_ns,
             keeps=keeps,
             before=before,
         )
@@ -369,7 +367,6 @@ class Raid:
 
     def _stop_clients(self, vehicle: int) -> None:
         for number in self._hit(vehicle):
-            self._lives[number][-1].client.catch_up()
             self._world.stop(f"client {number}")
 
     def _start_clients(self, vehicle: int) -> None:
@@ -445,7 +442,6 @@ class Raid:
         dt_s, scale = self._scenario.control.dt, self._scenario.mission.height_scale
         tracks: list[Track] = []
         for client, sink in self._lives[number]:
-            client.catch_up()
             rows = parse(sink.getvalue())
             if tracks or (rows["mode"] == Mode.TRACK).any():
                 began_s = client.began_ns / SECOND_NS

@@ -19,10 +19,10 @@ import msgspec
 import numpy as np
 
 from skytether.client.clamp import clamped
+from skytether.client.followers import Constants, SplineFollower
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.law.model import Array, white_acceleration
-from skytether.shared.law.spline import Guide, follow
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
@@ -94,9 +94,9 @@ def fly_aboard(scenario: Scenario) -> Rows:
     if scenario.reference.shape in UNKNOWN:
         raise ValueError(f"reference.shape: {scenario.reference.shape!r} is no shape known aboard")
     terms, vehicle = scenario.terms(), scenario.vehicle
-    model, u_max = terms.model, terms.u_max
+    constants = Constants.of(terms, regulator(scenario))
     flies, known = simulated(scenario, 1), Navigation(scenario)
-    desired, along = _due(scenario), regulator(scenario).tolist()
+    desired = _due(scenario)
     change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
     rows = np.zeros(scenario.steps, client_columns(terms.axes))
     rows["step"] = np.arange(scenario.steps)
@@ -106,15 +106,9 @@ def fly_aboard(scenario: Scenario) -> Rows:
     for k, row in enumerate(rows):
         now_ns = k * terms.dt_ns
         known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
-        wanted, told = [], []
-        for axis, each in enumerate(model.axes()):
-            knots = desired[k : k + 2, axis].ravel().tolist()
-            guide = Guide(each, knots, 1, terms.dt_s, 1, 0.0, 0.0, 0.0, u_max[axis], *along[axis])
-            (p, v), w = known.predicted[axis], known.disturbance[axis]
-            chosen, part = follow(guide, 0, knots[0], knots[1], p, v, w, float(u[axis]))
-            wanted.append(chosen)
-            told.append(part)
-        flown = clamped(wanted, u.tolist(), u_max, change_max, told=told)
+        spline = SplineFollower(constants, desired[k : k + 2].swapaxes(0, 1), 1, 1)
+        wanted, told = spline.input_at(0, known.predicted, known.disturbance, u).tolist()
+        flown = clamped(wanted, u.tolist(), terms.u_max, change_max, told=told)
         assert flown is not None
         u = np.array(flown)
         row["state"], row["measured"] = flies.truth(), known.measured

@@ -360,7 +360,7 @@ class Torture:
             link=life,
             recorder=life,
         )
-        life.disturbance = lambda: client.disturbance
+        life.disturbance = lambda: tuple(client.disturbance.tolist())
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:

@@ -73,12 +73,13 @@ def test_what_the_next_input_meets_obeys_eq_4_without_dead_time(
     terms = known.terms()
     plant = FirstOrderPlant(known, Weather(known, stream(0, "wind")))
     on_their_way = OnTheirWay(terms.model.axes(), terms.dead_times)
-    met, states = on_their_way.predict(plant.x, wind_mps), []
+    wind = np.array(wind_mps)
+    met, states = on_their_way.predict(plant.state(), wind), []
     for u in np.random.default_rng(seed).uniform(-3.0, 3.0, (40, 2)):
-        wanted = terms.model.step(np.array(met), u + np.array(wind_mps))
+        wanted = terms.model.step(met, u + wind)
         plant.advance(u)
-        on_their_way.issue(u.tolist())
-        met = on_their_way.predict(plant.x, wind_mps)
+        on_their_way.issue(u)
+        met = on_their_way.predict(plant.state(), wind)
         states.append((plant.state(), met))
         np.testing.assert_allclose(met, wanted, rtol=0.0, atol=1e-12 * 40)
     for axis, ns in enumerate(dead_time_ns):

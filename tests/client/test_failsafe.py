@@ -568,9 +568,9 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
         hand = tracking()
         with pytest.MonkeyPatch.context() as mad:
             if seen is Compensator:
-                mad.setattr(Compensator, "choose", lambda *_: np.array([np.nan, 0.0]))
+                mad.setattr(Compensator, "choose", lambda *_: ([np.nan, 0.0], [0.0, 0.0]))
             else:
-                mad.setattr(hand.flies.plant, "x", [(np.inf, np.inf)] * 2)
+                mad.setattr(hand.flies.plant, "x", np.full((2, 2), np.inf))
             hand.fly(0.02, plans=True)
         hand.fly(3.0, plans=True)
         rows = hand.rows()[160:]
@@ -583,7 +583,7 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
     """A position that changes by 300 m in a step, or a velocity by 20 m/s, is not flown by."""
     for p, v in ((300.0, 0.0), (0.0, 20.0)):
         hand = tracking()
-        hand.flies.plant.x = [(x + p, w + v) for x, w in hand.flies.plant.x]
+        hand.flies.plant.x += [p, v]
         hand.fly(0.02, plans=True)
         assert (hand.mode, hand.speed) == (Mode.BRAKE, pytest.approx(SPEED - 0.04))
         assert hand.changes[-1] == ("brake", str(Reason.LEAPT))
@@ -605,7 +605,7 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
 def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
     """Once it is good again the vehicle still does not know where it is, and says so."""
     hand = tracking()
-    hand.flies.plant.x = [(x + 300.0, w) for x, w in hand.flies.plant.x]
+    hand.flies.plant.x[:, 0] += 300.0
     hand.fly(3.0, plans=True)
     hand.fly(2.0, beats=False)
     assert hand.changes[-1] == ("hover", str(Reason.LOST))
@@ -700,7 +700,7 @@ def test_no_mistake_of_the_compensator_reaches_the_plant(
     hand = tracking(vehicle={"slew_mps2": 5.0})
     if not clamps:
         monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)
-    monkeypatch.setattr(Compensator, "choose", lambda *_: np.array([100.0, -100.0]))
+    monkeypatch.setattr(Compensator, "choose", lambda *_: ([100.0, -100.0],) * 2)
     # What is over u_max is no message: the record tells.
     monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_: None)
     hand.fly(0.4, plans=True)

@@ -18,7 +18,7 @@ from skytether.shared.telemetry.record import DOWNLINK, Record
 from skytether.shared.wire.protocol import Horizon, Mode
 from skytether.sim.flight import fly
 
-STILL = [(0.0, 0.0), (0.0, 0.0)]
+STILL, ZERO = np.zeros((2, 2)), np.zeros(2)
 
 
 def now(off_m: float = 0.0, steps: int = 1, *, is_news: bool = False) -> Unreported:
@@ -75,8 +75,8 @@ def test_what_is_news_is_told_at_once() -> None:
     told, compensator = reporter()
 
     def due(step: int, session: int = 7, mode: Mode = Mode.READY, silence: int = 0) -> bool:
-        compensator.choose(step, STILL)
-        return told.is_due(session, step, mode, STILL, [0.0, 0.0], silence)
+        compensator.choose(step, STILL, ZERO, ZERO)
+        return told.is_due(session, step, mode, STILL, ZERO, silence)
 
     assert due(0)
     assert not due(1)
@@ -97,7 +97,7 @@ def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
 
     def sent(steps: range, mode: Mode) -> Iterator[int]:
         for step in steps:
-            compensator.choose(step, STILL)
+            compensator.choose(step, STILL, ZERO, ZERO)
             if told.is_due(7, step, mode, STILL, [0.0, 0.0], 0):
                 yield step
 
@@ -113,15 +113,15 @@ def test_the_belief_is_the_rule_of_flight() -> None:
     compensator = Compensator(terms)
     feedback = np.array([[0.2, 0.1, 0.05, 1.5, 0.5]] * 2, np.float32)
     compensator.offer(horizon(3)._replace(feedback=feedback), 4, 2)
-    belief, x = BelievedState(terms, compensator), [(0.5, -0.3), (-0.2, 0.4)]
+    belief, x = BelievedState(terms, compensator), np.array([[0.5, -0.3], [-0.2, 0.4]])
     for step in range(4, 40):
-        u = np.array(compensator.choose(step, x))
-        belief.told(x, u.tolist()) if step == 4 else belief.silent()
-        x = [tuple(each) for each in terms.model.step(np.array(x), u + np.float32(0.05)).tolist()]
+        u = np.array(compensator.choose(step, x, ZERO, ZERO)[0])
+        belief.told(x, u) if step == 4 else belief.silent()
+        x = terms.model.step(x, u + np.float32(0.05))
         assert belief.off_m(x) == pytest.approx(0.0, abs=1e-6)
-    (p, v), y = x
-    assert belief.off_m([(p + 0.3, v), y]) == pytest.approx(0.3, abs=1e-6)
-    assert belief.off_m([(p, v + 0.1), y]) == pytest.approx(0.1 * terms.tau_s[0], abs=1e-6)
+    aside, faster = [[0.3, 0.0], [0.0, 0.0]], [[0.0, 0.1], [0.0, 0.0]]
+    assert belief.off_m(x + aside) == pytest.approx(0.3, abs=1e-6)
+    assert belief.off_m(x + faster) == pytest.approx(0.1 * terms.tau_s[0], abs=1e-6)
 
 
 # -- flights ---------------------------------------------------------------------------------

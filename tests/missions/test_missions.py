@@ -584,7 +584,7 @@ def test_who_gets_a_motion_again_says_so_again() -> None:
     reporter = Reporter(terms, "deviation(9)", compensator)
     knots = np.zeros((2, 1, 2), np.float32)
     told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
-    still, flown = ((0.0, 0.0), (0.0, 0.0)), (0.0, 0.0)
+    still, flown = np.zeros((2, 2)), np.zeros(2)
 
     def is_due(step: int) -> bool:
         return reporter.is_due(1, step, Mode.TRACK, still, flown, 0)

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import skytether
-from helpers import uncompile
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
 from skytether.lab.sweep import summaries
@@ -601,7 +600,8 @@ def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
     compensator = Compensator(terms, regulator(flown))
     told = message(10, np.array([knots, knots], np.float32), age=1, spacing=spacing)
     compensator.offer(told, 10, 9)
-    inputs = compensator.choose(10 + stage, [(0.0, 0.0), (1.0, -1.0)], before=terms.u_max)
+    state = np.array([[0.0, 0.0], [1.0, -1.0]])
+    inputs, _ = compensator.choose(10 + stage, state, np.zeros(2), np.array(terms.u_max))
     assert all(math.isfinite(u) for u in inputs)
     for u, bound in zip(inputs, terms.u_max, strict=True):
         assert abs(u) <= bound
@@ -799,9 +799,8 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
     known_aboard: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its filter has found it; without that it would be blown off by what K leaves."""
-    uncompile(monkeypatch)
     if not known_aboard:
-        monkeypatch.setattr(Navigation, "disturbance", property(lambda _: [0.0, 0.0]))
+        monkeypatch.setattr(Navigation, "disturbance", property(lambda _: np.zeros(2)))
     flown = scenario(
         control={"input_weight": 20.0},
         vehicle={"steady_wind_mps": [0.3, 0.0]},
@@ -814,7 +813,6 @@ def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In still air the server predicts the vehicle, so reports are few; ablation: it stands."""
-    uncompile(monkeypatch)
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     table["control"]["scheme"] = "trajectory"
@@ -826,6 +824,6 @@ def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
         return float((packets["direction"] != UPLINK).sum()) / flown.duration
 
     seldom = reports_per_s()
-    monkeypatch.setattr(Compensator, "foresee", lambda _, states, __=None: list(states))
+    monkeypatch.setattr(Compensator, "foresee", lambda _, states, __=None: states)
     assert seldom < 6.0
     assert reports_per_s() > 2.0 * seldom

@@ -301,7 +301,7 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
             horizon, last_seen = arriving[step]
             vehicle.offer(horizon, step, last_seen)
         states.append(x)
-        inputs.append(np.array(vehicle.choose(step, x.tolist())))
+        inputs.append(np.array(vehicle.choose(step, x, np.zeros(2), np.zeros(2))[0]))
         if step in {begin, seen}:
             told = Mode.TRACK, 1, x, inputs[-1]
             replay.observe(0, Observation(1, 1, step, FIRST, begin, 0, 0, *told))

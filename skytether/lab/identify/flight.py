@@ -131,7 +131,7 @@ class Identifying(Endpoint):
             return
         chosen = [0.0] * len(self._input)
         if known.is_known:
-            chosen = self.experiment.choose(known.predicted, now_ns=now_ns)
+            chosen = self.experiment.choose(known.predicted.tolist(), now_ns=now_ns)
         self._input = np.array(chosen)
         self._flies.fly(self._input)
         self.inputs.append((now_ns, chosen))

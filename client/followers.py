@@ -1,0 +1,202 @@
+"""What a vehicle flies by between two packets: a horizon of inputs, or a spline, eq. (11).
+
+The rules themselves are `shared.law.rule` and `shared.law.spline`, which the server flies by as
+well; here is what they need aboard, for all axes of one vehicle. Stages count steps from the first
+of a horizon.
+"""
+
+import math
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.law import rule, spline
+from skytether.shared.law.model import Array, Model
+from skytether.shared.law.rule import bounded
+from skytether.shared.law.spline import along
+from skytether.shared.law.terms import Terms
+from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, LED
+
+TOLD = [GAIN_P, GAIN_V, DISTURBANCE]
+"""Columns of a horizon's feedback on the wire,"""
+TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
+"""and those of the table that they go to."""
+
+
+class Follower(Protocol):
+    """What is flown by."""
+
+    length: int
+    """Number of stages for which there are inputs."""
+    feeds_back: bool
+    """Whether what is flown is told and feedback on top of that."""
+
+    def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
+        """Input u*, and what of it is told, without the feedback [m/s]; shape (2, axes).
+
+        Args:
+            stage: stage that the vehicle is at.
+            state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+            disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
+                spline [m/s].
+            before: input flown until now, of each axis; counts only along a spline [m/s].
+
+        Source: eq. (11).
+        """
+
+    def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
+        """State of each axis a step later, as the server foresees it [m, m/s]; shape (axes, 2).
+
+        Args:
+            stage: that of the newest `input_at`.
+            state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+            flown: input flown from there [m/s]; None for what the rule makes of the state.
+        """
+
+
+class Constants(NamedTuple):
+    """What all horizons and splines of a vehicle are flown with."""
+
+    terms: Terms
+    model: Model
+    """Model of the terms, eq. (4)."""
+    held: Array
+    """Columns of `Held` that are the same for all horizons; shape (axes, n)."""
+    guide: Array
+    """Columns of `Guide` that are the same for all splines; shape (axes, n)."""
+
+    @classmethod
+    def of(cls, terms: Terms, regulator: Array) -> Self:
+        """Constants of a flight.
+
+        Args:
+            terms: the rule of flight.
+            regulator: K and λ along a spline, see `shared.scenario.gain.regulator`; shape (axes,
+                3).
+        """
+        model = terms.model
+        held = np.zeros((terms.axes, rule.DISTURBANCE + 1))
+        held[:, : rule.MODEL] = np.stack(model, -1)
+        held[:, rule.INDEXED], held[:, rule.BRAKE] = terms.indexed, terms.brake
+        held[:, rule.BOUND] = terms.u_max
+        guide = np.zeros((terms.axes, spline.LAG + 1))
+        guide[:, : rule.MODEL] = np.stack(model, -1)
+        guide[:, spline.DT_S], guide[:, spline.BRAKE] = terms.dt_s, terms.brake
+        guide[:, spline.BOUND] = terms.u_max
+        guide[:, [spline.GAIN_P, spline.GAIN_V, spline.LAG]] = regulator
+        return cls(terms, model, held, guide)
+
+
+class HorizonFollower:
+    """Flies by a horizon of inputs.
+
+    Args:
+        constants: those of the vehicle.
+        inputs: its inputs [m/s]; shape (axes, n).
+        length: number of them that are flown.
+        feedback: its feedback, see `wire.protocol.Horizon`; shape (axes, 5), None without.
+    """
+
+    def __init__(
+        self,
+        constants: Constants,
+        inputs: NDArray[np.floating],
+        length: int,
+        feedback: NDArray[np.floating] | None = None,
+    ) -> None:
+        terms, self._model = constants.terms, constants.model
+        self.length, self.feeds_back = length, feedback is not None
+        self._inputs = np.array(inputs, np.float64, order="C")
+        self._table = constants.held.copy()
+        last = self._inputs[:, length - 1 if terms.indexed else 0].tolist()
+        within = [bounded(u, bound) for u, bound in zip(last, terms.u_max, strict=True)]
+        self._table[:, rule.LENGTH], self._table[:, rule.FEEDS_BACK] = length, self.feeds_back
+        # No math.hypot: it rounds otherwise in 17 % of cases, and the server's replay has a plain
+        # root.
+        self._table[:, rule.SPEED] = math.sqrt(sum(u * u for u in within))
+        self.lead = np.zeros((terms.axes, 2))
+        """State x̄ that it leads to, of each axis at the newest stage [m, m/s]; shape (axes, 2)."""
+        if feedback is not None:
+            self._table[:, TABLED] = feedback[:, TOLD]
+            self.lead[:] = feedback[:, LED]
+        self._lead_stage = 0
+
+    def input_at(
+        self,
+        stage: int,
+        state: Array,
+        disturbance: Array,  # noqa: ARG002 - it has one of its own
+        before: Array,  # noqa: ARG002 - it does not matter
+    ) -> Array:
+        """See `Follower`."""
+        flown = np.empty((2, len(state)))
+        rule.fly_horizon(
+            self._table, self._inputs, self.lead, self._lead_stage, stage, state, flown
+        )
+        self._lead_stage = max(stage, self._lead_stage)
+        return flown
+
+    def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
+        """See `Follower`."""
+        if flown is not None:
+            return self._model.step(state, flown + self._table[:, rule.DISTURBANCE])
+        ahead = np.empty_like(state)
+        rule.foresee_horizon(self._table, self._inputs, self.lead, stage, state, ahead)
+        return ahead
+
+
+class SplineFollower:
+    """Flies along a spline.
+
+    Args:
+        constants: those of the vehicle.
+        knots: position [m] and velocity [m/s] of each; shape (axes, n, 2).
+        spacing: steps from one knot to the next.
+        length: number of stages for which it is flown.
+    """
+
+    feeds_back = True
+
+    def __init__(
+        self, constants: Constants, knots: NDArray[np.floating], spacing: int, length: int
+    ) -> None:
+        terms = constants.terms
+        self.length = length
+        self.spacing, self.sent = spacing, knots
+        """Steps from knot to knot, and the knots as they were sent."""
+        self._knots = np.array(knots, np.float64, order="C").reshape(len(knots), -1)
+        axes = zip(constants.model.axes(), self._knots, terms.u_max, strict=True)
+        last = [
+            bounded(along(model, row, spacing, terms.dt_s, length - 1), bound)
+            for model, row, bound in axes
+        ]
+        self._table = table = constants.guide.copy()
+        table[:, spline.SPACING], table[:, spline.LENGTH] = spacing, length
+        table[:, spline.LAST], table[:, spline.SPEED] = last, math.hypot(*last)
+        self.lead = self._knots[:, :2].copy()
+        """State x̄ on the spline, of each axis at the newest stage [m, m/s]; shape (axes, 2)."""
+        self._lead_stage = 0
+
+    def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
+        """See `Follower`."""
+        flown = np.empty((2, len(state)))
+        spline.fly_spline(
+            self._table,
+            self._knots,
+            self.lead,
+            self._lead_stage,
+            stage,
+            state,
+            disturbance,
+            before,
+            flown,
+        )
+        self._lead_stage = stage
+        return flown
+
+    def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:  # noqa: ARG002
+        """See `Follower`; what is flown besides the spline is flown off."""
+        ahead = np.empty_like(state)
+        spline.foresee_spline(self._table, self._knots, self.lead, stage, state, ahead)
+        return ahead
