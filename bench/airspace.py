@@ -13,6 +13,7 @@ from skytether.server.common.scheme import foresight
 from skytether.server.controller import BLOCK
 from skytether.server.endpoint import Server
 from skytether.server.mpc.hierarchical import Planner
+from skytether.server.schemes.horizons import HorizonScheme
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
@@ -163,9 +164,9 @@ class Airspace:
         sent = len(self.server.outbox())
         if sent:
             assert sent == len(self._sessions), "a vehicle was sent no horizon"
-            planner = self.server.controller.planner
-            assert isinstance(planner, Planner), "a trajectory is no plan"
-            planned = planner.inputs
+            scheme = self.server.controller.scheme
+            assert isinstance(scheme, HorizonScheme), "a trajectory is no plan"
+            planned = scheme.planner.inputs
             self._vehicles.fly(planned[:sent, :, 0])
             self._past.append(self._vehicles.x)
             self._due_ns += self._dt_ns

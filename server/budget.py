@@ -3,13 +3,13 @@
 The trigger says of each vehicle whether it is worth a packet at all. Of those that are, the budget
 lets go as many as it has bytes for, in this order:
 
-1. what is owed: a packet in the place of a heartbeat, and the first of a vehicle that has nothing
+1. what is urgent: a packet in the place of a heartbeat, and the first of a vehicle that has nothing
    to fly on with. It goes in any case, as heartbeats do, and the others pay for it.
 2. vehicles that were sent nothing for WAIT_S, longest first, so that nobody starves;
 3. all others by what their trigger compares, a byte.
 
-A token bucket: b ← b + r Δt, within ± r BURST_S, less what is sent, headers included; what is owed
-may take it below zero. So a window of T seconds has at most r (T + BURST_S) beside what is owed.
+A token bucket: b ← b + r Δt, within ± r BURST_S, less what is sent, headers included; the urgent
+may take it below zero. So a window of T seconds has at most r (T + BURST_S) beside the urgent.
 The rate r is `control.shared_bytes_per_s`, or follows the queueing delay (`server.rate`).
 
 Who waits asks again at the next step. Vehicles of other blocks are ranked by what they asked for
@@ -86,27 +86,27 @@ class SharedBudget:
             self._control.update(rows, self._spent, now_ns)
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
-        # Debts are bounded as well, so that what is owed cannot keep plans waiting for long.
+        # Debts are bounded as well, so that what is urgent cannot keep plans waiting for long.
         self._tokens, self._spent = min(max(tokens, -most), most), 0
         self._tick += 1
 
     def choose(
-        self, rows: Indices, event: Flags, owed: Flags, worth: Array, since_s: Array
+        self, rows: Indices, event: Flags, urgent: Flags, worth: Array, since_s: Array
     ) -> Flags:
         """Flags of the vehicles whose requests are granted.
 
         Args:
             rows: the vehicles; shape (n,).
             event: which ask; shape (n,).
-            owed: which of these cannot wait; shape (n,).
+            urgent: which of these cannot wait; shape (n,).
             worth: what the trigger compares; shape (n,).
             since_s: time since each was sent something [s]; shape (n,).
         """
-        asks = event & ~owed
+        asks = event & ~urgent
         self._asked[rows] = np.where(asks, self._tick, NEVER)
         self._gain[rows] = np.nan_to_num(worth) / self._bytes[rows]
         self._waited_s[rows] = np.where(since_s >= WAIT_S, since_s, 0.0)
-        left = self._tokens - self._spent - self._bytes[rows[event & owed]].sum()
+        left = self._tokens - self._spent - self._bytes[rows[event & urgent]].sum()
         waiting = (self._asked >= self._tick - 1).nonzero()[0]
         # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
@@ -114,7 +114,7 @@ class SharedBudget:
         # The first that does not fit holds up all behind it: smaller packets must not pass it for
         # ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
-        chosen = owed & event | np.isin(rows, goes) & asks
+        chosen = urgent & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())
         if late:
             self.deferred += late

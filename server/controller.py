@@ -17,26 +17,20 @@ import numpy as np
 
 from skytether.server import missions
 from skytether.server.budget import SharedBudget
+from skytether.server.common import splines
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import DOUBTS, Figures, Foresight, Scheme, foresight
+from skytether.server.common.scheme import DOUBTS, Batch, Figures, Scheme, foresight
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
-from skytether.server.mpc import exact, hierarchical
-from skytether.server.mpc.hierarchical import Planner
-from skytether.server.schemes import committed, knots, predictive, sent_horizons, trajectory
-from skytether.server.schemes.committed import Replay
-from skytether.server.schemes.predictive import Estimator
-from skytether.server.schemes.trajectory import Guidance
+from skytether.server.schemes.table import SCHEMES, Entry, Fleet
 from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.gain import feedback_gain, regulator
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import KnownArrays, Situation, Verdict, make_trigger
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
@@ -45,34 +39,38 @@ BLOCK = 128
 """Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
 so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
 
-_SCHEMES = {
-    "predictive": (predictive, hierarchical, exact),
-    "none": (predictive, hierarchical, exact),
-    "committed": (committed, sent_horizons, hierarchical, exact),
-    "trajectory": (trajectory, knots, exact),
-    "mission": (missions, knots),
-}
-"""Modules and packages whose kernels plan by each scheme, and for missions; the others' kernels are
-called with any of them."""
+
+def _mission(fleet: Fleet) -> Scheme:
+    assert fleet.references is not None
+    state = MissionState(
+        fleet.scenario,
+        fleet.terms,
+        fleet.capacity,
+        fleet.block,
+        fleet.references,
+        fleet.desired.number,
+        fleet.clock,
+    )
+    return MissionPlanner(fleet.scenario, fleet.terms, fleet.block, state)
+
+
+MISSION = Entry(_mission, (missions, splines))
+"""Scheme of vehicles that keep apart."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
     """Names of the modules whose kernels are not called where a scenario is flown."""
-    scheme = "mission" if scenario.is_mission else scenario.control.scheme
-    others = {*chain.from_iterable(_SCHEMES.values())}.difference(_SCHEMES[scheme])
-    names = tuple(f"{each.__name__}." for each in others)
+    entry = MISSION if scenario.is_mission else SCHEMES[scenario.control.scheme]
+    every = chain.from_iterable(each.kernels for each in (MISSION, *SCHEMES.values()))
+    names = tuple(f"{each.__name__}." for each in {*every}.difference(entry.kernels))
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
 class Decisions(NamedTuple):
     """Decisions on n vehicles at a step; valid until the next decisions are made."""
 
-    rows: Indices
-    """The vehicles; shape (n,)."""
-    step: Indices
-    """Step k of each; shape (n,)."""
-    found: Foresight
-    """Predicted states, and the horizons; the n vehicles come first."""
+    batch: Batch
+    """The vehicles, what is foreseen of them, and which are sent their plan."""
     figures: Figures
     """Costs of the plans; shape (n,)."""
     planned: Array
@@ -80,9 +78,7 @@ class Decisions(NamedTuple):
     verdict: Verdict
     """Verdict of the trigger."""
     event: Flags
-    """Whether each vehicle is sent its horizon; shape (n,)."""
-    sent: Indices
-    """Indices of those that are sent theirs."""
+    """Whether each vehicle is sent its plan; shape (n,)."""
     solve_ns: int
     """Time that planning for all of them took [ns], or -1 where nobody measures it."""
 
@@ -97,9 +93,6 @@ class Controller:
         stopwatch: measures the parts; the core has no clock of its own.
         references: see `Desired`.
     """
-
-    owes = False
-    """Whether a vehicle is sent a heartbeat at this tick if nothing else."""
 
     def __init__(
         self,
@@ -122,37 +115,20 @@ class Controller:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self.desired = Desired(scenario, terms, room, block, references)
         """Desired trajectories as far as they are known."""
-        self._scheme: Scheme
-        self.planner: Planner | Guidance | MissionPlanner
-        """Plans of every vehicle, or what is sent in place of a plan."""
-        self._missions: MissionPlanner | None = None
-        """Planner that keeps vehicles of a mission apart."""
-        if scenario.is_mission and references is not None:
-            self._scheme = self.planner = self._missions = MissionPlanner(
-                scenario,
-                terms,
-                block,
-                MissionState(scenario, terms, room, block, references, self.desired.number, clock),
-            )
-        elif terms.splines:
-            self._scheme = self.planner = Guidance(
-                terms, control, regulator(scenario), self.desired, clock, room, block
-            )
-        else:
-            gain = feedback_gain(scenario)
-            self._scheme = (
-                Replay(terms, control, gain, room, clock)
-                if terms.commits
-                else Estimator(terms, control, gain, room)
-            )
-            self.planner = Planner(control, terms, self.desired, room, block, stopwatch)
+        is_mission = scenario.is_mission and references is not None
+        entry = MISSION if is_mission else SCHEMES[scenario.control.scheme]
+        fleet = Fleet(scenario, terms, room, block, clock, self.desired, references, stopwatch)
+        self.scheme = entry.make(fleet)
+        """What is believed of vehicles, planned and sent."""
         self._terms, self._room, self._block = terms, room, block
         self.faults: list[str] = []
         """Tracebacks of mistakes in plug-ins' policies, one for each policy, to be told."""
         self._sent_step = np.full(room, -1, dtype=np.int64)
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
-        self.owed: Flags = np.zeros(room, dtype=np.bool_)
+        self._heartbeat_due: Flags = np.zeros(room, dtype=np.bool_)
         """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
+        self._heartbeats = False
+        """Whether any is."""
         self._able = np.zeros(room, dtype=np.bool_)
         """Scratch: whether each of some vehicles is decided on; shape (room,)."""
         self._all, self._none = np.arange(block), np.arange(0)
@@ -161,7 +137,7 @@ class Controller:
         self._stopwatch = stopwatch
         self.last_step = np.full(room, -1, dtype=np.int64)
         """Step of each vehicle that was decided last, or -1; shape (room,)."""
-        self.observed_step = self._scheme.observed_step
+        self.observed_step = self.scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (room,)."""
         self.idle = np.zeros(room, dtype=np.int64)
         """Why there was no plan for each vehicle, or none sent, one of `Idle`; shape (room,)."""
@@ -175,7 +151,7 @@ class Controller:
     @property
     def counts(self) -> Counter[str]:
         """Events that were counted, by name."""
-        return Counter({**self._counts, **self._scheme.counts})
+        return Counter({**self._counts, **self.scheme.counts})
 
     def change_trigger(self, control: ControlConfig) -> None:
         """Ask another trigger from the next step on; it knows of nothing that was sent before."""
@@ -198,68 +174,33 @@ class Controller:
             horizons=found.horizons,
             held=found.held if terms.commits else None,
             sent_step=self._sent_step,
-            owed=self.owed,
+            heartbeat_due=self._heartbeat_due,
             desired=self.desired.states,
         )
-
-    def change_zones(self, zones: Zones) -> None:
-        """Keep vehicles of a mission out of other zones from now on."""
-        if self._missions:
-            self._missions.change_zones(zones)
-
-    def objection(self, zones: Zones) -> str:
-        """Why there cannot be these zones now, in words; empty: there can."""
-        return self._missions.objection(zones) if self._missions else ""
-
-    @property
-    def inside(self) -> list[tuple[int, str]]:
-        """Vehicles of a mission that were found at rest within a zone, and its name; to be
-        emptied.
-        """
-        return self._missions.inside if self._missions else []
-
-    @property
-    def left_tube(self) -> list[tuple[int, float]]:
-        """Vehicles of a mission that have left their tube, and by how much [m]; to be emptied."""
-        return self._missions.left_tube if self._missions else []
-
-    def waits(self, row: int) -> str:
-        """Reason in words why a vehicle of a mission waits; empty if it does not."""
-        return self._missions.waits(row) if self._missions else ""
-
-    def clock_m(self, row: int) -> float | None:
-        """Distance by which a vehicle of a mission may be elsewhere for want of its clock [m]."""
-        return self._missions.clock_m(row) if self._missions else None
-
-    def restart(self, row: int) -> bool:
-        """Take note that the client of a vehicle on a mission has begun anew; whether that is
-        news.
-        """
-        return self._missions is not None and self._missions.restart(row)
 
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row, or with a new life of it."""
         self.last_step[row] = self._sent_step[row] = -1
         self.idle[row] = Idle.PLANS
         self._takes[row] = True
-        self._scheme.forget(row)
-        self.planner.forget(row)
+        self.scheme.forget(row)
         self._trigger.forget(row)
         if self.budget:
             self.budget.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Keep an observation, unless a newer one is known (E11); whether it was kept."""
-        kept = self._scheme.observe(row, observation)
+        kept = self.scheme.observe(row, observation)
         if kept:
             self._takes[row] = bool(observation.takes)
         return kept
 
-    def owe(self, rows: list[int]) -> None:
+    def note_heartbeats(self, rows: list[int]) -> None:
         """Note the vehicles that are sent a heartbeat at this tick if nothing else."""
-        self.owed[:] = False
-        self.owed[rows] = True
-        self.owes = bool(rows)
+        if rows or self._heartbeats:
+            self._heartbeat_due[:] = False
+            self._heartbeat_due[rows] = True
+            self._heartbeats = bool(rows)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
         """Vehicles to decide on, and their steps: the step is new, and `idle` has no reason."""
@@ -288,10 +229,10 @@ class Controller:
         Source: algorithms 1, 2.
         """
         n, found, stopwatch = len(rows), self._found, self._stopwatch
-        self._scheme.foresee(rows, step, found)  # eq. (13)
+        self.scheme.foresee(rows, step, found)  # eq. (13)
         stopwatch.lap("estimate")
-        self.planner.plan(rows, step, found)  # eq. (14), (15)
-        figures, planned = self.planner.figures[:n], self.planner.planned[:n]
+        self.scheme.plan(rows, step, found)  # eq. (14), (15)
+        figures, planned = self.scheme.figures[:n], self.scheme.planned[:n]
         situation = Situation(rows, figures, found.start[:n], planned, self._known)
         verdict = self._trigger.test(situation)  # eq. (16)
         # A vehicle flies no horizon that was planned before it said that it would.
@@ -313,11 +254,11 @@ class Controller:
             # by.
             worth = verdict.figure if verdict.compares else figures["cost_gap"]
             # A vehicle without a plan to fly on with cannot wait for bytes.
-            owed = self.owed[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
-            event = self.budget.choose(rows, event, owed, worth, situation.since_sent_s)
+            urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
+            event = self.budget.choose(rows, event, urgent, worth, situation.since_sent_s)
             events = int(np.count_nonzero(event))
         # After the budget: the committed scheme may replay only what is really sent.
-        self._scheme.remember(rows, step, found, event)  # eq. (12)
+        self.scheme.remember(rows, step, found, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
         if events == n:  # of one vehicle: all or none
             sent = self._all[:n]
@@ -332,8 +273,8 @@ class Controller:
         counts["events"] += events
         counts["unsolved"] += unsolved
         stopwatch.lap("trigger")
-        solve_ns = self.planner.solve_ns
-        return Decisions(rows, step, found, figures, planned, verdict, event, sent, solve_ns)
+        batch = Batch(rows, step, found, sent)
+        return Decisions(batch, figures, planned, verdict, event, self.scheme.solve_ns)
 
 
 @kernel

@@ -176,7 +176,7 @@ class Server(Endpoint):
         if keys & GOALS and self._guided:
             self._guided.goals = given(scenario.mission.goals, scenario.model.axes)
         if keys & ZONES:
-            self.controller.change_zones(scenario.zones)
+            self.controller.scheme.change_zones(scenario.zones)
         if keys & POINT:
             moved = "reference.points_m" in keys
             position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None
@@ -185,7 +185,7 @@ class Server(Endpoint):
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """See `Endpoint`: nobody may fly into a new zone."""
-        found = self.controller.objection(scenario.zones) if keys & ZONES else ""
+        found = self.controller.scheme.objection(scenario.zones) if keys & ZONES else ""
         return f"mission.zones: got {found}; nothing was changed" if found else ""
 
     @property
@@ -207,7 +207,8 @@ class Server(Endpoint):
         """Figures of one vehicle; on a mission also what it waits for, and what its clock costs."""
         bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
         told = {"step": int(self.controller.last_step[row]), "clock_bound_ms": round(bound_ms, 3)}
-        clock_m, waits = self.controller.clock_m(row), self.controller.waits(row)
+        scheme = self.controller.scheme
+        clock_m, waits = scheme.clock_m(row), scheme.waits(row)
         more = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
         return told | {name: each for name, each in more.items() if each is not None}
 

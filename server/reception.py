@@ -173,7 +173,7 @@ class Reception:
 
     def _hello(self, hello: Hello, call: Call, address: Address, now_ns: int) -> None:
         row = self._sessions.row_of_other_life(hello)
-        if row is not None and self._controller.restart(row):
+        if row is not None and self._controller.scheme.restart(row):
             self._events.append(BegunAnew(vehicle=hello.vehicle))
         refusal, number = self._refusal(hello, address, now_ns), 0
         if refusal is Refusal.ACCEPTED:

@@ -66,7 +66,7 @@ class Session:
         self.said, self.sent_ns = (number + 1) % NUMBERS, now_ns
         return number
 
-    def is_owed(self, now_ns: int) -> bool:
+    def is_heartbeat_due(self, now_ns: int) -> bool:
         """Whether nothing was sent for as long as the vehicle asks."""
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
@@ -138,9 +138,9 @@ class Sessions:
         """First sessions, `count` of them at most."""
         return list(islice(self, count))
 
-    def owed(self, now_ns: int) -> list[Session]:
-        """Sessions without a packet for as long as their vehicles ask, see `is_owed`."""
-        return [each for each in self._live.values() if each.is_owed(now_ns)]
+    def heartbeats_due(self, now_ns: int) -> list[Session]:
+        """Sessions without a packet for as long as their vehicles ask, see `is_heartbeat_due`."""
+        return [each for each in self._live.values() if each.is_heartbeat_due(now_ns)]
 
     def at(self, row: int) -> Session:
         """The session in a row."""

@@ -6,16 +6,12 @@ never caught up with.
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.compiled import axes_of
-from skytether.server.common.scheme import Packing
+from skytether.server.common.scheme import Batch, Head
 from skytether.server.controller import BLOCK, Controller, Decisions
-from skytether.server.schemes.knots import inputs_along
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Events
@@ -33,23 +29,12 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import FIGURES, Recorder
-from skytether.shared.wire.protocol import (
-    FEEDBACK,
-    Heartbeat,
-    Idle,
-    Trajectory,
-    committed_max,
-    encode,
-    encode_horizon,
-    stamp_us,
-)
+from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server calls itself degraded."""
 EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
 """Columns of the record that may be empty."""
-NOTHING = memoryview(b"")
-"""Bytes that go with a horizon without feedback."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Resolution at which the length of a tick is counted [ns]."""
 
@@ -139,8 +124,6 @@ class Ticker:
         recorder: Recorder | None,
         plans: Recorder | None,
     ) -> None:
-        self._terms = terms
-        self._model, self._bounds = axes_of(terms.model), np.array(terms.u_max)
         self._sessions = sessions
         self._clock = clock
         self._controller = controller
@@ -150,7 +133,6 @@ class Ticker:
         self._events = events
         self._recorder, self._plans = recorder, plans
         self._records = recorder is not None or plans is not None
-        self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
         self._columns = [str(each) for each in FIGURES[terms.scheme]]
         """Columns of the record that figures of plans are written to."""
         self.durations = Histogram(TICK_BIN_NS)
@@ -171,15 +153,14 @@ class Ticker:
         controller.desired.tick(tick_ns)
         if controller.budget:
             controller.budget.fill(rows, now_ns)
-        owed = self._sessions.owed(now_ns)
-        if owed or controller.owes:
-            controller.owe([each.row for each in owed])
+        heartbeats = self._sessions.heartbeats_due(now_ns)
+        controller.note_heartbeats([each.row for each in heartbeats])
         rows, step = controller.able(rows, step)
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
             decisions = controller.decide(rows[block], step[block])
-            if len(decisions.sent):
-                self._send_horizons(decisions, now_ns)
+            if len(decisions.batch.sent):
+                self._send_plans(decisions.batch, now_ns)
             self._stopwatch.lap("encode")
             if self._records:
                 self._record(decisions)
@@ -189,15 +170,15 @@ class Ticker:
         if controller.faults:
             self._events += [Fault(traceback=said) for said in controller.faults]
             controller.faults.clear()
-        if left := controller.left_tube:
+        if left := controller.scheme.left_tube:
             self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
             left.clear()
-        if inside := controller.inside:
+        if inside := controller.scheme.inside:
             self._events += [InZone(vehicle=each, zone=zone) for each, zone in inside]
             inside.clear()
         # Last, for a horizon that was sent at this tick stands in place of a heartbeat.
-        if owed:
-            self._send_heartbeats(owed, now_ns)
+        if heartbeats:
+            self._send_heartbeats(heartbeats, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
@@ -212,69 +193,23 @@ class Ticker:
             else:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
-    def _send_horizons(self, decisions: Decisions, now_ns: int) -> None:
-        sent, found = decisions.sent, decisions.found
-        if self._terms.splines:
-            self._send_trajectories(decisions, now_ns)
-            return
-        # Bytes of one input on all axes, and of what goes with a horizon.
-        width = 4 * self._terms.axes
-        feedback, told = NOTHING, 0
-        if self._terms.feedback:
-            feedback, told = found.feedback.data.cast("B"), width * FEEDBACK
-        observed_step = self._controller.observed_step
-        heads, inputs = self._packing.pack(
-            found, sent, decisions.rows, decisions.step, observed_step
-        )
+    def _send_plans(self, batch: Batch, now_ns: int) -> None:
         # The time of sending and not the tick's due time: the vehicle measures the delay by this
         # stamp.
-        begin, server_us = 0, stamp_us(now_ns)
-        for i, row, k, o, d in heads:
-            session, end = self._sessions.at(row), begin + width * (d + self._terms.planned)
-            payload = encode_horizon(
-                session.vehicle,
-                session.number,
-                k,
-                server_us,
-                o,
-                inputs[begin:end],
-                feedback[i * told : (i + 1) * told],
-                session.number_next(now_ns),
-                session.hearing.silence,
-            )
-            begin = end
-            self._send(session, payload, is_plan=True)
+        sessions, sent_us = self._sessions, stamp_us(now_ns)
 
-    def _send_trajectories(self, decisions: Decisions, now_ns: int) -> None:
-        sent, told, axes = decisions.sent, decisions.found.told, self._terms.axes
-        rows, back = decisions.rows[sent], told.back[sent]
-        step = decisions.step[sent] - back
-        age = step - self._controller.observed_step[rows]
-        # A motion that is sent again is older than the newest observation, which it was not made
-        # from. Any other may be too, where the server's clock was set and the clock map lags: then
-        # the age is below 0, as a horizon's is, for it has to name an observation that was made.
-        age = np.where(back > 0, np.maximum(age, 0), age)
-        columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
-        server_us = stamp_us(now_ns)
-        for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
-            session, knots = self._sessions.at(row), told.knots[i, :, : 2 * n].reshape(axes, n, 2)
-            message = Trajectory(
-                session.vehicle,
-                session.number,
-                k,
-                server_us,
-                o,
-                spacing,
-                knots,
-                session.number_next(now_ns),
-                session.hearing.silence,
-            )
-            self._send(session, encode(message), is_plan=True)
+        def head(row: int) -> Head:
+            session = sessions.at(row)
+            number, silence = session.number_next(now_ns), session.hearing.silence
+            return Head(session.vehicle, session.number, sent_us, number, silence)
 
-    def _send_heartbeats(self, owed: Sequence[Session], now_ns: int) -> None:
-        """Send a heartbeat to each vehicle that is owed one and was sent nothing at this tick."""
-        for session in owed:
-            if session.is_owed(now_ns):
+        for row, payload in self._controller.scheme.encode(batch, head):
+            self._send(sessions.at(row), payload, is_plan=True)
+
+    def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
+        """Send a heartbeat to each of these that was sent nothing at this tick."""
+        for session in due:
+            if session.is_heartbeat_due(now_ns):
                 idle = int(self._sessions.idle[session.row])
                 beat = Heartbeat(
                     session.vehicle,
@@ -297,17 +232,18 @@ class Ticker:
             budget.charge(session.row, size, is_plan=is_plan)
 
     def _record(self, decisions: Decisions) -> None:
-        if self._plans is not None and len(decisions.sent):
-            self._record_plans(self._plans, decisions)
+        batch, figures = decisions.batch, decisions.figures
+        if self._plans is not None and len(batch.sent):
+            self._record_plans(self._plans, batch)
         if self._recorder is None:
             return
-        rows, found, figures = decisions.rows, decisions.found, decisions.figures
+        rows, found = batch.rows, batch.found
         n = len(rows)
         self._recorder.append(
             n,
             vehicle=self._sessions.vehicle[rows],
-            step=decisions.step,
-            reference=self._controller.desired.now(rows, decisions.step),
+            step=batch.step,
+            reference=self._controller.desired.now(rows, batch.step),
             estimate=found.estimate[:n],
             ahead=found.ahead[:n],
             planned=decisions.planned,
@@ -331,39 +267,16 @@ class Ticker:
         solved = figures["solved"]
         if not solved.all():
             told = {name: np.where(solved, figure, nothing) for name, figure in told.items()}
-        if EXPECTED_GAP in told and not decisions.found.doubt.size:
+        if EXPECTED_GAP in told and not decisions.batch.found.doubt.size:
             told[EXPECTED_GAP] = nothing
         told[OWN] = verdict.figure if verdict.compared is Compared.OWN else nothing
         return told
 
-    def _record_plans(self, plans: Recorder, decisions: Decisions) -> None:
-        sent, found = decisions.sent, decisions.found
-        step, ahead = decisions.step[sent], found.ahead[sent]
-        if self._terms.splines:
-            step = step - found.told.back[sent]
-            knots = found.told.knots[sent].astype(np.float64)
-            state: Array = knots[:, :, :2]
-            inputs: NDArray[Any] = np.empty((len(sent), *self._bounds.shape, self._terms.horizon))
-            inputs_along(
-                self._model,
-                self._bounds,
-                self._terms.dt_s,
-                knots,
-                found.told.number[sent],
-                found.told.spacing[sent],
-                inputs,
-            )
-        else:
-            # Behind d committed inputs, another d of each vehicle.
-            stages = ahead[:, None] + np.arange(self._terms.planned)
-            state = found.start[sent]
-            inputs = np.take_along_axis(found.horizons[sent], stages[:, None], axis=2)
+    def _record_plans(self, plans: Recorder, batch: Batch) -> None:
+        told = self._controller.scheme.sent_plans(batch)
         plans.append(
-            len(sent),
-            vehicle=self._sessions.vehicle[decisions.rows[sent]],
-            step=step,
-            begins=step + ahead,
-            state=state,
-            inputs=inputs,
-            disturbance=found.disturbance[sent],
+            len(batch.sent),
+            vehicle=self._sessions.vehicle[batch.rows[batch.sent]],
+            **told._asdict(),
+            disturbance=batch.found.disturbance[batch.sent],
         )

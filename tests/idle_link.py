@@ -88,7 +88,7 @@ def _session(network: DirectionConfig, link: LinkConfig, seed: int) -> tuple[int
             _send(under_way, down, now_ns, said, ear.silence, to_vehicle=False)
             said, told_ns = said + 1, now_ns
         else:
-            assert server.is_owed(now_ns)
+            assert server.is_heartbeat_due(now_ns)
             asks = server.hearing.silence
             _send(under_way, up, now_ns, server.said, asks, to_vehicle=True)
             server.said, server.sent_ns = server.said + 1, now_ns

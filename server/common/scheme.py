@@ -1,17 +1,19 @@
 """Interface of the schemes of delay compensation, and the predictions that they share.
 
-`server.schemes.committed` is "committed", `server.schemes.predictive` "predictive" and "none",
-`server.schemes.trajectory` "trajectory".
+`server.schemes.table` has the table of all; on a mission `server.missions.mission_planner` is one.
 """
 
+from abc import ABC, abstractmethod
 from collections import Counter
-from typing import Annotated, NamedTuple, Protocol
+from collections.abc import Callable, Iterator
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base.kernel import F2, F3, F4, I1, I2, S1, S3, kernel, record, records
-from skytether.shared.law.model import Flags, Indices
+from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
 
@@ -130,99 +132,77 @@ def foresight(
     )
 
 
-class Packing:
-    """Packs the horizons that are sent, of one block of vehicles after the other.
+class Head(NamedTuple):
+    """What the head of a packet to a vehicle says, whatever is in it."""
 
-    Args:
-        axes: number of axes.
-        most: largest number of inputs of a horizon on each axis.
-        planned: number of these that are planned, H; d more are committed.
+    vehicle: int
+    """Number of the vehicle."""
+    session: int
+    """Number of its session."""
+    sent_us: int
+    """Time of sending on the server's clock [µs]."""
+    number: int
+    """Number of the packet in the session."""
+    silence: int
+    """Longest silence that is asked of the vehicle [half steps]."""
+
+
+class Batch(NamedTuple):
+    """Vehicles that are decided on together, and which of them are sent a plan."""
+
+    rows: Indices
+    """The vehicles; shape (n,)."""
+    step: Indices
+    """Step k of each; shape (n,)."""
+    found: Foresight
+    """What is foreseen of them, and planned; these n come first."""
+    sent: Indices
+    """Indices, of these n, of those that are sent their plan."""
+
+
+class SentPlans(NamedTuple):
+    """Plans that are sent, for the record; shapes (m, …)."""
+
+    step: Indices
+    """Step that each is made for."""
+    begins: Indices
+    """Step of its first planned input."""
+    state: Array
+    """State there [m, m/s]; shape (m, axes, 2)."""
+    inputs: NDArray[np.floating]
+    """Planned inputs [m/s]; shape (m, axes, H)."""
+
+
+class Scheme(ABC):
+    """A scheme of delay compensation: what the server believes of its vehicles, plans and sends.
+
+    At each step and for each block of vehicles it is asked, in this order, to `foresee`, `plan`,
+    `remember`, and `encode`.
     """
-
-    def __init__(self, axes: int, most: int, planned: int) -> None:
-        self._width, self._planned = axes * most, planned
-        self._heads = np.empty((0, len(HEAD)), dtype=np.int64)
-        self._inputs = np.empty(0, dtype=np.float32)
-        self._told = self._inputs.data.cast("B")
-
-    def pack(
-        self, found: Foresight, sent: Indices, rows: Indices, step: Indices, observed: Indices
-    ) -> tuple[list[list[int]], memoryview]:
-        """Numbers in the columns of HEAD, and bytes of the horizons one after the other.
-
-        The bytes are valid until the next are packed.
-
-        Args:
-            found: has the horizons, of d + H inputs on each axis.
-            sent: which vehicles of the block, by index; shape (n,).
-            rows: the vehicles of the block.
-            step: k of each.
-            observed: step of the newest observation of each vehicle; shape (capacity,).
-        """
-        n = len(sent)
-        if n > len(self._heads):
-            self._heads = np.empty((n, len(HEAD)), dtype=np.int64)
-            self._inputs = np.empty(n * self._width, dtype=np.float32)
-            self._told = self._inputs.data.cast("B")
-        _pack(
-            found.horizons,
-            found.ahead,
-            sent,
-            rows,
-            step,
-            observed,
-            self._planned,
-            self._heads,
-            self._inputs,
-        )
-        return self._heads[:n].tolist(), self._told
-
-
-HEAD = ("index", "row", "step", "age", "ahead")
-"""Columns that `Packing` tells of a horizon: place of its vehicle in the block, and row; step k;
-age of the observation [steps]; delay bound d."""
-
-
-@kernel
-def _pack(
-    horizons: S3,
-    ahead: I1,
-    sent: I1,
-    rows: I1,
-    steps: I1,
-    observed: I1,
-    H: int,
-    heads: I2,
-    packed: S1,
-) -> None:
-    """Fill in what `Packing.pack` returns, as numbers; there is room for all there can be."""
-    at = 0
-    for n in range(len(sent)):
-        i = sent[n]
-        heads[n, 0], heads[n, 1], heads[n, 2] = i, rows[i], steps[i]
-        heads[n, 3], heads[n, 4] = steps[i] - observed[rows[i]], ahead[i]
-        for axis in range(horizons.shape[1]):
-            for stage in range(ahead[i] + H):
-                packed[at] = horizons[i, axis, stage]
-                at += 1
-
-
-class Scheme(Protocol):
-    """Counts of observations and of horizons sent, by what became of them."""
 
     observed_step: Indices
     """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
     counts: Counter[str]
     """Events that the scheme counted, by name."""
+    figures: Figures
+    """Costs of the newest plans; those of a block come first."""
+    planned: Array
+    """States that the newest plans begin with by the plans before [m, m/s]; shape (block, axes,
+    2)."""
+    solve_ns = -1
+    """Time that planning for the last block took [ns], or -1 where nobody measures it."""
 
+    @abstractmethod
     def forget(self, row: int) -> None:
         """Begin anew with a vehicle in this row."""
 
+    @abstractmethod
     def observe(self, row: int, observation: Observation) -> bool:
         """Keep an observation, unless a newer one is known (E11); whether it was kept."""
 
+    @abstractmethod
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in all but the horizons, for vehicles that were observed recently enough.
+        """Fill in all but the plans, for vehicles that were observed recently enough.
 
         Args:
             rows: the vehicles; shape (n,).
@@ -230,12 +210,67 @@ class Scheme(Protocol):
             found: what is filled in.
         """
 
+    @abstractmethod
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """Fill in the plans, `figures` and `planned`.
+
+        Args:
+            rows: the vehicles; shape (n,).
+            step: k of each; shape (n,).
+            found: what is foreseen of them; its horizons are filled in.
+        """
+
+    @abstractmethod
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """Take note of what was computed for the steps from k on, and which of it is sent.
 
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
-            found: what was foreseen, and the horizons.
-            event: which vehicles are sent theirs; shape (n,).
+            found: what was foreseen and planned.
+            event: which vehicles are sent their plan; shape (n,).
         """
+
+    @abstractmethod
+    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+        """Row and message of each vehicle that is sent its plan.
+
+        Args:
+            batch: the vehicles.
+            head: returns the head of the next packet to the vehicle in a row; called once for each.
+        """
+
+    @abstractmethod
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """Plans of the vehicles that are sent theirs, for the record."""
+
+    # -- what is asked of a mission ----------------------------------------------------------------
+
+    @property
+    def left_tube(self) -> list[tuple[int, float]]:
+        """Vehicles that have left their tube, and by how much [m]; to be emptied."""
+        return []
+
+    @property
+    def inside(self) -> list[tuple[int, str]]:
+        """Vehicles that were found at rest within a zone, and its name; to be emptied."""
+        return []
+
+    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most know of none
+        """Keep vehicles out of other zones from now on."""
+
+    def objection(self, zones: Zones) -> str:  # noqa: ARG002
+        """Why there cannot be these zones now, in words; empty: there can."""
+        return ""
+
+    def waits(self, row: int) -> str:  # noqa: ARG002
+        """Reason in words why a vehicle waits; empty if it does not."""
+        return ""
+
+    def clock_m(self, row: int) -> float | None:  # noqa: ARG002
+        """Distance by which a vehicle may be elsewhere for want of its clock [m]."""
+        return None
+
+    def restart(self, row: int) -> bool:  # noqa: ARG002
+        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        return False

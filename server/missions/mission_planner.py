@@ -26,13 +26,23 @@ who yields to whom.
 """
 
 import math
+from collections.abc import Callable, Iterator
 from functools import partial
 from operator import sub
 from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.scheme import FIGURES, Figures, Foresight
+from skytether.server.common.scheme import (
+    FIGURES,
+    Batch,
+    Figures,
+    Foresight,
+    Head,
+    Scheme,
+    SentPlans,
+)
+from skytether.server.common.splines import sent_splines, trajectories
 from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes
@@ -90,7 +100,7 @@ class DirectFlight(NamedTuple):
     """Shape (axes,) [m]."""
 
 
-class MissionPlanner:
+class MissionPlanner(Scheme):
     """The scheme "trajectory" for missions: motions that keep apart.
 
     Args:
@@ -100,15 +110,12 @@ class MissionPlanner:
         state: vehicles, and the motions that each may fly.
     """
 
-    solve_ns = -1
-
     def __init__(self, scenario: Scenario, terms: Terms, block: int, state: MissionState) -> None:
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         self.planned = np.zeros((block, terms.axes, 2))
-        self._state = state
-        self.counts, self.left_tube = state.counts, state.left_tube
-        self.inside: list[tuple[int, str]] = []
-        """Vehicles that were found at rest within a zone since this was emptied, and its name."""
+        self._state, self._terms = state, terms
+        self.counts = state.counts
+        self._inside: list[tuple[int, str]] = []
         self.observed_step = state.observed_step
         mission = scenario.mission
         clearances = self._clearances = scenario.clearances
@@ -136,6 +143,16 @@ class MissionPlanner:
         self._unconstrained = UnconstrainedPlanner(
             self._qp, state.possible, kept, clearances.apart_m, STUCK
         )
+
+    @property
+    def left_tube(self) -> list[tuple[int, float]]:
+        """See `Scheme`."""
+        return self._state.left_tube
+
+    @property
+    def inside(self) -> list[tuple[int, str]]:
+        """See `Scheme`."""
+        return self._inside
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
@@ -206,6 +223,14 @@ class MissionPlanner:
                 self._state.note_sent(int(rows[i]), k, motion)
 
     # -- zones -------------------------------------------------------------------------------------
+
+    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+        """See `Scheme`."""
+        return trajectories(batch, self.observed_step, head)
+
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """See `Scheme`."""
+        return sent_splines(batch, self._terms)
 
     def change_zones(self, zones: Zones) -> None:
         """Keep out of other zones from now on, to which `objection` has nothing to say."""
@@ -352,7 +377,7 @@ class MissionPlanner:
         if not vehicle.in_zone:
             vehicle.in_zone = True
             zone = self._zones.in_the_way(place[None], clearance_m)
-            self.inside.append((self._state.number_of(row), zone))
+            self._inside.append((self._state.number_of(row), zone))
         around = np.zeros((len(AROUND), len(place)))
         around[:, :2] = AROUND
         for far_m in np.arange(1, OUT_STEPS) * OUT_M:

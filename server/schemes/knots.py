@@ -1,16 +1,15 @@
-"""Knots of splines: as few as keep near to a trajectory, and the inputs that follow them."""
+"""Knots of splines: as few as keep near to a trajectory."""
 
 import numpy as np
 
-from skytether.server.common.compiled import Axes, axis_at, bounded
-from skytether.shared.base.kernel import F1, F3, I1, S2, kernel, part, shared
+from skytether.shared.base.kernel import F3, S2, part, shared
 from skytether.shared.law import spline
 from skytether.shared.wire.protocol import KNOTS_MAX
 
 INTERVALS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, KNOTS_MAX - 1])
 """Numbers of intervals between knots that are tried, fewest first."""
 
-spline_at, along = shared(spline.spline_at), shared(spline.along)
+spline_at = shared(spline.spline_at)
 
 
 @part
@@ -44,26 +43,3 @@ def fewest_knots(intended: F3, dt_s: float, error_m: float, knots: S2) -> tuple[
         if away <= error_m:
             break
     return count, spacing
-
-
-@kernel
-def inputs_along(
-    model: Axes, bounds: F1, dt_s: float, knots: F3, number: I1, spacing: I1, inputs: F3
-) -> None:
-    """Fill in the inputs ū along splines [m/s].
-
-    Args:
-        model: eq. (4).
-        bounds: u_max of each axis [m/s]; shape (axes,).
-        dt_s: length of a step [s].
-        knots: knots of each, as in `Splines` [m, m/s]; shape (n, axes, 2 KNOTS_MAX).
-        number: number of them; shape (n,).
-        spacing: steps from one to the next; shape (n,).
-        inputs: what is filled in; shape (n, axes, H).
-    """
-    for i in range(len(number)):
-        for axis in range(len(bounds)):
-            some = knots[i, axis, : 2 * number[i]]
-            for stage in range(inputs.shape[2]):
-                u = along(axis_at(model, axis), some, spacing[i], dt_s, stage)
-                inputs[i, axis, stage] = bounded(u, bounds[axis])

@@ -30,6 +30,7 @@ This is the scheme "trajectory", and stands in place of its planner.
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -37,7 +38,17 @@ from numpy.typing import NDArray
 
 from skytether.server.common.clock import ClockMap, Seen, half_trip_ns, shortest_ns
 from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import FIGURES, Figures, Foresight, Splines
+from skytether.server.common.scheme import (
+    FIGURES,
+    Batch,
+    Figures,
+    Foresight,
+    Head,
+    Scheme,
+    SentPlans,
+    Splines,
+)
+from skytether.server.common.splines import sent_splines, trajectories
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
 from skytether.server.schemes import delay_bound as delay
 from skytether.server.schemes.committed import LEARNED, LOSS, MARGIN
@@ -156,7 +167,7 @@ class Memory(NamedTuple):
     (capacity, ROOM, axes, 2 KNOTS_MAX)."""
 
 
-class Guidance:
+class Guidance(Scheme):
     """The `Scheme` "trajectory" for up to `capacity` vehicles, and what is sent to them.
 
     Args:
@@ -167,9 +178,6 @@ class Guidance:
         clock: knows half of the smallest round trip, which is a first guess at the delay bound.
         block: number of vehicles that are decided on at a time.
     """
-
-    solve_ns = -1
-    """See `server.mpc.hierarchical.Planner`: there is nothing to solve."""
 
     def __init__(
         self,
@@ -188,7 +196,7 @@ class Guidance:
         # the spline goes straight on: measured, such plans led up to 12 m away (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self.counts: Counter[str] = Counter()
-        self._desired, self._clock = desired, clock
+        self._desired, self._clock, self._terms = desired, clock, terms
         self._loop_gain = np.array(terms.gain)
         self._settings = Settings(
             dt_ns=terms.dt_ns,
@@ -279,6 +287,14 @@ class Guidance:
         """See `Scheme`; only what is sent is made, and counts."""
         bound, intended = self.delay_bound, self._intended
         _remember(self._settings, self._memory, bound, intended, rows, step, event, found.told)
+
+    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+        """See `Scheme`."""
+        return trajectories(batch, self.observed_step, head)
+
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """See `Scheme`."""
+        return sent_splines(batch, self._terms)
 
 
 @inline

@@ -52,7 +52,7 @@ class KnownArrays(NamedTuple):
     inputs, where they are not known."""
     sent_step: Indices
     """Step at which each vehicle was sent a horizon last, or -1; shape (capacity,)."""
-    owed: Flags
+    heartbeat_due: Flags
     """Whether each vehicle is sent a heartbeat at this step if nothing else; shape (capacity,)."""
     desired: Callable[[Indices, Indices, Indices], Array]
     """Desired states of some rows, at their steps k, from k+d on; see `Situation.desired`."""
@@ -114,9 +114,9 @@ class Situation(NamedTuple):
         return since
 
     @property
-    def owed(self) -> Flags:
+    def heartbeat_due(self) -> Flags:
         """Whether a heartbeat is due, which a horizon would take the place of; shape (n,)."""
-        return self.known.owed[self.rows]
+        return self.known.heartbeat_due[self.rows]
 
     @property
     def model(self) -> Model:
@@ -254,7 +254,7 @@ def always(situation: Situation) -> Verdict:
 @trigger
 def heartbeat(situation: Situation) -> Flags:
     """Sends where a heartbeat is due, in its place: as many packets, and each says something."""
-    return situation.owed
+    return situation.heartbeat_due
 
 
 @trigger(name="periodic")

@@ -39,8 +39,8 @@ from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
 from skytether.server.common.clock import BUCKET_NS, BUCKETS, RECENT
 from skytether.server.endpoint import Server
-from skytether.server.mpc.hierarchical import Planner
 from skytether.server.mpc.solver import Solver
+from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
@@ -433,9 +433,10 @@ class Torture:
 
     def set_solver(self, share: float, *, failing: bool) -> None:
         """Let a share of the solves of the server's present life fail, or none."""
-        planner = self._server.controller.planner
-        if not isinstance(planner, Planner):  # trajectories need no solver
+        scheme = self._server.controller.scheme
+        if not isinstance(scheme, HorizonScheme):  # trajectories need no solver
             return
+        planner = scheme.planner
         solvers = [getattr(solver, "inner", solver) for solver in planner.solvers]
         if failing:
             rng = self._chance

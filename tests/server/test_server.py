@@ -684,7 +684,8 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
     bad = vehicles.open(vehicle=2, sender=("v", 2))
     vehicles.observe(good, 0, sender=("v", 1))
     vehicles.observe(bad, 0, sender=("v", 2))
-    vehicles.server.controller._scheme._memory.state[1, 0] = 1e308  # no float32 is as large
+    known = vehicles.server.controller.scheme.predictor._memory
+    known.state[1, 0] = 1e308  # no float32 is as large
     with np.errstate(all="ignore"):
         sent = vehicles.tick()
     assert [peer for _, peer in sent] == [("v", 1)]

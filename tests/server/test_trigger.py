@@ -64,7 +64,7 @@ KNOWN = KnownArrays(
     horizons=np.arange(20, dtype=np.float32).reshape(2, 2, 5),
     held=np.arange(12.0).reshape(2, 2, 3),
     sent_step=np.array([40, -1]),
-    owed=np.array([False, True]),
+    heartbeat_due=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
 )
 """Known state of two vehicles at most."""

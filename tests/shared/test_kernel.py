@@ -266,7 +266,7 @@ def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies() -> N
     assert done.stdout.splitlines() == [f"{name} 0" for name in names]
 
 
-ALWAYS = {"clock", "controller", "desired", "plausibility", "scheme"}
+ALWAYS = {"clock", "controller", "desired", "plausibility"}
 """Modules of the server whose kernels are called with every scheme."""
 
 
