@@ -19,45 +19,36 @@ how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed i
 is committed are the inputs that this comes to if nothing else happens, along x̄ from x̂(k): as K is
 always the same, it makes no difference when the next horizon replaces the one before.
 
-What was observed and sent is kept by `schemes.sent_horizons`, and flown again along a course by
-`schemes.replay`; `schemes.loss_scenarios` tells what follows if horizons in flight are lost.
+What was sent is followed by `schemes.sent`, kept by `schemes.sent_horizons`, and flown again along
+a course by `schemes.replay`; `schemes.loss_scenarios` tells what follows if horizons in flight are
+lost.
 """
 
 from collections import Counter
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap, Seen, half_trip_ns, shortest_ns
+from skytether.server.common.clock import ClockMap, Seen
 from skytether.server.common.compiled import lasting, laws_of
 from skytether.server.common.scheme import Foresight
-from skytether.server.schemes import delay_bound as delay
-from skytether.server.schemes.delay_bound import (
-    DelayBound,
-    acknowledge,
-    at_least,
-    begin,
-    delay_bound,
-)
+from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance
 from skytether.server.schemes.loss_scenarios import doubt
 from skytether.server.schemes.observer import decay_of
 from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
+from skytether.server.schemes.sent import HOVERS, first_under_way, judge, nothing_sent, number_of
 from skytether.server.schemes.sent_horizons import (
     AXIS_STATE,
-    HOVERS,
-    LATEST,
     LEAD,
+    OBSERVATIONS,
     SENT_HORIZON,
     ReplayMemory,
     ReplaySettings,
-    first_after,
-    first_under_way,
     keep,
-    number_of,
     remember,
     speed_of,
 )
-from skytether.shared.base.kernel import I1, kernel, part
+from skytether.shared.base.kernel import I1, kernel
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
@@ -71,12 +62,6 @@ from skytether.shared.wire.protocol import (
     Observation,
     committed_max,
 )
-
-MARGIN = 2
-"""Steps on top of half a round trip, until a horizon has been acknowledged."""
-LOSS, LEARNED = 0.1, 0.05
-"""Share of lost horizons that is assumed at first, and by how much of itself each horizon that has
-come into force, or is lost, moves it."""
 
 
 class Replay:
@@ -105,37 +90,32 @@ class Replay:
             feeds_back=terms.feedback,
         )
         # One horizon a step at most, and none is flown for longer than `age_max`.
-        room = terms.age_max + H
+        ring = terms.age_max + H
         self._memory = ReplayMemory(
-            observed=np.zeros(capacity, dtype=np.int64),
-            seen=np.zeros(capacity, dtype=LATEST),
+            sent=nothing_sent(capacity, ring, terms, control),
+            seen=np.zeros(capacity, dtype=OBSERVATIONS),
             state=np.zeros((capacity, axes), dtype=AXIS_STATE),
-            sent=np.zeros((capacity, room), dtype=SENT_HORIZON),
-            inputs=np.zeros((capacity, room, axes, most + H), dtype=np.float32),
-            led=np.zeros((capacity, room, axes), dtype=LEAD),
+            horizons=np.zeros((capacity, ring), dtype=SENT_HORIZON),
+            inputs=np.zeros((capacity, ring, axes, most + H), dtype=np.float32),
+            led=np.zeros((capacity, ring, axes), dtype=LEAD),
         )
         # From the oldest observation that counts to the end of a plan that is made from it.
         longest = terms.age_max + most + H + 1
         self._course = HorizonsInForce(
-            np.empty(room + 2, dtype=np.int64), np.empty(room + 2, dtype=np.int64)
+            np.empty(ring + 2, dtype=np.int64), np.empty(ring + 2, dtype=np.int64)
         )
         self._track = FlownTrack(np.empty(longest), np.empty((longest, 2)))
-        given = control.delay_bound
-        fixed_s = None if given == "auto" else given
-        self.delay_bound = delay_bound(capacity, terms.dt_s, most, fixed_s)
         self._clock = clock
-        self.observed_step: Indices = self._memory.observed
+        self.observed_step: Indices = self._memory.sent.observed
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         for row in range(capacity):
             self.forget(row)
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
-        memory = self._memory
-        memory.observed[row] = -1
-        memory.seen[row] = (NO_HORIZON, 0, -1, NO_HORIZON, NO_HORIZON, 0, 0, 1, 1, LOSS)
-        memory.state["w"][row] = 0.0
-        delay.forget(self.delay_bound, row)
+        tracker.forget(self._memory.sent, row)
+        self._memory.seen[row] = (-1, NO_HORIZON, 1, 1)
+        self._memory.state["w"][row] = 0.0
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
@@ -156,7 +136,6 @@ class Replay:
         lost = _foresee(
             self._settings,
             self._memory,
-            self.delay_bound,
             self._clock.seen,
             self._course,
             self._track,
@@ -172,38 +151,10 @@ class Replay:
         remember(self._settings, self._memory, rows, step, found, event)
 
 
-@part
-def _listen(
-    settings: ReplaySettings, memory: ReplayMemory, bound: DelayBound, clock: Seen, row: int, k: int
-) -> None:
-    """Take what the newest observation says of the delay of horizons.
-
-    A bound so large that no plan could be flown is forgotten: nothing would be sent, and nothing
-    that was sent could show that the delay is smaller by now.
-    """
-    seen, room = memory.seen[row], memory.sent.shape[1]
-    age = k - memory.observed[row]
-    if bound.steps[row] > age and age + bound.steps[row] > settings.age_max:
-        bound.steps[row], bound.seen[row] = 0, 0
-    # No sample yet: half a round trip, rounded up, and a margin.
-    if bound.steps[row] == 0:
-        begin(bound, row, -(-half_trip_ns(clock, row) // settings.dt_ns) + MARGIN)
-    at_least(bound, row, -(-shortest_ns(clock, row) // settings.dt_ns))
-    if seen.in_force == seen.acknowledged or seen.sent == 0:
-        return
-    memory.seen[row].loss -= LEARNED * seen.loss
-    oldest = max(seen.sent - room, 0)
-    # One that is older than all in the ring was sent too long ago to be a sample.
-    if memory.sent[row, oldest % room].step <= seen.in_force:
-        acknowledge(bound, row, seen.since - seen.in_force)
-    memory.seen[row].acknowledged = seen.in_force
-
-
 @kernel
 def _foresee(
     settings: ReplaySettings,
     memory: ReplayMemory,
-    bound: DelayBound,
     clock: Seen,
     course: HorizonsInForce,
     track: FlownTrack,
@@ -215,33 +166,26 @@ def _foresee(
 
     Both `course` and `track` are scratch.
     """
-    axes, H, room = len(settings.laws), settings.H, memory.sent.shape[1]
-    lost = 0
+    axes, H, sent, lost = len(settings.laws), settings.H, memory.sent, 0
     for i in range(len(rows)):
-        row, k = rows[i], steps[i]
-        _listen(settings, memory, bound, clock, row, k)
-        d = bound.steps[row]
+        row, k, bound = rows[i], steps[i], sent.bound.steps
+        heard, observed = sent.heard[row], sent.observed[row]
+        age = k - observed
+        assert age <= settings.age_max  # the controller's promise; the track has no more room
+        # A bound so large that no plan could be flown is forgotten: nothing would be sent, and
+        # nothing that was sent could show that the delay is smaller by now.
+        if bound[row] > age and age + bound[row] > settings.age_max:
+            bound[row], sent.bound.seen[row] = 0, 0
+        lost += judge(sent, clock, row)
+        d = bound[row]
         if settings.decay < 1.0:
-            trip = k + d - memory.observed[row]
-            observe_disturbance(settings, memory, row, trip, course, track)
-        seen, observed = memory.seen[row], memory.observed[row]
-        assert (
-            k - observed <= settings.age_max
-        )  # the controller's promise; the track has no more room
-        # Those that were due and are not in force have been overtaken, or are lost.
-        first = first_under_way(memory, row, seen.in_force, observed)
-        for number in range(first_after(memory, row, seen.in_force), first):
-            # A lost horizon stays in the ring, and is counted once.
-            newly = memory.sent[row, number % room].due > seen.judged
-            lost += newly
-            if newly:
-                memory.seen[row].loss += LEARNED * (1.0 - memory.seen[row].loss)
-        memory.seen[row].judged = observed
+            observe_disturbance(settings, memory, row, age + d, course, track)
         # A vehicle that takes no horizons stands still, whatever is under way to it.
         flying, under_way = HOVERS, range(0)
-        if seen.takes == 1:
-            flying, under_way = number_of(memory, row, seen.in_force), range(first, seen.sent)
-        legs = chart(course, memory, row, observed, flying, under_way)
+        if memory.seen[row].takes == 1:
+            flying = number_of(sent, row, heard.in_force)
+            under_way = range(first_under_way(sent, row, heard.in_force, observed), heard.sent)
+        legs = chart(course, sent, row, observed, flying, under_way)
         found.ahead[i], speed = d, speed_of(memory.state[row].u)
         found.flown[i] = max(0, lasting(d + H, k, observed, settings.age_max) - d)
         for axis in range(axes):

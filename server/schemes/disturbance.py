@@ -9,14 +9,8 @@ that a filter aboard has left.
 
 from skytether.server.schemes.observer import learned
 from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
-from skytether.server.schemes.sent_horizons import (
-    UNKNOWN,
-    ReplayMemory,
-    ReplaySettings,
-    first_under_way,
-    number_of,
-    speed_of,
-)
+from skytether.server.schemes.sent import UNKNOWN, first_under_way, number_of
+from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings, speed_of
 from skytether.shared.base.kernel import part
 
 FOLLOW_S = 0.25
@@ -37,14 +31,13 @@ def observe_disturbance(
     Args:
         trip: steps from that to where planning starts; a long trip makes it slower.
     """
-    seen = memory.seen[row]
-    begin, end = seen.base_step, memory.observed[row]
+    seen, sent = memory.seen[row], memory.sent
+    heard = sent.heard[row]
+    begin, end = seen.base_step, sent.observed[row]
     if end == begin:
         return
-    before, after = (
-        number_of(memory, row, seen.base_in_force),
-        number_of(memory, row, seen.in_force),
-    )
+    before = number_of(sent, row, seen.base_in_force)
+    after = number_of(sent, row, heard.in_force)
     # A vehicle that takes no horizon brakes by its failsafe: what it does then says nothing of
     # wind.
     by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
@@ -52,15 +45,15 @@ def observe_disturbance(
     follows = by_rule and begin >= 0 and end - begin <= settings.age_max
     m, legs, speed = end - begin, 0, speed_of(memory.state[row].base_u)
     if follows:
-        first = first_under_way(memory, row, seen.base_in_force, begin)
-        legs = chart(course, memory, row, begin, before, range(first, after))
+        first = first_under_way(sent, row, seen.base_in_force, begin)
+        legs = chart(course, sent, row, begin, before, range(first, after))
         # What came into force, and when, is known.
-        while legs > 1 and course.begins[legs - 1] >= seen.since:
+        while legs > 1 and course.begins[legs - 1] >= heard.since:
             legs -= 1
-        if seen.since <= begin:
+        if heard.since <= begin:
             course.numbers[0] = after
-        elif seen.since < end:
-            course.begins[legs], course.numbers[legs] = seen.since, after
+        elif heard.since < end:
+            course.begins[legs], course.numbers[legs] = heard.since, after
             legs += 1
     for axis in range(len(settings.laws)):
         state, law, lag = memory.state[row, axis], settings.laws[axis], 0.0
@@ -82,5 +75,5 @@ def observe_disturbance(
             lag = left * off
         memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v - lag
         memory.state[row, axis].base_u = state.u
-    memory.seen[row].base_step, memory.seen[row].base_in_force = end, seen.in_force
+    memory.seen[row].base_step, memory.seen[row].base_in_force = end, heard.in_force
     memory.seen[row].base_takes = seen.takes

@@ -29,8 +29,8 @@ def doubt(
         flying: number of the horizon in force at its newest observation.
         under_way: numbers of those in flight.
     """
-    observed, share, speed = memory.observed[row], 1.0, speed_of(memory.state[row].u)
-    then, loss = k + found.ahead[i] - observed, memory.seen[row].loss
+    observed, share, speed = memory.sent.observed[row], 1.0, speed_of(memory.state[row].u)
+    then, loss = k + found.ahead[i] - observed, memory.sent.heard[row].loss
     for j in range(found.doubt.shape[1]):
         found.doubt[i, j] = 0.0
         left = len(under_way) - j - 1
@@ -41,7 +41,7 @@ def doubt(
         last = left == 0 or j + 1 == found.doubt.shape[1]
         found.doubt[i, j] = share if last else share * (1.0 - loss)
         some = range(under_way.start, under_way.start + left)
-        legs = chart(course, memory, row, observed, flying, some)
+        legs = chart(course, memory.sent, row, observed, flying, some)
         for axis in range(len(settings.laws)):
             state = memory.state[row, axis]
             x = (state.p, state.v, state.u, speed)

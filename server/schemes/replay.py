@@ -10,7 +10,8 @@ disturbance observer replays what was flown, and doubt asks what follows from a 
 from typing import NamedTuple
 
 from skytether.server.common.compiled import advance, axis_of, lead_to, step
-from skytether.server.schemes.sent_horizons import HOVERS, ReplayMemory, ReplaySettings
+from skytether.server.schemes.sent import HOVERS, Sent
+from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings
 from skytether.shared.base.kernel import F1, F2, I1, inline, part
 from skytether.shared.law.rule import Held
 
@@ -36,7 +37,7 @@ class FlownTrack(NamedTuple):
 @part
 def chart(
     course: HorizonsInForce,
-    memory: ReplayMemory,
+    sent: Sent,
     row: int,
     begin: int,
     flown: int,
@@ -47,10 +48,10 @@ def chart(
     Args:
         following: numbers of horizons, each in force when it is due.
     """
-    room, legs = memory.sent.shape[1], 1
+    ring, legs = sent.plans.shape[1], 1
     course.begins[0], course.numbers[0] = begin, flown
     for number in following:
-        due = memory.sent[row, number % room].due
+        due = sent.plans[row, number % ring].due
         # In force already when the course begins: the newest such horizon counts.
         if due <= begin:
             course.numbers[0] = number
@@ -78,7 +79,7 @@ def roll(
         x: position [m] and velocity [m/s] at the begin, the input flown from there on [m/s], and
             the magnitude of that over all axes [m/s].
     """
-    law, room, begin = settings.laws[axis], memory.sent.shape[1], course.begins[0]
+    law, begin = settings.laws[axis], course.begins[0]
     model, bound, w = axis_of(law), law.bound, memory.state[row, axis].w
     gain_p, gain_v = law.gain_p, law.gain_v
     p, v, told_first, speed_told = x
@@ -96,9 +97,9 @@ def roll(
             )
             p, v = _fly(stands, begin, 0.0, 0.0, p, v, w, first, last, begin, told_first, track)
             continue
-        slot = number % room
-        horizon, led = memory.sent[row, slot], memory.led[row, slot, axis]
-        made_for, led_p, led_v = horizon.step, led.p, led.v
+        slot = number % memory.sent.plans.shape[1]
+        horizon, led = memory.horizons[row, slot], memory.led[row, slot, axis]
+        made_for, led_p, led_v = memory.sent.plans[row, slot].step, led.p, led.v
         held = Held(
             model,
             memory.inputs[row, slot, axis],

@@ -36,7 +36,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.clock import ClockMap, Seen, half_trip_ns, shortest_ns
+from skytether.server.common.clock import ClockMap, Seen
 from skytether.server.common.desired import Desired, Window
 from skytether.server.common.scheme import (
     FIGURES,
@@ -50,10 +50,17 @@ from skytether.server.common.scheme import (
 )
 from skytether.server.common.splines import sent_splines, trajectories
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
-from skytether.server.schemes import delay_bound as delay
-from skytether.server.schemes.committed import LEARNED, LOSS, MARGIN
-from skytether.server.schemes.delay_bound import SAMPLES, DelayBound, acknowledge, at_least, begin
+from skytether.server.schemes import sent as tracker
+from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
 from skytether.server.schemes.knots import fewest_knots, spline_at
+from skytether.server.schemes.sent import (
+    Sent,
+    first_under_way,
+    judge,
+    note,
+    nothing_sent,
+    number_of,
+)
 from skytether.shared.base.kernel import (
     B1,
     F1,
@@ -72,7 +79,7 @@ from skytether.shared.law import spline
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
-from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
+from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
 
 ROOM = 64
 """Number of trajectories that are remembered of each vehicle: the newest that were sent."""
@@ -91,32 +98,9 @@ follow = shared(spline.follow)
 """The rule of flight along a spline, compiled for kernels."""
 
 
-class Followed:
-    """Record: what is known of one vehicle."""
-
-    in_force: int
-    """Step that the trajectory in force at its newest observation was made for, or NO_HORIZON."""
-    since: int
-    """First step flown with it."""
-    acknowledged: int
-    """Step that the trajectory last seen to have come into force was made for, or NO_HORIZON."""
-    judged: int
-    """Step up to which trajectories were seen in force, lost or overtaken."""
-    sent: int
-    """Number of trajectories sent so far."""
-    first: int
-    """Number of the first that may be held: those before were dropped aboard."""
-    loss: float
-    """Share of trajectories that were lost lately, ℓ."""
-
-
 class SentTrajectory:
-    """Record: a trajectory that was sent."""
+    """Record: how a trajectory that was sent is flown."""
 
-    step: int
-    """Step k of its first knot."""
-    due: int
-    """Step at which it is in force, or lost."""
     ends: int
     """Step after the last at which it is flown."""
     spacing: int
@@ -125,14 +109,12 @@ class SentTrajectory:
     """Number of its knots."""
 
 
-VEHICLE, SENT = record(Followed), record(SentTrajectory)
+TRAJECTORY = record(SentTrajectory)
 
 
 class Settings(NamedTuple):
     """Constants shared by all vehicles."""
 
-    dt_ns: int
-    """Length of a step [ns]."""
     dt_s: float
     """Length of a step [s]."""
     age_max: int
@@ -152,16 +134,14 @@ class Settings(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State of every vehicle, and the horizons sent to it."""
+    """State of every vehicle, and the trajectories sent to it."""
 
-    observed: I1
-    """Step of the newest observation, or -1; shape (capacity,)."""
-    vehicles: Annotated[NDArray[np.void], records(VEHICLE, 1)]
-    """Shape (capacity,)."""
+    sent: Sent
+    """Which trajectories are in force, in flight or lost."""
     state: F3
     """State in the newest observation [m, m/s]; shape (capacity, axes, 2)."""
-    sent: Annotated[NDArray[np.void], records(SENT, 2)]
-    """Trajectories that were sent, a ring; shape (capacity, ROOM)."""
+    trajectories: Annotated[NDArray[np.void], records(TRAJECTORY, 2)]
+    """Trajectories in the ring; shape (capacity, ROOM)."""
     knots: F4
     """Knots of these trajectories as they are read aboard [m, m/s]; shape
     (capacity, ROOM, axes, 2 KNOTS_MAX)."""
@@ -189,7 +169,7 @@ class Guidance(Scheme):
         capacity: int,
         block: int,
     ) -> None:
-        axes, given = terms.axes, control.delay_bound
+        axes = terms.axes
         # TINY: weights that ask for no gain on position would divide by 0.
         lead_s = (1.0 + regulator[:, 1]) / np.maximum(regulator[:, 0], TINY)
         # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
@@ -199,7 +179,6 @@ class Guidance(Scheme):
         self._desired, self._clock, self._terms = desired, clock, terms
         self._loop_gain = np.array(terms.gain)
         self._settings = Settings(
-            dt_ns=terms.dt_ns,
             dt_s=terms.dt_s,
             age_max=terms.age_max,
             seen=desired.seen,
@@ -210,15 +189,12 @@ class Guidance(Scheme):
             plans=bool(plans),
         )
         self._memory = Memory(
-            observed=np.full(capacity, -1, dtype=np.int64),
-            vehicles=np.zeros(capacity, dtype=VEHICLE),
+            sent=nothing_sent(capacity, ROOM, terms, control),
             state=np.zeros((capacity, axes, 2)),
-            sent=np.zeros((capacity, ROOM), dtype=SENT),
+            trajectories=np.zeros((capacity, ROOM), dtype=TRAJECTORY),
             knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
         )
-        fixed_s = None if given == "auto" else given
-        self.delay_bound = delay.delay_bound(capacity, terms.dt_s, committed_max(terms), fixed_s)
-        self.observed_step: Indices = self._memory.observed
+        self.observed_step: Indices = self._memory.sent.observed
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
         """Costs of flying on; those of a block come first."""
@@ -228,26 +204,22 @@ class Guidance(Scheme):
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
         """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
         2)."""
-        for row in range(capacity):
-            self.forget(row)
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
-        self._memory.observed[row] = -1
-        self._memory.vehicles[row] = (NO_HORIZON, 0, NO_HORIZON, -1, 0, 0, LOSS)
-        delay.forget(self.delay_bound, row)
+        tracker.forget(self._memory.sent, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`; a vehicle that takes nothing holds nothing either."""
-        known = self._memory.vehicles[row]
+        heard = self._memory.sent.heard[row]
         if observation.step <= self.observed_step[row]:
             return False
         self.observed_step[row] = observation.step
-        known["in_force"], known["since"] = observation.in_force, observation.since
+        heard["in_force"], heard["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
         # A vehicle that takes none has dropped what it held, and drops what is under way.
         if not observation.takes:
-            known["first"], known["in_force"] = known["sent"], NO_HORIZON
+            heard["first"], heard["in_force"] = heard["sent"], NO_HORIZON
         return True
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
@@ -266,7 +238,6 @@ class Guidance(Scheme):
         lost, unsolved = _appraise(
             self._settings,
             self._memory,
-            self.delay_bound,
             self._clock.seen,
             self._nominal,
             self._desired.window(rows, step, found.ahead),
@@ -285,8 +256,8 @@ class Guidance(Scheme):
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; only what is sent is made, and counts."""
-        bound, intended = self.delay_bound, self._intended
-        _remember(self._settings, self._memory, bound, intended, rows, step, event, found.told)
+        intended = self._intended
+        _remember(self._settings, self._memory, intended, rows, step, event, found.told)
 
     def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
@@ -322,42 +293,10 @@ def _followed(
     if number < 0:
         return memory.state[row, axis, 0], 0.0
     slot = number % ROOM
-    sent = memory.sent[row, slot]
-    knots = memory.knots[row, slot, axis, : 2 * sent.count]
-    return spline_at(knots, sent.spacing, settings.dt_s, step - sent.step)
-
-
-@part
-def _listen(
-    settings: Settings, memory: Memory, bound: DelayBound, clock: Seen, row: int
-) -> tuple[int, int]:
-    """Take what the newest observation says of delays and losses.
-
-    Returns:
-        number of the trajectory in force there, or -1 where that is none, or unknown; and how many
-        are newly known to be lost.
-    """
-    dt_ns, known, observed = settings.dt_ns, memory.vehicles[row], memory.observed[row]
-    if bound.steps[row] == 0:
-        begin(bound, row, -(-half_trip_ns(clock, row) // dt_ns) + MARGIN)
-    at_least(bound, row, -(-shortest_ns(clock, row) // dt_ns))
-    oldest = max(known.first, known.sent - ROOM)
-    flown, lost = -1, 0
-    for number in range(known.sent - 1, oldest - 1, -1):
-        sent = memory.sent[row, number % ROOM]
-        if sent.step == known.in_force:
-            flown = number
-        if sent.step <= known.in_force:
-            break
-        if known.judged < sent.due <= observed:
-            lost += 1
-            memory.vehicles[row].loss += LEARNED * (1.0 - memory.vehicles[row].loss)
-    memory.vehicles[row].judged = observed
-    if flown >= 0 and known.in_force != known.acknowledged:
-        memory.vehicles[row].loss -= LEARNED * memory.vehicles[row].loss
-        acknowledge(bound, row, known.since - known.in_force)
-        memory.vehicles[row].acknowledged = known.in_force
-    return flown, lost
+    trajectory = memory.trajectories[row, slot]
+    knots = memory.knots[row, slot, axis, : 2 * trajectory.count]
+    since = step - memory.sent.plans[row, slot].step
+    return spline_at(knots, trajectory.spacing, settings.dt_s, since)
 
 
 @part
@@ -427,7 +366,6 @@ def _intend(
 def _appraise(
     settings: Settings,
     memory: Memory,
-    bound: DelayBound,
     clock: Seen,
     nominal: Nominal,
     window: Window,
@@ -442,20 +380,18 @@ def _appraise(
     Returns:
         how many trajectories are newly known to be lost, and how many plans were not found.
     """
-    lost, unsolved, axes = 0, 0, len(settings.bounds)
+    sent, lost, unsolved, axes = memory.sent, 0, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
-        flown, newly = _listen(settings, memory, bound, clock, row)
-        lost += newly
-        known, d, observed = memory.vehicles[row], bound.steps[row], memory.observed[row]
+        lost += judge(sent, clock, row)
+        heard, d, observed = sent.heard[row], sent.bound.steps[row], sent.observed[row]
+        flown = number_of(sent, row, heard.in_force)
         newest, ends, held = flown, -1, np.inf
         if flown >= 0:
-            held = ends = memory.sent[row, flown % ROOM].ends
-        oldest = max(known.first, known.sent - ROOM, flown + 1)
-        for number in range(oldest, known.sent):
-            sent = memory.sent[row, number % ROOM]
-            if sent.step > known.in_force and sent.due > observed:
-                newest, ends = number, max(ends, sent.ends)
+            held = ends = memory.trajectories[row, flown % ROOM].ends
+        first_in_flight = first_under_way(sent, row, heard.in_force, observed)
+        for number in range(first_in_flight, heard.sent):
+            newest, ends = number, max(ends, memory.trajectories[row, number % ROOM].ends)
         # Only if the new one would be young enough: otherwise one would be sent at each step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         for axis in range(axes):
@@ -464,16 +400,16 @@ def _appraise(
                 p, v = _followed(settings, memory, row, newest, axis, k)
             intended[i, axis, 0, 0], intended[i, axis, 0, 1] = p, v
             planned[i, axis, 0], planned[i, axis, 1] = p, v
-        place, first = window.place[i], window.first[i]
-        desired = window.states[place, :axes, first:]
+        place = window.place[i]
+        desired = window.states[place, :axes, window.first[i] :]
         if not _intend(settings, nominal, row, k, desired, intended[i]):
             unsolved += 1
         share, expected = 1.0, 0.0
-        for number in range(newest, flown, -1):
-            sent = memory.sent[row, number % ROOM]
-            if number < oldest or sent.due <= observed or share <= SURE:
+        for number in range(heard.sent - 1, first_in_flight - 1, -1):
+            if share <= SURE:
                 break
-            comes = _arrives(bound, row, known.loss, observed - sent.step)
+            since = observed - sent.plans[row, number % ROOM].step
+            comes = _arrives(sent.bound, row, heard.loss, since)
             gap, _ = _gap(settings, memory, intended[i], row, number, k, d)
             expected += share * comes * gap
             share *= 1.0 - comes
@@ -496,7 +432,6 @@ def _appraise(
 def _remember(
     settings: Settings,
     memory: Memory,
-    bound: DelayBound,
     intended: F4,
     rows: I1,
     steps: I1,
@@ -510,12 +445,10 @@ def _remember(
         row, dt_s = rows[i], settings.dt_s
         count, spacing = fewest_knots(intended[i], dt_s, settings.error_m, told.knots[i])
         told.number[i], told.spacing[i] = count, spacing
-        slot = memory.vehicles[row].sent % ROOM
-        memory.vehicles[row].sent += 1
-        sent = memory.sent[row, slot]
-        sent.step, sent.due = steps[i], steps[i] + bound.steps[row]
-        sent.ends = memory.observed[row] + settings.age_max + 1
-        sent.spacing, sent.count = spacing, count
+        slot = note(memory.sent, row, steps[i], memory.sent.bound.steps[row])
+        trajectory = memory.trajectories[row, slot]
+        trajectory.ends = memory.sent.observed[row] + settings.age_max + 1
+        trajectory.spacing, trajectory.count = spacing, count
         for axis in range(len(settings.bounds)):
             for number in range(2 * count):
                 memory.knots[row, slot, axis, number] = told.knots[i, axis, number]

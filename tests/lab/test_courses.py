@@ -100,15 +100,15 @@ def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple
     """Server's memory of the newest message: numbers, feedback, and steps between knots."""
     memory = scheme._memory
     if isinstance(scheme, Guidance):
-        slot = (memory.vehicles["sent"][row] - 1) % trajectory.ROOM
-        count = memory.sent["count"][row, slot]
+        slot = (memory.sent.heard["sent"][row] - 1) % trajectory.ROOM
+        count = memory.trajectories["count"][row, slot]
         knots = memory.knots[row, slot, :, : 2 * count]
         return (
             knots.reshape(len(knots), count, 2).copy(),
             np.zeros(0),
-            memory.sent["spacing"][row, slot],
+            memory.trajectories["spacing"][row, slot],
         )
-    slot = memory.sent["step"][row].argmax()
+    slot = memory.sent.plans["step"][row].argmax()
     return memory.inputs[row, slot].copy(), found.feedback[i].astype(float), 0
 
 

@@ -10,7 +10,8 @@ from skytether.client.compensator import Compensator
 from skytether.server.common.clock import ClockMap
 from skytether.server.common.scheme import Foresight, foresight
 from skytether.server.mpc.hierarchical import Planner
-from skytether.server.schemes.committed import LEARNED, Replay
+from skytether.server.schemes.committed import Replay
+from skytether.server.schemes.sent import LEARNED
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.gain import feedback_gain
@@ -79,8 +80,9 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
     """Input flown at a step with a horizon that was sent; zero without one, or with another's."""
     memory, brake = replay._memory, replay._settings.brake
     bounds = replay._settings.laws["bound"].tolist()
-    for slot in range(min(int(memory.seen["sent"][0]), memory.sent.shape[1])):
-        made_for, _, length, speed = memory.sent[0, slot].tolist()
+    plans = memory.sent.plans["step"][0].tolist()
+    for slot, made_for in enumerate(plans[: int(memory.sent.heard["sent"][0])]):
+        length, speed = memory.horizons[0, slot].tolist()
         if made_for == in_force:
             stage = step - made_for
             inputs = memory.inputs[0, slot, :, rule.entry(stage, length)].tolist()
@@ -147,7 +149,7 @@ def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int)
         see(replay, 103, np.array([[1.0, 0.2], [-1.0, 0.1]]), 100)
         for number, inputs in enumerate(given[1 : count + 1]):
             send(replay, 103 + number, inputs)
-        replay._memory.seen["loss"] = loss / (1.0 - LEARNED)  # one has come since
+        replay._memory.sent.heard["loss"] = loss / (1.0 - LEARNED)  # one has come since
         found = foresight(1, 2, H, MOST, doubts=3)
         replay.foresee(ROW, np.array([110]), found)
         return found

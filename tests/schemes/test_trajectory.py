@@ -23,6 +23,7 @@ from skytether.server.common.scheme import Foresight, foresight
 from skytether.server.mpc.nominal import make_nominal, plan_nominal
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.knots import fewest_knots
+from skytether.server.schemes.sent import LOSS
 from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain
@@ -279,7 +280,7 @@ class Server:
     @property
     def d(self) -> int:
         """The delay bound [steps]."""
-        return int(self.scheme.delay_bound.steps[0])
+        return int(self.scheme._memory.sent.bound.steps[0])
 
 
 def known(flown: Scenario, server: Server, off_m: float, off_mps: float) -> float:
@@ -322,7 +323,7 @@ def test_gap_is_the_mean_over_what_may_be_followed() -> None:
     assert not held["fresh"]
     assert held["cost_gap"] == pytest.approx(0.0, abs=1e-9)
     hovering = known(flown, server, 0.1, 1.0)
-    assert held["expected_gap"] == pytest.approx(trajectory.LOSS * hovering, rel=1e-6)
+    assert held["expected_gap"] == pytest.approx(LOSS * hovering, rel=1e-6)
 
 
 def test_gap_of_what_is_in_force_is_certain() -> None:
@@ -369,8 +370,8 @@ def test_the_longer_an_observation_knows_nothing_of_it_the_less_likely_it_comes(
         server.observe(made + 1 + delay, in_force=made + 1, since=made + 1 + delay)
         made += 1 + delay
     server.at(made + 1)
-    loss = float(server.scheme._memory.vehicles["loss"][0])
-    bound = server.scheme.delay_bound
+    loss = float(server.scheme._memory.sent.heard["loss"][0])
+    bound = server.scheme._memory.sent.bound
     for since, later in ((0, 4), (1, 4), (2, 2), (4, 1), (8, 0)):
         share = (1.0 - loss) * ((later + 1) / 5 if since else 1.0)
         found = trajectory._arrives(bound, 0, loss, since)
@@ -639,8 +640,8 @@ def flown_and_kept(flown: Scenario) -> tuple[Record, Kept]:
     def spy(self: Guidance, rows: Indices, step: Indices, found: Foresight, event: Any) -> None:
         inner(self, rows, step, found, event)
         for i in np.flatnonzero(event):
-            slot = (self._memory.vehicles["sent"][rows[i]] - 1) % trajectory.ROOM
-            sent = self._memory.sent[rows[i], slot]
+            slot = (self._memory.sent.heard["sent"][rows[i]] - 1) % trajectory.ROOM
+            sent = self._memory.trajectories[rows[i], slot]
             knots = self._memory.knots[rows[i], slot, :, : 2 * sent["count"]].copy()
             kept[int(step[i])] = (int(sent["spacing"]), knots)
 
@@ -769,8 +770,8 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
                 inner = Guidance.observe
 
                 def observe(self: Guidance, row: int, told: Observation) -> bool:
-                    sent = self._memory.vehicles["sent"][row]
-                    newest = self._memory.sent["step"][row, (sent - 1) % trajectory.ROOM]
+                    sent = self._memory.sent.heard["sent"][row]
+                    newest = self._memory.sent.plans["step"][row, (sent - 1) % trajectory.ROOM]
                     made = int(newest) if sent and told.takes else NO_HORIZON
                     return inner(self, row, told._replace(in_force=made, since=made + 1))  # noqa: B023
 
