@@ -16,8 +16,9 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from socketserver import ThreadingMixIn
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
+from wsgiref.types import StartResponse, WSGIEnvironment
 
 import msgspec
 from prometheus_client import CollectorRegistry, generate_latest
@@ -29,9 +30,6 @@ from skytether.shared.core.endpoint import Address
 from skytether.shell.metrics import OWN, families, trouble
 from skytether.shell.udp import from_kernel, look_up
 from skytether.shell.web import HEADERS, host_name, is_ours
-
-if TYPE_CHECKING:
-    from _typeshed.wsgi import StartResponse, WSGIEnvironment
 
 CONNECTIONS_MAX = 8
 """Most connections at once; a new one closes the oldest."""
@@ -192,9 +190,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
     def handle_error(self, *_: object) -> None:
         """Nothing: the client is gone, or too slow."""
 
-    def _answer(
-        self, environ: "WSGIEnvironment", start_response: "StartResponse"
-    ) -> Iterable[bytes]:
+    def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"
         more = list(HEADERS.items())
         if not self._is_ours(environ.get("HTTP_HOST")):

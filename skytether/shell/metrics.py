@@ -242,13 +242,14 @@ def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], l
     """Metrics made of figures, and the paths of figures that no table has.
 
     Args:
-        process: server, netem or client.
+        process: server, netem or client; another process has no table, and figures of its own that
+            are not exported.
         figures: from `Endpoint.figures`, and those that the process adds.
     """
     found: dict[str, Exposed] = {}
     unknown = []
     for path, value in flat(figures):
-        for metric in TABLES[process]:
+        for metric in TABLES.get(process, _PROCESS):
             labels = matched(metric.figure, path)
             if labels is not None:
                 if metric.name not in found:
@@ -256,7 +257,8 @@ def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], l
                 metric.add(found[metric.name], labels, value)
                 break
         else:
-            if all(matched(figure, path) is None for figure in LEFT_OUT[process]):
+            left_out = LEFT_OUT.get(process, ())
+            if process in TABLES and all(matched(each, path) is None for each in left_out):
                 unknown.append("/".join(path))
     return list(found.values()), unknown
 
