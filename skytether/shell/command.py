@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from errno import EMFILE
 from functools import partial
 from pathlib import Path
@@ -108,8 +108,7 @@ def parse(
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
     plugins.load(plugins.named(argv))
-    own = {field.name for field in fields(defaults)}  # type: ignore[arg-type]
-    argv, values = key_values(argv, own)
+    argv, values = key_values(argv, type(defaults))
     if asks_help(argv):  # it shows the keys as they are in the scenario
         named = leads and argv and not argv[0].startswith("-")
         base = reading.load_base(argv[0] if named else defaults.scenario)

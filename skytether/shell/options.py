@@ -9,10 +9,9 @@ started, are read here, too, and tyro knows of a scenario's keys in the help alo
 import dataclasses
 import json
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
@@ -25,8 +24,6 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 
 T = TypeVar("T")
-WHOLE_SCENARIO = "title", "duration", "settle", "seed", "armed"
-"""Keys of a scenario in no section: a flag much like one of these is a key with a mistake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +67,7 @@ def asks_help(argv: Sequence[str]) -> bool:
     return not {"-h", "--help"}.isdisjoint(argv)
 
 
-def key_values(argv: Sequence[str], own: Collection[str]) -> tuple[list[str], dict[str, Any]]:
+def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
     """Command line without flags of a scenario's keys, and the plain values of these.
 
     A key takes one word, a list all words up to the next flag, and a boolean none: it is written
@@ -78,20 +75,20 @@ def key_values(argv: Sequence[str], own: Collection[str]) -> tuple[list[str], di
 
     Args:
         argv: the command line.
-        own: flags of the command itself, which are no keys.
+        options: the command's options, whose flags are no keys.
 
     Raises:
         ConfigError: a key has no value.
     """
     words, rest, values = deque(argv), list[str](), dict[str, Any]()
+    own, _ = _flags(options)
     while words:
         word = words.popleft()
         flag, equals, text = word.partition("=")
         key = flag.removeprefix("--").replace("-", "_")
         section, dot, name = key.rpartition(".")
         negated = f"{section}{dot}{name.removeprefix('no_')}"
-        is_key = dot or _kinds(negated) or get_close_matches(key, WHOLE_SCENARIO, 1, 0.8)
-        if not flag.startswith("--") or key in own or not is_key:
+        if not flag.startswith("--") or key in own or not (dot or _kinds(negated) or _slipped(key)):
             rest.append(word)
         elif bool in _kinds(negated):
             values[negated] = toml_value(text) if equals else negated == key
@@ -105,9 +102,17 @@ def key_values(argv: Sequence[str], own: Collection[str]) -> tuple[list[str], di
     return rest, values
 
 
+def _slipped(flag: str) -> bool:
+    """Whether an unknown flag is much like a key that stands in no section."""
+    import difflib  # for mistakes alone
+
+    keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
+    return bool(difflib.get_close_matches(flag, keys, 1, 0.8))
+
+
 def _key_value(key: str, words: Sequence[str]) -> Any:
     kinds = _kinds(key)
-    values = words if kinds <= {str, Literal} else [_number_or_other(word) for word in words]
+    values = words if kinds <= {str} else [_number_or_other(word) for word in words]
     if tuple in kinds and not (
         len(values) == 1 and (len(kinds) > 1 or isinstance(values[0], list))
     ):
@@ -136,7 +141,8 @@ def _kinds(key: str) -> frozenset[Any]:
     if hasattr(kind, "__struct_fields__"):  # a direction of the network may be a text
         return frozenset({str})
     kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
-    return frozenset(get_origin(each) or each for each in kinds)
+    words = {type(word) for each in kinds if get_origin(each) is Literal for word in get_args(each)}
+    return frozenset(words | {get_origin(each) or each for each in kinds} - {Literal})
 
 
 def toml_value(text: str) -> Any:

@@ -78,6 +78,7 @@ KEYS: list[tuple[list[str], dict[str, Any]]] = [
     (["--control.delay-bound", "auto"], {"control.delay_bound": "auto"}),
     (["--control.feedback"], {"control.feedback": True}),
     (["--control.no-feedback", "--no-armed"], {"control.feedback": False, "armed": False}),
+    (["--model.axes", "3", "--vehicle.kind", "ideal"], {"model.axes": 3, "vehicle.kind": "ideal"}),
     (["--title", "7"], {"title": "7"}),
     (["--model.tau-s", "0.5", "0.6"], {"model.tau_s": [0.5, 0.6]}),
     (["--model.tau-s", "0.5"], {"model.tau_s": [0.5]}),
@@ -94,11 +95,10 @@ KEYS: list[tuple[list[str], dict[str, Any]]] = [
 def test_flags_of_keys_are_read_by_the_types_of_keys(
     flags: list[str], values: dict[str, Any]
 ) -> None:
-    rest, read = options.key_values(
-        ["demo", *flags, "--log", "json", "--control", "a"], {"control"}
-    )
+    own = ["--log", "json", "--control", "a"]
+    rest, read = options.key_values(["demo", *flags, *own], client.ClientOptions)
     assert read == values
-    assert rest == ["demo", "--log", "json", "--control", "a"]
+    assert rest == ["demo", *own]
 
 
 @pytest.mark.parametrize(
