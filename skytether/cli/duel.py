@@ -1,7 +1,5 @@
 """`skytether duel`: two scenarios on the same network and seed, side by side on one page."""
 
-import contextlib
-import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -110,24 +108,18 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, p
     for each in (*sockets, *parts):
         each.mkdir(mode=0o700)
 
-    def say(line: object) -> None:
-        # The terminal may be gone: this is no reason to end the flight.
-        with contextlib.suppress(OSError):
-            print(line, file=sys.stderr)
-
     def fly(place: int, on_second: Callable[[float], None]) -> None:
         processes.run(
             scenarios[place],
             parts[place],
             on_second=on_second,
             interrupted=interrupted,
-            control=sockets[place],
-            feeds=sockets[place],
+            sockets=sockets[place],
         )
 
     title = f"flying {' and '.join(names)}"
     with (
-        page_process.beside(sockets, page, say),
+        page_process.beside(sockets, page),
         command.interruptible() as interrupted,
         terminal.progress(title, scenarios[0].duration) as on_second,
         ThreadPoolExecutor(len(names)) as pool,

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -142,7 +141,7 @@ class FleetFlight:
     """Figures of the processes "client" and "netem", where there are such processes."""
     failure: Event | None = None
     """Event of the first vehicle that did not fly, or did not fly to the end."""
-    machine: "Metronome | None" = None
+    machine: "Lateness | None" = None
     """Measure of how late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
@@ -261,19 +260,6 @@ def _virtually(
     )
 
 
-@contextmanager
-def _paged(options: FleetOptions) -> Iterator[Path | None]:
-    """Serve a page if one is asked for; yields the folder of its sockets."""
-    if options.page is None:
-        yield None
-        return
-    with (
-        temporary.folder() as folder,
-        page_process.beside([folder], options.page, page_process.say),
-    ):
-        yield folder
-
-
 def _really(
     options: FleetOptions,
     vehicles: int,
@@ -282,8 +268,8 @@ def _really(
 ) -> FleetFlight:
     with (
         temporary.folder() as parts,
-        _paged(options) as sockets,
-        Metronome(options) as machine,
+        page_process.paged(options.page) as sockets,
+        metronome(options.config.control.dt) as machine,
     ):
         shortfalls = processes.run(
             options.config,
@@ -294,8 +280,7 @@ def _really(
             workers=options.workers,
             watched=False,
             secure=options.secure,
-            control=sockets,
-            feeds=sockets,
+            sockets=sockets,
         )
         incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
         if incomplete:
@@ -310,36 +295,41 @@ def _really(
         return FleetFlight(client, servers, rest["netem"], rest, failure, machine, vehicles=told)
 
 
-class Metronome:
-    """Thread that only sleeps, step by step: the steps it misses are the machine's fault."""
+@dataclass(slots=True)
+class Lateness:
+    """How late the machine woke a thread that only sleeps."""
 
-    def __init__(self, options: FleetOptions) -> None:
-        self._dt_s = options.config.control.dt
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._sleep, daemon=True)
-        self.missed = 0
-        self.late_s_max = 0.0
+    missed: int = 0
+    """Steps that the thread missed."""
+    max_s: float = 0.0
+    """Largest delay with which it woke [s]."""
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
 
-    def __exit__(
-        self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
+@contextmanager
+def metronome(dt_s: float) -> Iterator[Lateness]:
+    """Let a thread sleep step by step for as long as the block takes: the steps that it misses are
+    the machine's fault.
+    """
+    late, over = Lateness(), threading.Event()
 
-    def _sleep(self) -> None:
+    def sleep() -> None:
         due_s = time.monotonic()
-        while not self._over.is_set():
-            due_s += self._dt_s
+        while not over.is_set():
+            due_s += dt_s
             time.sleep(max(0.0, due_s - time.monotonic()))
             late_s = time.monotonic() - due_s
-            self.late_s_max = max(self.late_s_max, late_s)
-            missed = int(late_s / self._dt_s)
-            self.missed += missed
-            due_s += missed * self._dt_s
+            late.max_s = max(late.max_s, late_s)
+            missed = int(late_s / dt_s)
+            late.missed += missed
+            due_s += missed * dt_s
+
+    thread = threading.Thread(target=sleep, daemon=True)
+    thread.start()
+    try:
+        yield late
+    finally:
+        over.set()
+        thread.join()
 
 
 def _vehicles(options: FleetOptions) -> int:
@@ -421,7 +411,7 @@ def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None)
         server_missed=sum(server["missed"] for server in servers),
         client_missed=sum(int(rows["missed"][-1]) for rows in each),
         machine_missed=flown.machine.missed if flown.machine else None,
-        machine_late_ms_max=flown.machine.late_s_max * 1e3 if flown.machine else None,
+        machine_late_ms_max=flown.machine.max_s * 1e3 if flown.machine else None,
         server_cpu_us=spent_us,
         client_cpu_us=cpu_s["client"] * 1e6 / len(client) if cpu_s else None,
         netem_cpu_us=cpu_s["netem"] * 1e6 / max(packets, 1) if cpu_s else None,

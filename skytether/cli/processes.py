@@ -200,8 +200,7 @@ def run(
     watched: bool = True,
     secure: bool = False,
     set_parameters: bool = False,
-    control: Path | None = None,
-    feeds: Path | None = None,
+    sockets: Path | None = None,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
 
@@ -219,9 +218,8 @@ def run(
         watched: whether server and netem record, too.
         secure: whether the link is sealed, with keys that are made for this flight.
         set_parameters: whether the client makes its autopilot's parameters safe.
-        control: folder for a socket of each process, through which keys change in flight.
-        feeds: folder for the feed of each process, called as in `server.feed`; of several workers,
-            as in `server.feed.1`.
+        sockets: folder for two sockets of each process: `server`, through which keys change in
+            flight, and `server.feed`, its feed; of several workers, `server.1`, `server.feed.1`.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -241,11 +239,12 @@ def run(
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
-        part = ["--record", str(parts / name)] if recorded else []
-        heeds = ["--control", str(control / name)] if control else []
-        tells = ["--feed", str(feeds_in(feeds)[name])] if feeds else []
         # Whoever says `fly` begins a new flight.
-        told = ["--json", str(parts / f"{name}.json"), "--new-flight", *part, *heeds, *tells]
+        told = ["--json", str(parts / f"{name}.json"), "--new-flight"]
+        if recorded:
+            told += ["--record", str(parts / name)]
+        if sockets:
+            told += ["--control", str(sockets / name), "--feed", str(feeds_in(sockets)[name])]
         return [name, str(file), *told, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
