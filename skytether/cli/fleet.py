@@ -1,14 +1,13 @@
 """`skytether fleet`: many vehicles on one server, over real UDP or in virtual time."""
 
-import json
 import threading
 import time
 from argparse import ArgumentError, ArgumentParser
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -21,18 +20,17 @@ from skytether.cli import page_process, processes
 from skytether.figures import film
 from skytether.figures import flights as figures
 from skytether.shared.base import kernel
-from skytether.shared.core.events import Event, NotFlown
+from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry import record
-from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
-from skytether.shell import command, temporary, terminal
+from skytether.shell import command, terminal
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.sim import flight
+from skytether.sim import flight as sim
 
 VEHICLES = 20
 """Default number of vehicles."""
@@ -130,25 +128,13 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class FleetFlight:
-    """A fleet's flight: what the vehicles recorded, and the figures of each process."""
+    """A fleet's flight, and what it cost the machine."""
 
-    client: Rows
-    servers: list[dict[str, Any]]
-    """Figures of each server worker."""
-    netem: dict[str, Any]
-    """Figures of netem."""
-    processes: dict[str, dict[str, Any]]
-    """Figures of the processes "client" and "netem", where there are such processes."""
-    failure: Event | None = None
-    """Event of the first vehicle that did not fly, or did not fly to the end."""
+    record: Record
     machine: "Lateness | None" = None
-    """Measure of how late the machine woke a sleeping thread, over real UDP."""
+    """How late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
-    server: Rows | None = None
-    """Rows of the server, in virtual time."""
-    vehicles: dict[str, Any] = field(default_factory=dict)
-    """Figures of each vehicle, by its number."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -179,23 +165,23 @@ def fleet(argv: Sequence[str]) -> None:
         command.interruptible() as interrupted,
         terminal.progress(f"flying {title}", options.config.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(
-            options, vehicles, on_second, interrupted
-        )
+        fly = _virtually if options.virtual else _really
+        flight = fly(options, vehicles, on_second, interrupted)
+    flown = flight.record
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
-    apart = _separations(options.config, flown.client, flown.vehicles)
-    summary = _summarise(options, flown, apart and float(np.nanmin(apart[1])))
+    apart = _separations(options.config, flown)
+    summary = _summarise(options, flight, apart and float(np.nanmin(apart[1])))
     _show(summary, title)
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure and options.figure.suffix == film.SUFFIX:
-        flight = options.config, flown.client
-        with terminal.progress("drawing the film", film.length(*flight), "frames") as bar:
-            film.write(options.figure, title, *flight, apart, bar)
+        shown = options.config, flown.client
+        with terminal.progress("drawing the film", film.length(*shown), "frames") as bar:
+            film.write(options.figure, title, *shown, apart, bar)
     elif options.figure:
-        told = flown.client, flown.server, apart
-        figures.fleet(options.figure, title, options.config, *told)
+        server = flown.server if options.virtual else None
+        figures.fleet(options.figure, title, options.config, flown.client, server, apart)
     if flown.failure:
         raise CommandError(str(flown.failure))
 
@@ -238,7 +224,7 @@ def _virtually(
 ) -> FleetFlight:
     kernel.load()
     began_s = time.process_time()
-    flown = flight.fly(
+    flown = sim.fly(
         options.config,
         vehicles=vehicles,
         secure=options.secure,
@@ -248,16 +234,7 @@ def _virtually(
     )
     if flown.failure and not isinstance(flown.failure, NotFlown):
         raise CommandError(str(flown.failure))
-    return FleetFlight(
-        client=flown.client,
-        servers=[flown.figures["server"]],
-        netem=flown.figures["netem"],
-        processes={},
-        failure=flown.failure,
-        cpu_s=time.process_time() - began_s,
-        server=flown.server,
-        vehicles=flown.figures["client"]["by_vehicle"],
-    )
+    return FleetFlight(flown, cpu_s=time.process_time() - began_s)
 
 
 def _really(
@@ -267,13 +244,11 @@ def _really(
     interrupted: Callable[[], bool],
 ) -> FleetFlight:
     with (
-        temporary.folder() as parts,
         page_process.paged(options.page) as sockets,
         metronome(options.config.control.dt) as machine,
     ):
-        shortfalls = processes.run(
+        flown = processes.flown(
             options.config,
-            parts,
             on_second=on_second,
             interrupted=interrupted,
             vehicles=vehicles,
@@ -282,17 +257,9 @@ def _really(
             secure=options.secure,
             sockets=sockets,
         )
-        incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
-        if incomplete:
-            raise CommandError("; ".join(map(str, incomplete)))
-        servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
-        rest = {
-            name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")
-        }
-        failure = next(iter(shortfalls), None)
-        client = record.read(parts / "client")
-        told = rest["client"]["by_vehicle"]
-        return FleetFlight(client, servers, rest["netem"], rest, failure, machine, vehicles=told)
+    if flown.incomplete:
+        raise CommandError("; ".join(map(str, flown.incomplete)))
+    return FleetFlight(flown, machine)
 
 
 @dataclass(slots=True)
@@ -349,10 +316,9 @@ def _vehicles(options: FleetOptions) -> int:
     return count
 
 
-def _separations(
-    scenario: Scenario, client: Rows, vehicles: Mapping[str, Any]
-) -> tuple[Array, Array] | None:
+def _separations(scenario: Scenario, flown: Record) -> tuple[Array, Array] | None:
     """Distances between a mission's vehicles over time, see `separations`; None where unknown."""
+    client, vehicles = flown.client, flown.figures["client"].get("by_vehicle", {})
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
@@ -364,23 +330,27 @@ def _separations(
     return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
 
-def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None) -> FleetSummary:
-    scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
+def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None) -> FleetSummary:
+    scenario, flown, machine = options.config, flight.record, flight.machine
+    client, counted = flown.client, flown.figures
+    server = flown.server if options.virtual else None
+    servers = [counted[name] for name in counted if name.startswith("server")]
+    measured = [each for each in counted.values() if "cpu_s" in each]
     steps = sum(server["counts"].get("steps", 0) for server in servers)
     spent_us = {
         stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
         for stage in STAGES
     }
     spent_us = {stage: us for stage, us in spent_us.items() if us}
-    if all("cpu_s" in server for server in servers):
+    if measured:
         spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
     duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
     each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
-    rmse = [summarise(scenario, options.scenario, rows, flown.server).rmse_xy for rows in each]
+    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in each]
     known = [value for value in rmse if value is not None]
-    links = (netem["uplink"], netem["downlink"])
+    links = (counted["netem"]["uplink"], counted["netem"]["downlink"])
     packets = sum(link["packets"] for link in links)
-    cpu_s = {name: figures["cpu_s"] for name, figures in flown.processes.items()}
+    cpu_us = {name: each["cpu_s"] * 1e6 for name, each in counted.items() if "cpu_s" in each}
     return FleetSummary(
         scenario=options.scenario,
         seed=scenario.seed,
@@ -401,21 +371,17 @@ def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None)
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
-        + sum(
-            process["kernel_drops"] + process["send_errors"]
-            for process in (*flown.processes.values(), *servers)
-            if "cpu_s" in process
-        ),
+        + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
         client_missed=sum(int(rows["missed"][-1]) for rows in each),
-        machine_missed=flown.machine.missed if flown.machine else None,
-        machine_late_ms_max=flown.machine.max_s * 1e3 if flown.machine else None,
+        machine_missed=machine.missed if machine else None,
+        machine_late_ms_max=machine.max_s * 1e3 if machine else None,
         server_cpu_us=spent_us,
-        client_cpu_us=cpu_s["client"] * 1e6 / len(client) if cpu_s else None,
-        netem_cpu_us=cpu_s["netem"] * 1e6 / max(packets, 1) if cpu_s else None,
-        vehicle_steps_per_core_s=len(client) / flown.cpu_s if flown.cpu_s else None,
+        client_cpu_us=cpu_us["client"] / len(client) if "client" in cpu_us else None,
+        netem_cpu_us=cpu_us["netem"] / max(packets, 1) if cpu_us else None,
+        vehicle_steps_per_core_s=len(client) / flight.cpu_s if flight.cpu_s else None,
     )
 
 

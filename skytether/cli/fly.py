@@ -221,7 +221,7 @@ def _really(
 ) -> tuple[Record, str | None]:
     """Fly over UDP; returns the flight, and a sentence on what its recording lacks."""
     scenario, name, secure = options.config, options.scenario, options.secure
-    with temporary.folder() as parts, ExitStack() as stack:
+    with ExitStack() as stack:
         live = None
         if options.record:
             from skytether.cli import recorder
@@ -230,9 +230,8 @@ def _really(
             feeds = processes.feeds_in(sockets)
             live = recorder.Live(options.record, feeds, scenario, name, secure=secure, tell=_tell)
             stack.callback(live.finish)
-        shortfalls = processes.run(
+        flown = processes.flown(
             scenario,
-            parts,
             on_second=on_second,
             interrupted=interrupted,
             on_event=lambda line: _tell(line.event),
@@ -240,7 +239,6 @@ def _really(
             set_parameters=options.set_parameters,
             sockets=sockets,
         )
-        flown = processes.record_of(parts, scenario, shortfalls)
         if live is None:
             return flown, None
         summary = _summarise(scenario, name, flown, secure=secure) if len(flown.client) else None

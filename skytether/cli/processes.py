@@ -9,6 +9,7 @@ The loop is asyncio's own: uvloop would reset signals that the children must go 
 
 import asyncio
 import contextlib
+import json
 import signal
 import sys
 from collections import deque
@@ -42,7 +43,7 @@ from skytether.shared.telemetry.record import (
     read,
     server_columns,
 )
-from skytether.shell import plugins
+from skytether.shell import plugins, temporary
 from skytether.shell.command import INTERRUPTED, CommandError
 from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
@@ -307,6 +308,37 @@ def fly_chain(
     asyncio.run(main())
 
 
+def flown(
+    scenario: Scenario,
+    *,
+    on_second: Callable[[float], None],
+    interrupted: Callable[[], bool],
+    on_event: OnEvent = lambda _: None,
+    vehicles: int = 1,
+    workers: int = 1,
+    watched: bool = True,
+    secure: bool = False,
+    set_parameters: bool = False,
+    sockets: Path | None = None,
+) -> Record:
+    """Fly a scenario until its end, or Ctrl-C; arguments and exceptions as those of `run`."""
+    with temporary.folder() as parts:
+        shortfalls = run(
+            scenario,
+            parts,
+            on_second=on_second,
+            interrupted=interrupted,
+            on_event=on_event,
+            vehicles=vehicles,
+            workers=workers,
+            watched=watched,
+            secure=secure,
+            set_parameters=set_parameters,
+            sockets=sockets,
+        )
+        return record_of(parts, scenario, shortfalls)
+
+
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
@@ -322,11 +354,13 @@ def record_of(
     netem = _rows(parts / "netem", PACKET_COLUMNS).copy()
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
+    counted = {path.name.replace(".json", ""): path.read_bytes() for path in parts.glob("*.json*")}
     return Record(
         client=_rows(parts / "client", client_columns(axes)),
         server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
+        figures={name: json.loads(told) for name, told in counted.items() if told},
         events=tuple(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
@@ -336,10 +370,12 @@ def record_of(
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
-    """Rows of a part of the record; none where the disk was too full even for the file's header."""
+    """Rows of a part of the record; none where there is no part, or where the disk was too full
+    even for its header.
+    """
     try:
         return read(part)
-    except ValueError:
+    except (ValueError, FileNotFoundError):
         return np.empty(0, columns)
 
 
