@@ -29,7 +29,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
 VEHICLES = 20
@@ -41,7 +41,7 @@ STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger",
 
 
 @dataclass(frozen=True)
-class FleetOptions:
+class FleetOptions(ScenarioOptions):
     """Options of `skytether fleet`."""
 
     scenario: ScenarioName = "fleet"
@@ -65,8 +65,6 @@ class FleetOptions:
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg), or a film (.gif)."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):

@@ -31,7 +31,7 @@ from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command, temporary, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.command import CommandError, ScenarioOptions
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
@@ -46,11 +46,9 @@ ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 
 
 @dataclass(frozen=True)
-class FlyOptions:
+class FlyOptions(ScenarioOptions):
     """Options of `skytether fly`."""
 
-    scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
@@ -81,8 +79,6 @@ class FlyOptions:
     Lichtblick can show the file."""
     beside: str | None = None
     """Second scenario to compare with, flown in virtual time with the same duration and seed."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def fly(argv: Sequence[str]) -> None:

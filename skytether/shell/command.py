@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from errno import EMFILE
 from functools import partial
 from pathlib import Path
@@ -54,6 +54,16 @@ Plugins = Annotated[
         "`skytether triggers` and `skytether references`.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ScenarioOptions:
+    """Options of a command that flies a scenario."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    plugin: Plugins = ()
+    config: ScenarioFlags = Scenario()
 
 
 class CommandError(Exception):

@@ -34,9 +34,7 @@ from skytether.shell import beside, command
 from skytether.shell.command import (
     CONFIGURATION,
     CommandError,
-    Plugins,
-    ScenarioFlags,
-    ScenarioName,
+    ScenarioOptions,
     unsealed,
     write,
 )
@@ -57,11 +55,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ProcessOptions:
+class ProcessOptions(ScenarioOptions):
     """Options of every process."""
 
-    scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
     log: LogFormat = "text"
     """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
@@ -78,8 +74,6 @@ class ProcessOptions:
     """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
-    plugin: Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 @contextmanager
