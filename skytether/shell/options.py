@@ -113,13 +113,11 @@ def _slipped(flag: str) -> bool:
 def _key_value(key: str, words: Sequence[str]) -> Any:
     kinds = _kinds(key)
     values = words if kinds <= {str} else [_number_or_other(word) for word in words]
-    if tuple in kinds and not (
-        len(values) == 1 and (len(kinds) > 1 or isinstance(values[0], list))
-    ):
-        return values
-    if not values:
+    if len(values) == 1 and (kinds != {tuple} or isinstance(values[0], list)):
+        return values[0]
+    if not values and tuple not in kinds:
         raise ConfigError(f"{key}: got nothing, expected a value")
-    return values[0]
+    return values
 
 
 def _number_or_other(word: str) -> Any:
@@ -190,7 +188,7 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
     """Fields of options by flag, and the positional ones."""
     flags, positional = {}, []
-    for name, hint in get_type_hints(options, include_extras=True).items():
+    for name, hint in _hints(options).items():
         argument = _argument(hint) or Argument()
         if argument.positional:
             positional.append(name)
@@ -211,8 +209,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
         ValueError: only tyro can read the value.
     """
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    # Where one number may stand for all axes, the text is that number.
-    (kind,) = (kind for kind in kinds if kind is not NoneType and get_origin(kind) is not tuple)
+    (kind,) = (kind for kind in kinds if kind is not NoneType)
     if kind in (str, Path) and text and text != "None" and (given or text[0] != "-"):
         return kind(text)
     if kind in (int, float) and text[:1].isdecimal() and text.isascii():
@@ -222,7 +219,6 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
     raise ValueError(text)
 
 
-@cache
 def _tell_tyro(options: type, *, keys: bool) -> None:
     """Add tyro's annotations that correspond to the options' own; keys of a scenario, or none."""
     from tyro import conf
@@ -240,5 +236,10 @@ def _tell_tyro(options: type, *, keys: bool) -> None:
         words += [conf.UseAppendAction] * argument.append
         return Annotated[(hint, *words)]
 
-    hints = get_type_hints(options, include_extras=True)
-    options.__annotations__ = {name: told(hint) for name, hint in hints.items()}
+    options.__annotations__ = {name: told(hint) for name, hint in _hints(options).items()}
+
+
+@cache
+def _hints(options: type) -> Mapping[str, Any]:
+    """Annotations of options, as they are written."""
+    return get_type_hints(options, include_extras=True)

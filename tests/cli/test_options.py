@@ -64,6 +64,13 @@ def test_any_other_line_is_for_tyro(default: Any, argv: list[str]) -> None:
     assert options.plain(default, argv) is None
 
 
+def test_the_help_shows_keys_after_a_mistake_as_well(capsys: pytest.CaptureFixture[str]) -> None:
+    for flag in ("--nonsense", "--help"):
+        with pytest.raises(SystemExit):
+            command.parse(client.ClientOptions(), ["demo", flag], "x", None)
+    assert "--control.decay-rate FLOAT" in capsys.readouterr().out
+
+
 def test_a_command_with_a_required_option_is_for_tyro() -> None:
     assert options.plain(keygen.KeygenOptions(options), ["file"]) is None  # type: ignore[arg-type]
 
