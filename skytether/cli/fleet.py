@@ -2,7 +2,6 @@
 
 import threading
 import time
-from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
-from skytether.shell import command, terminal
+from skytether.shell import command, plugins, terminal
 from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
@@ -190,26 +189,24 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     Raises:
         CommandError: a scenario is given as well, or the file is no table of goals.
     """
-    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--mission")
-    try:
-        found, rest = parser.parse_known_args(list(argv))
-    except ArgumentError:
-        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION) from None
-    if found.mission is None:
+    missions, rest = plugins.flag_values(argv, "--mission")
+    if "--mission" in rest:
+        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION)
+    if not missions:
         return rest
+    mission = missions[-1]
     if rest and not rest[0].startswith("-"):
         said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
         raise CommandError(said, command.CONFIGURATION)
-    if not found.mission.endswith(".csv"):
-        return [found.mission, *rest]
+    if not mission.endswith(".csv"):
+        return [mission, *rest]
     try:
-        with Path(found.mission).open(encoding="utf-8") as table:
+        with Path(mission).open(encoding="utf-8") as table:
             axes = 3 if "z" in table.readline().strip().split(",") else 2
-        lasts_s = read_mission(Path(found.mission), axes).lasts_s
+        lasts_s = read_mission(Path(mission), axes).lasts_s
     except (OSError, ValueError) as error:
-        raise CommandError(f"--mission: {found.mission}: {error}", command.CONFIGURATION) from None
-    shape = ["--reference.shape", "mission", "--reference.file", found.mission]
+        raise CommandError(f"--mission: {mission}: {error}", command.CONFIGURATION) from None
+    shape = ["--reference.shape", "mission", "--reference.file", mission]
     flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
     return ["swap", *shape, *flown, *rest]
 
