@@ -9,6 +9,7 @@ that no client keeps others out; at most 50 are accepted per second. Who comes b
 website is refused: a stranger may have pointed it here.
 """
 
+import io
 import os
 import socket
 import threading
@@ -35,6 +36,8 @@ CONNECTIONS_MAX = 8
 """Most connections at once; a new one closes the oldest."""
 PATIENCE_S = 5.0
 """Longest time for a request and its answer [s]."""
+REQUEST_BYTES_MAX = 8192
+"""Largest size of a request [B]."""
 POLL_S = 0.1
 """Interval at which connections that take too long are closed [s]."""
 REST_S = 0.02
@@ -101,8 +104,31 @@ class Collected(Collector):
         return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(told) + b"\n"
 
 
+class _Bounded(io.BufferedReader):
+    """Lines of a request, as long as all of them together may be."""
+
+    left = REQUEST_BYTES_MAX
+
+    def readline(self, _: int | None = -1, /) -> bytes:
+        """Read the next line.
+
+        Raises:
+            OSError: the request is too long.
+        """
+        line = super().readline(self.left + 1)
+        self.left -= len(line)
+        if self.left < 0:
+            raise OSError("the request is too long")
+        return line
+
+
 class _Handler(WSGIRequestHandler):
     """Reader of a request; answers to what is no request have the common headers as well."""
+
+    def setup(self) -> None:
+        """Prepare to read."""
+        super().setup()
+        self.rfile = _Bounded(self.rfile.detach())
 
     def log_message(self, *_: object) -> None:
         """Log nothing."""
