@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -105,9 +106,8 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> N
     """Fly both scenarios over UDP at once, each with its own processes."""
 
     def fly(scenario: Scenario, sockets: Path) -> Record:
-        return processes.flown(
-            scenario, on_second=on_second, interrupted=interrupted, sockets=sockets
-        )
+        run = partial(processes.run, on_second=on_second, interrupted=interrupted, sockets=sockets)
+        return processes.flown(scenario, run)
 
     with ExitStack() as stack:
         folder = stack.enter_context(temporary.folder())

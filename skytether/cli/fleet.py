@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -242,8 +243,8 @@ def _really(
         page_process.paged(options.page) as sockets,
         metronome(options.config.control.dt) as machine,
     ):
-        flown = processes.flown(
-            options.config,
+        run = partial(
+            processes.run,
             on_second=on_second,
             interrupted=interrupted,
             vehicles=vehicles,
@@ -252,6 +253,7 @@ def _really(
             secure=options.secure,
             sockets=sockets,
         )
+        flown = processes.flown(options.config, run)
     if flown.incomplete:
         raise CommandError("; ".join(map(str, flown.incomplete)))
     return FleetFlight(flown, machine)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -226,8 +227,8 @@ def _really(
             feeds = processes.feeds_in(sockets)
             live = recorder.Live(options.record, feeds, scenario, name, secure=secure, tell=_tell)
             stack.callback(live.finish)
-        flown = processes.flown(
-            scenario,
+        run = partial(
+            processes.run,
             on_second=on_second,
             interrupted=interrupted,
             on_event=lambda line: _tell(line.event),
@@ -235,6 +236,7 @@ def _really(
             set_parameters=options.set_parameters,
             sockets=sockets,
         )
+        flown = processes.flown(scenario, run)
         if live is None:
             return flown, None
         summary = _summarise(scenario, name, flown, secure=secure) if len(flown.client) else None

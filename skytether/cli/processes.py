@@ -308,35 +308,10 @@ def fly_chain(
     asyncio.run(main())
 
 
-def flown(
-    scenario: Scenario,
-    *,
-    on_second: Callable[[float], None],
-    interrupted: Callable[[], bool],
-    on_event: OnEvent = lambda _: None,
-    vehicles: int = 1,
-    workers: int = 1,
-    watched: bool = True,
-    secure: bool = False,
-    set_parameters: bool = False,
-    sockets: Path | None = None,
-) -> Record:
-    """Fly a scenario until its end, or Ctrl-C; arguments and exceptions as those of `run`."""
+def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) -> Record:
+    """Record of a flight by `run`, given its other arguments as in `partial(run, workers=2)`."""
     with temporary.folder() as parts:
-        shortfalls = run(
-            scenario,
-            parts,
-            on_second=on_second,
-            interrupted=interrupted,
-            on_event=on_event,
-            vehicles=vehicles,
-            workers=workers,
-            watched=watched,
-            secure=secure,
-            set_parameters=set_parameters,
-            sockets=sockets,
-        )
-        return record_of(parts, scenario, shortfalls)
+        return record_of(parts, scenario, fly(scenario, parts))
 
 
 def record_of(
