@@ -10,8 +10,8 @@ if __name__ == "__main__":  # before the imports below, which take a while
 import secrets
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated
@@ -40,15 +40,14 @@ from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.shell.journal import take_up
-from skytether.shell.log import LogFormat
+from skytether.shell.command import CommandError, ScenarioName
 from skytether.shell.memory import MemoryFile, folder
 from skytether.shell.options import Argument
+from skytether.shell.process import ProcessOptions
 
 
 @dataclass(frozen=True)
-class ClientOptions:
+class ClientOptions(ProcessOptions):
     """Options of `skytether client`."""
 
     scenario: ScenarioName = "demo"
@@ -71,25 +70,12 @@ class ClientOptions:
     insecure: bool = False
     """Do without keys even where the server is another machine: anybody on the way can fly the
     vehicle."""
-    log: LogFormat = "text"
-    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
-    record: Path | None = None
-    """File for the client's part of the record; one that ends in .mcap becomes a recording with
-    all that the client says, see `skytether join`."""
     json: Path | None = None
     """File for the summary of the flight, as far as the vehicle knows it; of several vehicles, for
     what was counted, and the CPU time it took."""
-    control: Path | None = None
-    """Unix socket to make, through which keys change in flight, see `skytether set`."""
-    feed: Path | None = None
-    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
     new_flight: bool = False
     """Begin a new flight: what an earlier run has kept in `vehicle.memory`, and what was set in
     flight, does not count. A person says so; the command of a service must not."""
-    metrics: str | None = None
-    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def fly(argv: Sequence[str]) -> None:
@@ -100,8 +86,7 @@ def fly(argv: Sequence[str]) -> None:
     server flies another scenario, is full, or has another client under this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
-    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
-    scenario, server = taken_up.scenario, command.address("--server", options.server)
+    server = command.address("--server", options.server)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -109,7 +94,7 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
     keyring = keys.load(options.keys) if options.keys else None
-    flying = [vehicles.make(scenario, number) for number in numbers]
+    alone = len(numbers) == 1
 
     def link(number: int) -> ClientLink:
         if keyring is None:
@@ -119,21 +104,21 @@ def fly(argv: Sequence[str]) -> None:
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
-    warnings = command.flight_warnings(scenario) + taken_up.news
-    columns = client_columns(scenario.model.axes)
     with (
-        _memory(options, flying, keyring) as memory,
-        (
-            process.recorded(part, columns)
-            if (part := process.part_of(options.record))
-            else process.recorded_meanwhile(columns)
-        ) as recording,
-        process.fed(
-            options.feed, options.record, "client", options, secure=keyring is not None
-        ) as feed,
+        process.begin(
+            "client",
+            replace(options, json=None) if alone else options,
+            client_columns(options.config.model.axes),
+            secure=keyring is not None,
+            warnings=command.flight_warnings(options.config),
+            keeps_rows=True,
+        ) as running,
+        ExitStack() as stack,
     ):
-        recorder = process.recorder("client", columns, recording, feed)
-        before = _before(memory, scenario, numbers[0], warnings) if memory else None
+        scenario = running.scenario
+        flying = [vehicles.make(scenario, number) for number in numbers]
+        memory = stack.enter_context(_memory(options, flying, keyring))
+        before = _before(memory, scenario, numbers[0], running.warnings) if memory else None
         if kernel := sys.modules.get("skytether.shared.base.kernel"):  # what flies has some
             terminal.prepare(kernel.missing())
             kernel.load()
@@ -152,18 +137,15 @@ def fly(argv: Sequence[str]) -> None:
                 vehicle=number,
                 boot_id=secrets.randbits(64),
                 link=link(number),
-                recorder=recorder,
+                recorder=running.recorder,
                 keeps=memory is not None,
                 before=before,
             )
             for number, flies in zip(numbers, flying, strict=True)
         ]
-        alone = len(clients) == 1
         endpoint = clients[0] if alone else Fleet(clients, apart_ns(len(clients), scenario.dt_ns))
-        process.drive(
-            "client",
+        running.drive(
             Steady(endpoint),
-            options,
             bind=None,
             peers=[server],
             waiting_for=(
@@ -171,20 +153,13 @@ def fly(argv: Sequence[str]) -> None:
                 if line
                 else f"the server at {options.server}"
             ),
-            secure=keyring is not None,
             insecure=options.insecure,
-            log=options.log,
-            json=None if alone else options.json,
-            recording=recording,
-            control=options.control,
-            journal=taken_up.journal,
-            feed=feed,
-            metrics=command.optional_address("--metrics", options.metrics),
             line=line,
             is_patient=True,
             memory=memory,
-            warnings=warnings,
         )
+        recording = running.recording
+        assert recording
         if alone and len(rows := recording.rows()):
             summary = summarise(scenario, options.scenario, rows, secure=keyring is not None)
             title = "client, as far as it is recorded" if recording.fault() else "client"

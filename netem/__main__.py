@@ -9,22 +9,18 @@ if __name__ == "__main__":  # before the imports below, which take a while
 
 import gc
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated
 
 from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command, process
-from skytether.shell.command import ScenarioFlags, ScenarioName
-from skytether.shell.journal import take_up
-from skytether.shell.log import LogFormat
 from skytether.shell.options import Argument
+from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
@@ -33,11 +29,9 @@ default of 700 objects looks through all of them many times a second."""
 
 
 @dataclass(frozen=True)
-class NetemOptions:
+class NetemOptions(ProcessOptions):
     """Options of `skytether netem`."""
 
-    scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host stands in brackets,
     as in [::1]:47000; its socket hears IPv6 alone, even that of [::]. A name means its IPv4
@@ -50,27 +44,9 @@ class NetemOptions:
     only one of uplink and downlink is given, the other passes everything at once."""
     downlink: str | None = None
     """Impairments of packets from clients to the server, written as for uplink."""
-    log: LogFormat = "text"
-    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
-    record: Path | None = None
-    """File for netem's part of the record: the fate of every packet. One that ends in .mcap becomes
-    a recording with all that netem says, see `skytether join`."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Most clients at once, each of which takes a socket: 512 unless given, or as many as the
     system allows."""
-    json: Path | None = None
-    """File for what was counted, and the CPU time it took."""
-    control: Path | None = None
-    """Unix socket to make, through which keys change in flight, see `skytether set`."""
-    new_flight: bool = False
-    """Begin a new flight: what was set in flight in an earlier run, and lies beside the socket of
-    --control, does not count. A person says so; the command of a service must not."""
-    feed: Path | None = None
-    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
-    metrics: str | None = None
-    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def emulate(argv: Sequence[str]) -> None:
@@ -93,31 +69,10 @@ def emulate(argv: Sequence[str]) -> None:
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
     _check_server(server, bind)
-    part = process.part_of(options.record)
-    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
-    with (
-        process.recorded(part, PACKET_COLUMNS) if part else nullcontext() as recording,
-        process.fed(options.feed, options.record, "netem", options, secure=False) as feed,
-    ):
-        recorder = process.recorder("netem", PACKET_COLUMNS, recording, feed)
-        endpoint = Proxy(taken_up.scenario, server=server, flows=flows, recorder=recorder)
-        process.drive(
-            "netem",
-            endpoint,
-            options,
-            bind=bind,
-            peers=[server],
-            waiting_for=f"clients of {options.server}",
-            secure=None,
-            log=options.log,
-            json=options.json,
-            recording=recording,
-            control=options.control,
-            journal=taken_up.journal,
-            feed=feed,
-            metrics=command.optional_address("--metrics", options.metrics),
-            warnings=taken_up.news,
-        )
+    with process.begin("netem", options, PACKET_COLUMNS, secure=None) as running:
+        endpoint = Proxy(running.scenario, server=server, flows=flows, recorder=running.recorder)
+        waiting_for = f"clients of {options.server}"
+        running.drive(endpoint, bind=bind, peers=[server], waiting_for=waiting_for)
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:

@@ -8,28 +8,25 @@ if __name__ == "__main__":  # first, before the imports below, which take a whil
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from skytether.autopilot import faults
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base import kernel
-from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS
 from skytether.shell import command, process, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.shell.log import LogFormat
+from skytether.shell.command import CommandError, ScenarioName
 from skytether.shell.options import Argument
+from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import is_loopback, look_up
 
 BIND = "127.0.0.1:14550"
 
 
 @dataclass(frozen=True)
-class AutopilotOptions:
+class AutopilotOptions(ProcessOptions):
     """Options of `skytether autopilot`."""
 
     scenario: ScenarioName = "demo"
@@ -63,19 +60,6 @@ class AutopilotOptions:
     insecure: bool = False
     """Listen even where other machines can reach it: MAVLink has no keys, anybody there can fly
     it."""
-    log: LogFormat = "text"
-    """Form of printed events: sentences, or lines of JSON for a program."""
-    record: Path | None = None
-    """File for the autopilot's part of the record: the vehicle's true state every 5 ms."""
-    json: Path | None = None
-    """File for counters and the CPU time used."""
-    control: Path | None = None
-    """Unix socket to create, through which the wind can be changed in flight, see `skytether
-    set`."""
-    metrics: str | None = None
-    """HTTP address for metrics, HOST:PORT, for Prometheus, and /healthz."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def pilot(argv: Sequence[str]) -> None:
@@ -93,31 +77,16 @@ def pilot(argv: Sequence[str]) -> None:
         said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
         raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
     peers = [to] if to else []
-    record = options.record
-    with process.recorded(record, TRUTH_COLUMNS) if record else nullcontext() as recording:
+    with process.begin("autopilot", options, TRUTH_COLUMNS, secure=None) as running:
         endpoint = Autopilot(
-            options.config,
+            running.scenario,
             options.flavour,
             peers=peers,
             ready_s=options.ready,
             faults=[faults.parse(each) for each in options.fault],
-            recorder=recording.recorder if recording else None,
+            recorder=running.recorder,
         )
-        process.drive(
-            "autopilot",
-            endpoint,
-            options,
-            bind=bind,
-            peers=peers,
-            waiting_for="MAVLink",
-            secure=None,
-            log=options.log,
-            json=options.json,
-            recording=recording,
-            control=options.control,
-            metrics=command.optional_address("--metrics", options.metrics),
-            ready=_ready,
-        )
+        running.drive(endpoint, bind=bind, peers=peers, waiting_for="MAVLink", ready=_ready)
 
 
 def _ready() -> None:

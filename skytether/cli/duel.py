@@ -1,11 +1,10 @@
 """`skytether duel`: two scenarios on the same network and seed, side by side on one page."""
 
-import contextlib
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +15,7 @@ from skytether.cli import page_process, processes
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError
@@ -71,8 +70,7 @@ def duel(argv: Sequence[str]) -> None:
         with closing(Player(flights, frames)) as player:
             until_told(at, flights, now_ns=player.now_ns, more=player.controls)
         return
-    with temporary.folder() as folder:
-        _really((one, other), names, folder, options.page)
+    _really((one, other), names, options.page)
 
 
 def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
@@ -104,40 +102,26 @@ def titles(one: str, other: str) -> tuple[str, str]:
     return names if names[0] != names[1] else (f"{names[0]} 1", f"{names[1]} 2")
 
 
-def _really(scenarios: Sequence[Scenario], names: Sequence[str], folder: Path, page: str) -> None:
+def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> None:
     """Fly both scenarios over UDP at once, each with its own processes."""
-    sockets, parts = [folder / name for name in names], [folder / f"{name}.d" for name in names]
-    for each in (*sockets, *parts):
-        each.mkdir(mode=0o700)
 
-    def say(line: object) -> None:
-        # The terminal may be gone: this is no reason to end the flight.
-        with contextlib.suppress(OSError):
-            print(line, file=sys.stderr)
+    def fly(scenario: Scenario, sockets: Path) -> Record:
+        run = partial(processes.run, on_second=on_second, interrupted=interrupted, sockets=sockets)
+        return processes.flown(scenario, run)
 
-    def fly(place: int, on_second: Callable[[float], None]) -> None:
-        processes.run(
-            scenarios[place],
-            parts[place],
-            on_second=on_second,
-            interrupted=interrupted,
-            control=sockets[place],
-            feeds=sockets[place],
-        )
-
-    title = f"flying {' and '.join(names)}"
-    with (
-        page_process.beside(sockets, page, say),
-        command.interruptible() as interrupted,
-        terminal.progress(title, scenarios[0].duration) as on_second,
-        ThreadPoolExecutor(len(names)) as pool,
-    ):
-        flying = [pool.submit(fly, place, on_second) for place in range(len(names))]
-        for one in flying:
-            one.result()
-    for scenario, name, part in zip(scenarios, names, parts, strict=True):
-        rows = [record.read(part / each) for each in ("client", "server", "netem")]
-        if not len(rows[0]):
+    with ExitStack() as stack:
+        folder = stack.enter_context(temporary.folder())
+        sockets = [folder / name for name in names]
+        for each in sockets:
+            each.mkdir(mode=0o700)
+        stack.enter_context(page_process.beside(sockets, page))
+        interrupted = stack.enter_context(command.interruptible())
+        title = f"flying {' and '.join(names)}"
+        on_second = stack.enter_context(terminal.progress(title, scenarios[0].duration))
+        pool = stack.enter_context(ThreadPoolExecutor(len(names)))
+        flights = list(pool.map(fly, scenarios, sockets))
+    for scenario, name, flown in zip(scenarios, names, flights, strict=True):
+        if not len(flown.client):
             raise CommandError("interrupted before the first step", command.INTERRUPTED)
         title = f"{name}, over UDP on loopback, seed {scenario.seed}"
-        terminal.finish(summarise(scenario, name, *rows), title)
+        terminal.finish(summarise(scenario, name, flown.client, flown.server, flown.netem), title)

@@ -1,15 +1,13 @@
 """`skytether fleet`: many vehicles on one server, over real UDP or in virtual time."""
 
-import json
 import threading
 import time
-from argparse import ArgumentError, ArgumentParser
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -22,18 +20,17 @@ from skytether.cli import page_process, processes
 from skytether.figures import film
 from skytether.figures import flights as figures
 from skytether.shared.base import kernel
-from skytether.shared.core.events import Event, NotFlown
+from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry import record
-from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
-from skytether.shell import command, temporary, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.sim import flight
+from skytether.shell import command, plugins, terminal
+from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
+from skytether.sim import flight as sim
 
 VEHICLES = 20
 """Default number of vehicles."""
@@ -44,7 +41,7 @@ STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger",
 
 
 @dataclass(frozen=True)
-class FleetOptions:
+class FleetOptions(ScenarioOptions):
     """Options of `skytether fleet`."""
 
     scenario: ScenarioName = "fleet"
@@ -68,8 +65,6 @@ class FleetOptions:
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg), or a film (.gif)."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,25 +126,13 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class FleetFlight:
-    """A fleet's flight: what the vehicles recorded, and the figures of each process."""
+    """A fleet's flight, and what it cost the machine."""
 
-    client: Rows
-    servers: list[dict[str, Any]]
-    """Figures of each server worker."""
-    netem: dict[str, Any]
-    """Figures of netem."""
-    processes: dict[str, dict[str, Any]]
-    """Figures of the processes "client" and "netem", where there are such processes."""
-    failure: Event | None = None
-    """Event of the first vehicle that did not fly, or did not fly to the end."""
-    machine: "Metronome | None" = None
-    """Measure of how late the machine woke a sleeping thread, over real UDP."""
+    record: Record
+    machine: "Lateness | None" = None
+    """How late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
     """CPU time of everything together [s], in virtual time."""
-    server: Rows | None = None
-    """Rows of the server, in virtual time."""
-    vehicles: dict[str, Any] = field(default_factory=dict)
-    """Figures of each vehicle, by its number."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -180,23 +163,23 @@ def fleet(argv: Sequence[str]) -> None:
         command.interruptible() as interrupted,
         terminal.progress(f"flying {title}", options.config.duration) as on_second,
     ):
-        flown = (_virtually if options.virtual else _really)(
-            options, vehicles, on_second, interrupted
-        )
+        fly = _virtually if options.virtual else _really
+        flight = fly(options, vehicles, on_second, interrupted)
+    flown = flight.record
     if not len(flown.client):
         raise CommandError("interrupted before the first step", command.INTERRUPTED)
-    apart = _separations(options.config, flown.client, flown.vehicles)
-    summary = _summarise(options, flown, apart and float(np.nanmin(apart[1])))
+    apart = _separations(options.config, flown)
+    summary = _summarise(options, flight, apart and float(np.nanmin(apart[1])))
     _show(summary, title)
     if options.json:
         command.write(options.json, msgspec.json.encode(summary))
     if options.figure and options.figure.suffix == film.SUFFIX:
-        flight = options.config, flown.client
-        with terminal.progress("drawing the film", film.length(*flight), "frames") as bar:
-            film.write(options.figure, title, *flight, apart, bar)
+        shown = options.config, flown.client
+        with terminal.progress("drawing the film", film.length(*shown), "frames") as bar:
+            film.write(options.figure, title, *shown, apart, bar)
     elif options.figure:
-        told = flown.client, flown.server, apart
-        figures.fleet(options.figure, title, options.config, *told)
+        server = flown.server if options.virtual else None
+        figures.fleet(options.figure, title, options.config, flown.client, server, apart)
     if flown.failure:
         raise CommandError(str(flown.failure))
 
@@ -207,26 +190,24 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     Raises:
         CommandError: a scenario is given as well, or the file is no table of goals.
     """
-    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--mission")
-    try:
-        found, rest = parser.parse_known_args(list(argv))
-    except ArgumentError:
-        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION) from None
-    if found.mission is None:
+    missions, rest = plugins.flag_values(argv, "--mission")
+    if "--mission" in rest:
+        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION)
+    if not missions:
         return rest
+    mission = missions[-1]
     if rest and not rest[0].startswith("-"):
         said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
         raise CommandError(said, command.CONFIGURATION)
-    if not found.mission.endswith(".csv"):
-        return [found.mission, *rest]
+    if not mission.endswith(".csv"):
+        return [mission, *rest]
     try:
-        with Path(found.mission).open(encoding="utf-8") as table:
+        with Path(mission).open(encoding="utf-8") as table:
             axes = 3 if "z" in table.readline().strip().split(",") else 2
-        lasts_s = read_mission(Path(found.mission), axes).lasts_s
+        lasts_s = read_mission(Path(mission), axes).lasts_s
     except (OSError, ValueError) as error:
-        raise CommandError(f"--mission: {found.mission}: {error}", command.CONFIGURATION) from None
-    shape = ["--reference.shape", "mission", "--reference.file", found.mission]
+        raise CommandError(f"--mission: {mission}: {error}", command.CONFIGURATION) from None
+    shape = ["--reference.shape", "mission", "--reference.file", mission]
     flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
     return ["swap", *shape, *flown, *rest]
 
@@ -239,7 +220,7 @@ def _virtually(
 ) -> FleetFlight:
     kernel.load()
     began_s = time.process_time()
-    flown = flight.fly(
+    flown = sim.fly(
         options.config,
         vehicles=vehicles,
         secure=options.secure,
@@ -249,29 +230,7 @@ def _virtually(
     )
     if flown.failure and not isinstance(flown.failure, NotFlown):
         raise CommandError(str(flown.failure))
-    return FleetFlight(
-        client=flown.client,
-        servers=[flown.figures["server"]],
-        netem=flown.figures["netem"],
-        processes={},
-        failure=flown.failure,
-        cpu_s=time.process_time() - began_s,
-        server=flown.server,
-        vehicles=flown.figures["client"]["by_vehicle"],
-    )
-
-
-@contextmanager
-def _paged(options: FleetOptions) -> Iterator[Path | None]:
-    """Serve a page if one is asked for; yields the folder of its sockets."""
-    if options.page is None:
-        yield None
-        return
-    with (
-        temporary.folder() as folder,
-        page_process.beside([folder], options.page, page_process.say),
-    ):
-        yield folder
+    return FleetFlight(flown, cpu_s=time.process_time() - began_s)
 
 
 def _really(
@@ -281,65 +240,60 @@ def _really(
     interrupted: Callable[[], bool],
 ) -> FleetFlight:
     with (
-        temporary.folder() as parts,
-        _paged(options) as sockets,
-        Metronome(options) as machine,
+        page_process.paged(options.page) as sockets,
+        metronome(options.config.control.dt) as machine,
     ):
-        shortfalls = processes.run(
-            options.config,
-            parts,
+        run = partial(
+            processes.run,
             on_second=on_second,
             interrupted=interrupted,
             vehicles=vehicles,
             workers=options.workers,
             watched=False,
             secure=options.secure,
-            control=sockets,
-            feeds=sockets,
+            sockets=sockets,
         )
-        incomplete = [each for each in shortfalls if not isinstance(each, NotFlown)]
-        if incomplete:
-            raise CommandError("; ".join(map(str, incomplete)))
-        servers = [json.loads(part.read_bytes()) for part in parts.glob("server.json*")]
-        rest = {
-            name: json.loads((parts / f"{name}.json").read_bytes()) for name in ("netem", "client")
-        }
-        failure = next(iter(shortfalls), None)
-        client = record.read(parts / "client")
-        told = rest["client"]["by_vehicle"]
-        return FleetFlight(client, servers, rest["netem"], rest, failure, machine, vehicles=told)
+        flown = processes.flown(options.config, run)
+    if flown.incomplete:
+        raise CommandError("; ".join(map(str, flown.incomplete)))
+    return FleetFlight(flown, machine)
 
 
-class Metronome:
-    """Thread that only sleeps, step by step: the steps it misses are the machine's fault."""
+@dataclass(slots=True)
+class Lateness:
+    """How late the machine woke a thread that only sleeps."""
 
-    def __init__(self, options: FleetOptions) -> None:
-        self._dt_s = options.config.control.dt
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._sleep, daemon=True)
-        self.missed = 0
-        self.late_s_max = 0.0
+    missed: int = 0
+    """Steps that the thread missed."""
+    max_s: float = 0.0
+    """Largest delay with which it woke [s]."""
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
 
-    def __exit__(
-        self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
+@contextmanager
+def metronome(dt_s: float) -> Iterator[Lateness]:
+    """Let a thread sleep step by step for as long as the block takes: the steps that it misses are
+    the machine's fault.
+    """
+    late, over = Lateness(), threading.Event()
 
-    def _sleep(self) -> None:
+    def sleep() -> None:
         due_s = time.monotonic()
-        while not self._over.is_set():
-            due_s += self._dt_s
+        while not over.is_set():
+            due_s += dt_s
             time.sleep(max(0.0, due_s - time.monotonic()))
             late_s = time.monotonic() - due_s
-            self.late_s_max = max(self.late_s_max, late_s)
-            missed = int(late_s / self._dt_s)
-            self.missed += missed
-            due_s += missed * self._dt_s
+            late.max_s = max(late.max_s, late_s)
+            missed = int(late_s / dt_s)
+            late.missed += missed
+            due_s += missed * dt_s
+
+    thread = threading.Thread(target=sleep, daemon=True)
+    thread.start()
+    try:
+        yield late
+    finally:
+        over.set()
+        thread.join()
 
 
 def _vehicles(options: FleetOptions) -> int:
@@ -359,10 +313,9 @@ def _vehicles(options: FleetOptions) -> int:
     return count
 
 
-def _separations(
-    scenario: Scenario, client: Rows, vehicles: Mapping[str, Any]
-) -> tuple[Array, Array] | None:
+def _separations(scenario: Scenario, flown: Record) -> tuple[Array, Array] | None:
     """Distances between a mission's vehicles over time, see `separations`; None where unknown."""
+    client, vehicles = flown.client, flown.figures["client"].get("by_vehicle", {})
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
@@ -374,23 +327,27 @@ def _separations(
     return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
 
-def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None) -> FleetSummary:
-    scenario, client, servers, netem = options.config, flown.client, flown.servers, flown.netem
+def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None) -> FleetSummary:
+    scenario, flown, machine = options.config, flight.record, flight.machine
+    client, counted = flown.client, flown.figures
+    server = flown.server if options.virtual else None
+    servers = [counted[name] for name in counted if name.startswith("server")]
+    measured = [each for each in counted.values() if "cpu_s" in each]
     steps = sum(server["counts"].get("steps", 0) for server in servers)
     spent_us = {
         stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
         for stage in STAGES
     }
     spent_us = {stage: us for stage, us in spent_us.items() if us}
-    if all("cpu_s" in server for server in servers):
+    if measured:
         spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
     duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
     each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
-    rmse = [summarise(scenario, options.scenario, rows, flown.server).rmse_xy for rows in each]
+    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in each]
     known = [value for value in rmse if value is not None]
-    links = (netem["uplink"], netem["downlink"])
+    links = (counted["netem"]["uplink"], counted["netem"]["downlink"])
     packets = sum(link["packets"] for link in links)
-    cpu_s = {name: figures["cpu_s"] for name, figures in flown.processes.items()}
+    cpu_us = {name: each["cpu_s"] * 1e6 for name, each in counted.items() if "cpu_s" in each}
     return FleetSummary(
         scenario=options.scenario,
         seed=scenario.seed,
@@ -411,21 +368,17 @@ def _summarise(options: FleetOptions, flown: FleetFlight, least_m: float | None)
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
-        + sum(
-            process["kernel_drops"] + process["send_errors"]
-            for process in (*flown.processes.values(), *servers)
-            if "cpu_s" in process
-        ),
+        + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
         client_missed=sum(int(rows["missed"][-1]) for rows in each),
-        machine_missed=flown.machine.missed if flown.machine else None,
-        machine_late_ms_max=flown.machine.late_s_max * 1e3 if flown.machine else None,
+        machine_missed=machine.missed if machine else None,
+        machine_late_ms_max=machine.max_s * 1e3 if machine else None,
         server_cpu_us=spent_us,
-        client_cpu_us=cpu_s["client"] * 1e6 / len(client) if cpu_s else None,
-        netem_cpu_us=cpu_s["netem"] * 1e6 / max(packets, 1) if cpu_s else None,
-        vehicle_steps_per_core_s=len(client) / flown.cpu_s if flown.cpu_s else None,
+        client_cpu_us=cpu_us["client"] / len(client) if "client" in cpu_us else None,
+        netem_cpu_us=cpu_us["netem"] / max(packets, 1) if cpu_us else None,
+        vehicle_steps_per_core_s=len(client) / flight.cpu_s if flight.cpu_s else None,
     )
 
 

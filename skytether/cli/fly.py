@@ -1,11 +1,11 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
 
-import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -32,7 +32,7 @@ from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command, temporary, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.command import CommandError, ScenarioOptions
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
@@ -47,11 +47,9 @@ ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 
 
 @dataclass(frozen=True)
-class FlyOptions:
+class FlyOptions(ScenarioOptions):
     """Options of `skytether fly`."""
 
-    scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
@@ -82,8 +80,6 @@ class FlyOptions:
     Lichtblick can show the file."""
     beside: str | None = None
     """Second scenario to compare with, flown in virtual time with the same duration and seed."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def fly(argv: Sequence[str]) -> None:
@@ -109,7 +105,8 @@ def fly(argv: Sequence[str]) -> None:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
     vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
-    with _paged(options) as sockets:
+    page = None if options.virtual or options.no_page else options.page
+    with page_process.paged(page, options.control) as sockets:
         both = [scenario, beside] if beside else [scenario]
         terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, both))))
         with (
@@ -162,19 +159,6 @@ def _show(
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
-
-
-@contextlib.contextmanager
-def _paged(options: FlyOptions) -> Iterator[Path | None]:
-    """Serve a page of the flight, unless none is wanted; yields the folder of its sockets."""
-    if options.virtual or options.no_page or options.page == page_process.NONE:
-        yield options.control
-        return
-    command.address("--page", options.page)
-    with ExitStack() as stack:
-        folder = options.control or stack.enter_context(temporary.folder())
-        stack.enter_context(page_process.beside([folder], options.page, page_process.say))
-        yield folder
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:
@@ -233,38 +217,30 @@ def _really(
     interrupted: Callable[[], bool],
 ) -> tuple[Record, str | None]:
     """Fly over UDP; returns the flight, and a sentence on what its recording lacks."""
-    with temporary.folder() as parts, ExitStack() as stack:
-        scenario = options.config
-        feeds = sockets or (parts if options.record else None)
+    scenario, name, secure = options.config, options.scenario, options.secure
+    with ExitStack() as stack:
         live = None
-        if options.record and feeds:
+        if options.record:
             from skytether.cli import recorder
 
-            live = recorder.Live(
-                options.record,
-                processes.feeds_in(feeds),
-                scenario,
-                options.scenario,
-                secure=options.secure,
-                tell=_tell,
-            )
+            sockets = sockets or stack.enter_context(temporary.folder())
+            feeds = processes.feeds_in(sockets)
+            live = recorder.Live(options.record, feeds, scenario, name, secure=secure, tell=_tell)
             stack.callback(live.finish)
-        shortfalls = processes.run(
-            scenario,
-            parts,
+        run = partial(
+            processes.run,
             on_second=on_second,
             interrupted=interrupted,
             on_event=lambda line: _tell(line.event),
-            secure=options.secure,
+            secure=secure,
             set_parameters=options.set_parameters,
-            control=sockets,
-            feeds=feeds,
+            sockets=sockets,
         )
-        flown = processes.record_of(parts, scenario, shortfalls)
+        flown = processes.flown(scenario, run)
         if live is None:
             return flown, None
-        summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
-        return flown, live.finish(summary if len(flown.client) else None, flown)
+        summary = _summarise(scenario, name, flown, secure=secure) if len(flown.client) else None
+        return flown, live.finish(summary, flown)
 
 
 def _missing(scenario: Scenario, flown: Record) -> str | None:

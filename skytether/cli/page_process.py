@@ -4,11 +4,11 @@ import contextlib
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from skytether.shared.base.printable import printable
-from skytether.shell import plugins
+from skytether.shell import command, plugins, temporary
 from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
@@ -20,13 +20,30 @@ NONE = "none"
 
 
 @contextlib.contextmanager
-def beside(folders: Sequence[Path], at: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Serve a page of flights for as long as the block takes.
+def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
+    """Serve a page of a flight for as long as the block takes; yields the folder of its sockets.
 
     Args:
-        folders: folders of the flights.
-        at: HOST:PORT.
-        say: called in a thread with the page's address, or with the reason why there is no page.
+        at: HOST:PORT, or NONE: no page, as without an address.
+        folder: folder of the flight's sockets; with a page, a temporary one unless given.
+
+    Raises:
+        CommandError: the address is none.
+    """
+    if at is None or at == NONE:
+        yield folder
+        return
+    command.address("--page", at)
+    with contextlib.ExitStack() as stack:
+        folder = folder or stack.enter_context(temporary.folder())
+        stack.enter_context(beside([folder], at))
+        yield folder
+
+
+@contextlib.contextmanager
+def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
+    """Serve a page of flights at HOST:PORT for as long as the block takes; its address, or the
+    reason why there is none, is printed.
     """
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(

@@ -9,6 +9,7 @@ The loop is asyncio's own: uvloop would reset signals that the children must go 
 
 import asyncio
 import contextlib
+import json
 import signal
 import sys
 from collections import deque
@@ -42,7 +43,7 @@ from skytether.shared.telemetry.record import (
     read,
     server_columns,
 )
-from skytether.shell import plugins
+from skytether.shell import plugins, temporary
 from skytether.shell.command import INTERRUPTED, CommandError
 from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
@@ -200,8 +201,7 @@ def run(
     watched: bool = True,
     secure: bool = False,
     set_parameters: bool = False,
-    control: Path | None = None,
-    feeds: Path | None = None,
+    sockets: Path | None = None,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
 
@@ -219,9 +219,8 @@ def run(
         watched: whether server and netem record, too.
         secure: whether the link is sealed, with keys that are made for this flight.
         set_parameters: whether the client makes its autopilot's parameters safe.
-        control: folder for a socket of each process, through which keys change in flight.
-        feeds: folder for the feed of each process, called as in `server.feed`; of several workers,
-            as in `server.feed.1`.
+        sockets: folder for two sockets of each process: `server`, through which keys change in
+            flight, and `server.feed`, its feed; of several workers, `server.1`, `server.feed.1`.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -241,11 +240,12 @@ def run(
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
-        part = ["--record", str(parts / name)] if recorded else []
-        heeds = ["--control", str(control / name)] if control else []
-        tells = ["--feed", str(feeds_in(feeds)[name])] if feeds else []
         # Whoever says `fly` begins a new flight.
-        told = ["--json", str(parts / f"{name}.json"), "--new-flight", *part, *heeds, *tells]
+        told = ["--json", str(parts / f"{name}.json"), "--new-flight"]
+        if recorded:
+            told += ["--record", str(parts / name)]
+        if sockets:
+            told += ["--control", str(sockets / name), "--feed", str(feeds_in(sockets)[name])]
         return [name, str(file), *told, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
@@ -308,6 +308,12 @@ def fly_chain(
     asyncio.run(main())
 
 
+def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) -> Record:
+    """Record of a flight by `run`, given its other arguments as in `partial(run, workers=2)`."""
+    with temporary.folder() as parts:
+        return record_of(parts, scenario, fly(scenario, parts))
+
+
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
@@ -323,11 +329,13 @@ def record_of(
     netem = _rows(parts / "netem", PACKET_COLUMNS).copy()
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
+    counted = {path.name.replace(".json", ""): path.read_bytes() for path in parts.glob("*.json*")}
     return Record(
         client=_rows(parts / "client", client_columns(axes)),
         server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
+        figures={name: json.loads(told) for name, told in counted.items() if told},
         events=tuple(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
@@ -337,10 +345,12 @@ def record_of(
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
-    """Rows of a part of the record; none where the disk was too full even for the file's header."""
+    """Rows of a part of the record; none where there is no part, or where the disk was too full
+    even for its header.
+    """
     try:
         return read(part)
-    except ValueError:
+    except (ValueError, FileNotFoundError):
         return np.empty(0, columns)
 
 

@@ -1,6 +1,5 @@
 """`skytether set`: change keys of a scenario in flight."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +8,10 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from skytether.shared.base import toml
 from skytether.shared.core.change import REQUEST_BYTES_MAX
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.control import Caller, ControlError
-from skytether.shell.options import read
+from skytether.shell.options import read, toml_value
 
 
 @dataclass(frozen=True)
@@ -64,18 +62,9 @@ def parsed(changes: Sequence[str]) -> dict[str, Any]:
             raise CommandError(f"got {change!r}, expected KEY=VALUE", CONFIGURATION)
         if key in values:
             raise CommandError(f"{key}: got two values, expected one", CONFIGURATION)
-        values[key] = value(text.strip())
+        values[key] = toml_value(text.strip())
     size = len(msgspec.json.encode(values))
     if size > REQUEST_BYTES_MAX:
         expected = f"expected at most {REQUEST_BYTES_MAX} B at a time"
         raise CommandError(f"got {size} B of keys and values, {expected}", CONFIGURATION)
     return values
-
-
-def value(text: str) -> Any:
-    """Value of a text as TOML if JSON can express it too; any other text is a string itself."""
-    try:
-        table = toml.loads(f"value = {text}")
-        return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
-    except (ValueError, RecursionError, TypeError):
-        return text

@@ -13,10 +13,9 @@ from skytether.shared.base import files, kernel
 from skytether.shared.core.aboard import AutopilotRefused, AutopilotText
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record, read
 from skytether.shell import command, temporary, terminal
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import straight as virtual
 from skytether.station import laws
 from skytether.station.joined import joined, summary_of
@@ -27,7 +26,7 @@ TOLD = AutopilotRefused, AutopilotText, Fault
 
 
 @dataclass(frozen=True)
-class StraightOptions(LawOptions):
+class StraightOptions(LawOptions, ScenarioOptions):
     """Options of `skytether straight`."""
 
     scenario: ScenarioName = "autopilot"
@@ -41,8 +40,6 @@ class StraightOptions(LawOptions):
     """File for the summary of the flight."""
     figure: Path | None = None
     """File for a picture of the flight (.png, .pdf or .svg)."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def straight(argv: Sequence[str]) -> None:

@@ -8,14 +8,13 @@ import os
 import signal
 import sys
 import threading
-from argparse import ArgumentError, ArgumentParser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from errno import EMFILE
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 import msgspec
 
@@ -29,7 +28,7 @@ from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
-from skytether.shell.options import Argument, read
+from skytether.shell.options import Argument, asks_help, key_values, read
 from skytether.shell.udp import (
     SPARE_FILES,
     allow_sockets,
@@ -55,6 +54,16 @@ Plugins = Annotated[
         "`skytether triggers` and `skytether references`.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ScenarioOptions:
+    """Options of a command that flies a scenario."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    plugin: Plugins = ()
+    config: ScenarioFlags = Scenario()
 
 
 class CommandError(Exception):
@@ -109,34 +118,37 @@ def parse(
         SystemExit: tyro has shown the help, or what is wrong with a flag.
     """
     plugins.load(plugins.named(argv))
-    named = leads and argv and not argv[0].startswith("-")
-    name = argv[0] if named else defaults.scenario
-    argv, directions = _directions(argv)
-    while True:
-        config = reading.with_directions(base := reading.load_base(name), directions)
-        default = replace(defaults, scenario=name, config=config)  # type: ignore[type-var]
-        options = read(default, argv, prog, help_)
-        if options.scenario == name:
-            break
-        name = options.scenario
+    argv, values = key_values(argv, type(defaults))
+    if asks_help(argv):  # it shows the keys as they are in the scenario
+        named = leads and argv and not argv[0].startswith("-")
+        base = reading.load_base(argv[0] if named else defaults.scenario)
+        defaults = replace(defaults, config=base)  # type: ignore[type-var]
+    options = read(defaults, argv, prog, help_)
+    name = options.scenario
+    base = reading.load_base(name)
+    table = _laid(base, values)
     read_scenario = reading.check if is_final else reading.convert
-    source = name if options.config == base else f"{name} and the command line"
-    checked = read_scenario(reading.to_table(options.config), source)
+    source = name if table == reading.to_table(base) else f"{name} and the command line"
+    checked = read_scenario(table, source)
     for option in OUTPUTS:
         claim_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]
 
 
-def _directions(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Command line without network directions given as texts, and these directions."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for way in reading.DIRECTIONS:
-        parser.add_argument(f"--network.{way}", dest=way)
-    try:
-        found, rest = parser.parse_known_args(list(argv))
-    except ArgumentError as error:
-        raise CommandError(f"{error.argument_name}: expected a text", CONFIGURATION) from None
-    return rest, {way: text for way, text in vars(found).items() if text is not None}
+def _laid(scenario: Scenario, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Table of a scenario with values of keys; a key that there is not is in it as well."""
+    whole = {f"network.{way}": way for way in reading.DIRECTIONS}
+    directions = {whole[key]: text for key, text in values.items() if key in whole}
+    table = reading.to_table(reading.with_directions(scenario, directions))
+    for key in values.keys() - whole.keys():
+        *sections, name = key.split(".")
+        below: Any = table
+        for section in sections:
+            below = below.setdefault(section, {})
+            if not isinstance(below, dict):
+                raise ConfigError(f"{key}: no such key")
+        below[name] = values[key]
+    return table
 
 
 def address(flag: str, text: str) -> Address:

@@ -3,31 +3,32 @@
     GET /metrics   counted figures, as text for Prometheus
     GET /healthz   200 while the process is healthy, else 503; JSON either way
 
-The loop hands over its figures once a second; a thread renders them and answers. The thread never
-touches the endpoint. A connection has a bounded time, and the oldest is closed where there are too
-many, so that no client keeps others out; at most 50 are accepted per second. Who comes by the name
-of a website is refused: a stranger may have pointed it here.
+The loop hands over its figures once a second; threads render them and answer, and never touch the
+endpoint. A connection has a bounded time, and the oldest is closed where there are too many, so
+that no client keeps others out; at most 50 are accepted per second. Who comes by the name of a
+website is refused: a stranger may have pointed it here.
 """
 
+import io
 import os
-import selectors
 import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from socketserver import ThreadingMixIn
 from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
+from wsgiref.types import StartResponse, WSGIEnvironment
 
 import msgspec
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.metrics_core import Metric as Exposed
 from prometheus_client.registry import Collector
-from prometheus_client.samples import Sample
 
 from skytether.shared.core.endpoint import Address
-from skytether.shell.metrics import OWN, PREFIX, TABLES, families, trouble
+from skytether.shell.metrics import OWN, families, trouble
 from skytether.shell.udp import from_kernel, look_up
 from skytether.shell.web import HEADERS, host_name, is_ours
 
@@ -37,10 +38,14 @@ PATIENCE_S = 5.0
 """Longest time for a request and its answer [s]."""
 REQUEST_BYTES_MAX = 8192
 """Largest size of a request [B]."""
+POLL_S = 0.1
+"""Interval at which connections that take too long are closed [s]."""
 REST_S = 0.02
 """Pause between two accepted connections [s]."""
 FRESH_S = 3.0
 """Age from which figures count as stale, and the process as stuck [s]."""
+BY_NAME = b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
+"""Answer to who comes by the name of a website."""
 
 
 class MetricsError(OSError):
@@ -70,9 +75,7 @@ class Collected(Collector):
     def collect(self) -> Iterable[Exposed]:
         """Metrics for prometheus_client, which calls this method."""
         labels = {"process": self._process, "scenario": self._scenario}
-        info, step_s, age_s, unmapped = (
-            Exposed(PREFIX + metric.name, metric.help, metric.kind) for metric in OWN
-        )
+        info, step_s, age_s, unmapped = (metric.exposed() for metric in OWN)
         info.add_sample(info.name, labels, 1.0)
         step_s.add_sample(step_s.name, {}, self._step_s)
         yield from (info, step_s)
@@ -82,16 +85,7 @@ class Collected(Collector):
         told, unknown = families(self._kind, figures)
         age_s.add_sample(age_s.name, {}, time.monotonic() - taken_s)
         unmapped.add_sample(unmapped.name, {}, float(len(unknown)))
-        yield from (age_s, unmapped)
-        for metric, samples in told:
-            kind = "gauge" if metric.kind == "modes" else metric.kind
-            # prometheus_client adds the suffix of a counter's name itself.
-            name = PREFIX + metric.name
-            exposed = Exposed(name.removesuffix("_total"), metric.help, kind)
-            exposed.samples += [
-                Sample(name + suffix, labels, value) for suffix, labels, value in samples
-            ]
-            yield exposed
+        yield from (age_s, unmapped, *told)
 
     def trouble(self) -> str:
         """Reason why the process is unhealthy; empty for a healthy one."""
@@ -103,27 +97,51 @@ class Collected(Collector):
             return f"it has been stuck for {age_s:.0f} s"
         return trouble(self._kind, figures)
 
-    def health(self) -> tuple[int, bytes]:
+    def health(self) -> tuple[str, bytes]:
         """Status and body of the answer to a health check."""
         why = self.trouble()
         told = {"process": self._process, "healthy": not why, "trouble": why}
-        return 503 if why else 200, msgspec.json.encode(told) + b"\n"
+        return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(told) + b"\n"
 
 
-@dataclass(slots=True)
-class _Scrape:
-    """Connection of one client."""
+class _Bounded(io.BufferedReader):
+    """Lines of a request, as long as all of them together may be."""
 
-    socket: socket.socket
-    until_s: float
-    """Time at which the connection is closed, complete or not [s]."""
-    request: bytearray = field(default_factory=bytearray)
-    answer: memoryview | None = None
-    """Remaining bytes of the answer; None until the request is complete."""
+    left = REQUEST_BYTES_MAX
+
+    def readline(self, _: int | None = -1, /) -> bytes:
+        """Read the next line.
+
+        Raises:
+            OSError: the request is too long.
+        """
+        line = super().readline(self.left + 1)
+        self.left -= len(line)
+        if self.left < 0:
+            raise OSError("the request is too long")
+        return line
 
 
-class Metrics:
-    """HTTP server of a process's metrics, in a thread.
+class _Handler(WSGIRequestHandler):
+    """Reader of a request; answers to what is no request have the common headers as well."""
+
+    def setup(self) -> None:
+        """Prepare to read."""
+        super().setup()
+        self.rfile = _Bounded(self.rfile.detach())
+
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+    def end_headers(self) -> None:
+        """Add the common headers."""
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+
+class Metrics(ThreadingMixIn, WSGIServer):
+    """HTTP server of a process's metrics, with a thread for each connection.
 
     Args:
         address: address to listen at; port 0 takes a free one.
@@ -133,164 +151,93 @@ class Metrics:
         MetricsError: the address cannot be listened at.
     """
 
+    daemon_threads = True
+
     def __init__(self, address: Address, collected: Collected) -> None:
+        listening = _listening(address)
+        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+        self.address = from_kernel(listening.getsockname())
+        """Address that the server listens at."""
+        # not looked up in the DNS, as `server_bind` would
+        self.server_name, self.server_port = self.address
+        self.setup_environ()
+        self.set_app(self._answer)
         self._collected = collected
         self._name = address[0].lower()
         """Name that the user has given this machine."""
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
-        self._socket = _listening(address)
-        self.address = from_kernel(self._socket.getsockname())
-        """Address that the server listens at."""
-        self._selector = selectors.DefaultSelector()
-        self._ours, self._waker = socket.socketpair()
-        self._selector.register(self._socket, selectors.EVENT_READ)
-        self._selector.register(self._ours, selectors.EVENT_READ)
-        self._connections: dict[int, _Scrape] = {}
-        """Connections by file descriptor, the oldest first."""
-        self._closed = False
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._connections: dict[socket.socket, float] = {}
+        """Times at which connections are closed, answered or not [s]; the oldest first."""
+        self._thread = threading.Thread(target=self.serve_forever, args=(POLL_S,), daemon=True)
         self._thread.start()
 
+    def close(self) -> None:
+        """Stop answering."""
+        self.shutdown()
+        self.server_close()
+
     def take(self, figures: Mapping[str, Any]) -> None:
-        """Serve these figures from now on."""
+        """Take new figures, which the caller must not change any more."""
         self._collected.take(figures)
 
-    def close(self) -> None:
-        """Stop serving."""
-        self._closed = True
-        with suppress(BrokenPipeError):  # the thread has ended already
-            self._waker.send(b"\0")
-        self._thread.join()
-        self._waker.close()
-
-    def _work(self) -> None:
-        try:
-            while not self._closed:
-                self._turn()
-        finally:
-            for connection in self._connections.values():
-                connection.socket.close()
-            self._selector.close()
-            self._socket.close()
-            self._ours.close()
-
-    def _turn(self) -> None:
-        oldest = next(iter(self._connections.values()), None)
-        wait_s = None if oldest is None else max(oldest.until_s - time.monotonic(), 0.0)
-        for key, _ in self._selector.select(wait_s):
-            if key.fileobj is self._socket:
-                self._accept()
-            elif key.fd in self._connections:
-                self._go_on(self._connections[key.fd])
-        now_s = time.monotonic()
-        for connection in tuple(self._connections.values()):
-            if now_s >= connection.until_s:
-                self._end(connection)
-
-    def _accept(self) -> None:
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Next connection, after a pause."""
         time.sleep(REST_S)
-        try:
-            sock, _ = self._socket.accept()
-        except OSError:  # the client is gone already, or too many files are open
-            return
-        if len(self._connections) == CONNECTIONS_MAX:
-            self._end(next(iter(self._connections.values())))
-        sock.setblocking(False)
-        self._connections[sock.fileno()] = _Scrape(sock, time.monotonic() + PATIENCE_S)
-        self._selector.register(sock, selectors.EVENT_READ)
+        return super().get_request()
 
-    def _go_on(self, connection: _Scrape) -> None:
-        """Read more of a request, or send more of its answer."""
-        try:
-            if connection.answer is None:
-                piece = connection.socket.recv(REQUEST_BYTES_MAX)
-                if not piece:
-                    self._end(connection)
-                    return
-                connection.request += piece
-                if not _is_whole(connection.request):
-                    return
-                connection.answer = memoryview(self._answer(bytes(connection.request)))
-                self._selector.modify(connection.socket, selectors.EVENT_WRITE)
-            connection.answer = connection.answer[connection.socket.send(connection.answer) :]
-        except BlockingIOError:
-            return
-        except OSError:
-            self._end(connection)
-            return
-        if not connection.answer:
-            self._end(connection)
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a connection in a thread; it takes the place of the oldest if there are many."""
+        for oldest in list(self._connections)[: 1 - CONNECTIONS_MAX]:
+            self._hang_up(oldest)
+        self._connections[request] = time.monotonic() + PATIENCE_S
+        super().process_request(request, client_address)
 
-    def _end(self, connection: _Scrape) -> None:
-        del self._connections[connection.socket.fileno()]
-        self._selector.unregister(connection.socket)
-        # data left unread would reset the connection and discard the answer
+    def service_actions(self) -> None:
+        """Close the connections that take too long."""
+        now_s = time.monotonic()
+        for connection, until_s in list(self._connections.items()):
+            if now_s >= until_s:
+                self._hang_up(connection)
+
+    def _hang_up(self, connection: socket.socket) -> None:
+        """End a connection, which its thread notices."""
+        self._connections.pop(connection, None)
         with suppress(OSError):
-            connection.socket.shutdown(socket.SHUT_WR)
-        connection.socket.close()
+            connection.shutdown(socket.SHUT_RDWR)
 
-    def _answer(self, request: bytes) -> bytes:
-        if len(request) > REQUEST_BYTES_MAX:
-            return _response(431, b"too long\n")
-        words = request.split(b"\r\n", 1)[0].split()
-        if len(words) != 3 or not words[2].startswith(b"HTTP/1."):
-            return _response(400, b"no request\n")
-        if words[0] != b"GET":
-            return _response(405, b"GET alone\n", "Allow: GET\r\n")
-        if not all(map(self._is_ours, _hosts(request))):
-            return _response(403, BY_NAME)
-        return self._page(words[1].split(b"?")[0])
+    def shutdown_request(self, request: Any) -> None:
+        """Forget a connection that is answered, or has failed."""
+        self._connections.pop(request, None)
+        super().shutdown_request(request)
 
-    def _page(self, path: bytes) -> bytes:
-        """Answer to a request for a path."""
-        match path:
-            case b"/metrics":
-                return _response(200, generate_latest(self._registry), kind=CONTENT_TYPE_LATEST)
-            case b"/healthz":
-                status, body = self._collected.health()
-                return _response(status, body, kind="application/json")
-        return _response(404, b"/metrics or /healthz\n")
+    def handle_error(self, *_: object) -> None:
+        """Nothing: the client is gone, or too slow."""
 
-    def _is_ours(self, host: str) -> bool:
+    def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"
+        more = list(HEADERS.items())
+        if not self._is_ours(environ.get("HTTP_HOST")):
+            status, body = "403 Forbidden", BY_NAME
+        elif environ["REQUEST_METHOD"] != "GET":
+            status, body = "405 Method Not Allowed", b"GET alone\n"
+            more.append(("Allow", "GET"))
+        elif environ["PATH_INFO"] == "/metrics":
+            status, kind, body = "200 OK", CONTENT_TYPE_LATEST, generate_latest(self._registry)
+        elif environ["PATH_INFO"] == "/healthz":
+            status, body = self._collected.health()
+            kind = "application/json"
+        start_response(status, [("Content-Type", kind), *more])
+        return [body]
+
+    def _is_ours(self, host: str | None) -> bool:
         """Whether a Host header is no name that a stranger can point at this machine."""
+        if host is None or "," in host:  # there is none, or there are several
+            return host is None
         name = host_name(host)
         return is_ours(name) or name == self._name or (name != "" and "." not in name)
-
-
-def _hosts(request: bytes) -> list[str]:
-    """Values of the Host headers of a request."""
-    lines = (line.partition(b":") for line in request.split(b"\r\n")[1:])
-    return [value.decode("latin-1").strip() for name, _, value in lines if name.lower() == b"host"]
-
-
-BY_NAME = b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
-"""Answer to who comes by the name of a website."""
-_REASONS = {
-    200: "OK",
-    400: "Bad Request",
-    403: "Forbidden",
-    404: "Not Found",
-    405: "Method Not Allowed",
-    431: "Request Header Fields Too Large",
-    503: "Service Unavailable",
-}
-
-
-def _response(
-    status: int, body: bytes, more: str = "", kind: str = "text/plain; charset=utf-8"
-) -> bytes:
-    framing = "".join(f"{name}: {value}\r\n" for name, value in HEADERS.items())
-    head = (
-        f"HTTP/1.1 {status} {_REASONS[status]}\r\nContent-Type: {kind}\r\n"
-        f"Content-Length: {len(body)}\r\n{framing}{more}Connection: close\r\n\r\n"
-    )
-    return head.encode() + body
-
-
-def _is_whole(request: bytearray) -> bool:
-    """Whether the request is complete, or too long."""
-    return b"\r\n\r\n" in request or len(request) > REQUEST_BYTES_MAX
 
 
 def _listening(address: Address) -> socket.socket:
@@ -307,15 +254,4 @@ def _listening(address: Address) -> socket.socket:
         # The text of an OSError contains the address, that of a gaierror does not.
         number = error.errno or 0
         raise MetricsError(os.strerror(number) if number > 0 else str(error.strerror)) from None
-    sock.setblocking(False)
     return sock
-
-
-def names() -> frozenset[str]:
-    """Names of all metrics that any process may serve."""
-    told = {metric for table in TABLES.values() for metric in table} | set(OWN)
-    return frozenset(
-        PREFIX + metric.name + suffix
-        for metric in told
-        for suffix in (("_bucket", "_count") if metric.kind == "histogram" else ("",))
-    )

@@ -5,15 +5,14 @@ reader does not take at once waits for it, up to a bound, and a reader whose bou
 dropped. `shared.telemetry.feed` has the frames; `Subscriber` is the other end.
 """
 
-import selectors
+import asyncio
 import socket
 import threading
 import time
 from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from itertools import chain
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -80,30 +79,12 @@ class _Part:
 
 
 class _Reader:
-    """Reader of the feed, and the bytes queued for it."""
+    """Reader of the feed, and the bytes that it has not taken yet."""
 
-    def __init__(self, connection: socket.socket, pieces: Iterator[bytes]) -> None:
+    def __init__(self, connection: socket.socket, waiting: bytes) -> None:
         connection.setblocking(False)
         self.connection = connection
-        self._waiting = deque(pieces)
-        self._bytes = sum(map(len, self._waiting))
-        self._begin = 0
-        """Number of bytes of the first piece that were sent already."""
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether bytes are queued."""
-        return bool(self._waiting)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether more bytes are queued than allowed."""
-        return self._bytes > WAITING_BYTES_MAX
-
-    def add(self, piece: bytes) -> None:
-        """Queue a piece."""
-        self._waiting.append(piece)
-        self._bytes += len(piece)
+        self.waiting = bytearray(waiting)
 
     def send(self) -> None:
         """Send what the socket takes, but no more than one turn's share.
@@ -111,30 +92,8 @@ class _Reader:
         Raises:
             OSError: the reader is gone.
         """
-        left = SEND_BYTES_MAX
-        while self._waiting and left > 0:
-            begin, piece = self._begin, self._waiting[0]
-            try:
-                sent = self.connection.send(memoryview(piece)[begin : begin + left])
-            except BlockingIOError:
-                return
-            left -= sent
-            self._bytes -= sent
-            self._begin += sent
-            if self._begin == len(piece):
-                self._waiting.popleft()
-                self._begin = 0
-
-    def finish(self, patience_s: float) -> None:
-        """Send everything that is queued, waiting only for a bounded time.
-
-        Raises:
-            OSError: the reader is gone, or too slow.
-        """
-        until_s = time.monotonic() + patience_s
-        while self._waiting:
-            self.connection.settimeout(max(until_s - time.monotonic(), 0.001))
-            self.send()
+        with suppress(BlockingIOError):
+            del self.waiting[: self.connection.send(self.waiting[:SEND_BYTES_MAX])]
 
 
 class Feed:
@@ -235,8 +194,9 @@ class Feed:
         self._send()
         until_s = time.monotonic() + PATIENCE_S
         for reader in self._readers:
+            reader.connection.settimeout(max(until_s - time.monotonic(), 0.001))
             with suppress(OSError):
-                reader.finish(until_s - time.monotonic())
+                reader.connection.sendall(reader.waiting)
             reader.connection.close()
         self._readers.clear()
         self._local.close()
@@ -255,15 +215,13 @@ class Feed:
             return
         piece = b"".join(self._fresh)
         self._fresh.clear()
-        self._keep(piece)
         for reader in tuple(self._readers):
-            reader.add(piece)
-            if reader.is_full:
-                self._drop(reader)
+            reader.waiting += piece
+            if len(reader.waiting) > WAITING_BYTES_MAX:
+                self._dropped += 1
+                self._forget(reader)
             elif reader not in self._behind:
                 self._go_on(reader)
-
-    def _keep(self, piece: bytes) -> None:
         self._backlog.append(piece)
         self._backlog_bytes += len(piece)
         while self._backlog_bytes > BACKLOG_BYTES_MAX:
@@ -276,18 +234,14 @@ class Feed:
         except OSError:
             self._forget(reader)
             return
-        if self._loop is None or reader.is_behind == (reader in self._behind):
+        if self._loop is None or bool(reader.waiting) == (reader in self._behind):
             return
-        if reader.is_behind:
+        if reader.waiting:
             self._behind.add(reader)
             self._loop.add_writer(reader.connection, self._go_on, reader)
         else:
             self._behind.discard(reader)
             self._loop.remove_writer(reader.connection)
-
-    def _drop(self, reader: _Reader) -> None:
-        self._dropped += 1
-        self._forget(reader)
 
     def _forget(self, reader: _Reader) -> None:
         if self._loop is not None and reader in self._behind:
@@ -315,7 +269,7 @@ class Feed:
             connection.close()
             return
         self._send()
-        reader = _Reader(connection, chain((encode(self._opened()),), self._backlog))
+        reader = _Reader(connection, b"".join((encode(self._opened()), *self._backlog)))
         self._readers.append(reader)
         self._go_on(reader)
 
@@ -335,67 +289,49 @@ class Subscriber:
         take: Callable[[str, Frame], None],
         lost: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._paths = dict(paths)
         self._take, self._lost = take, lost
-        self._selector = selectors.DefaultSelector()
-        self._ours, self._waker = socket.socketpair()
-        self._selector.register(self._ours, selectors.EVENT_READ)
-        self._open: dict[str, tuple[socket.socket, Reader]] = {}
         self._closed = False
+        self._loop = asyncio.new_event_loop()
+        self._reading = self._loop.create_task(self._read_all(paths))
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop reading; no callback runs any more when this returns."""
         self._closed = True
-        with suppress(OSError):  # called by the thread itself
-            self._waker.send(b"\0")
+        with suppress(RuntimeError):  # the thread has ended already
+            self._loop.call_soon_threadsafe(self._reading.cancel)
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
     def _work(self) -> None:
-        try:
-            due_s = time.monotonic()
-            while not self._closed:
-                if time.monotonic() >= due_s:
-                    due_s = time.monotonic() + AGAIN_S
-                    for name in self._paths.keys() - self._open.keys():
-                        self._connect(name)
-                for key, _ in self._selector.select(max(due_s - time.monotonic(), 0.0)):
-                    if key.fileobj is not self._ours and not self._closed:
-                        self._read(key.data)
-        finally:
-            for connection, _ in self._open.values():
-                connection.close()
-            self._selector.close()
-            self._ours.close()
-            self._waker.close()
+        with closing(self._loop), suppress(asyncio.CancelledError):
+            self._loop.run_until_complete(self._reading)
 
-    def _connect(self, name: str) -> None:
-        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        connection.setblocking(False)
-        try:
-            connection.connect(str(self._paths[name]))
-        except OSError:  # no process listens, or its queue of connections is full
-            connection.close()
-            return
-        self._open[name] = connection, Reader()
-        self._selector.register(connection, selectors.EVENT_READ, name)
+    async def _read_all(self, paths: Mapping[str, Path]) -> None:
+        async with asyncio.TaskGroup() as readers:
+            for name, path in paths.items():
+                readers.create_task(self._follow(name, path))
 
-    def _read(self, name: str) -> None:
-        connection, reader = self._open[name]
-        try:
-            piece = connection.recv(READ_BYTES)
-            frames = reader.read(piece)
-        except BlockingIOError:
-            return
-        except (OSError, FeedError):
-            piece, frames = b"", []
-        for frame in frames:
-            if not self._closed:
-                self._take(name, frame)
-        if not piece:
-            self._selector.unregister(connection)
-            connection.close()
-            del self._open[name]
-            self._lost(name)
+    async def _follow(self, name: str, path: Path) -> None:
+        """Read the feed of a process, and of each that comes after it."""
+        while not self._closed:
+            with suppress(OSError):  # no process listens, or its queue of connections is full
+                stream, connection = await asyncio.open_unix_connection(path, limit=READ_BYTES)
+                with closing(connection), suppress(OSError, FeedError):
+                    await self._read(name, stream)
+                if not self._closed:
+                    self._lost(name)
+            await asyncio.sleep(AGAIN_S)
+
+    async def _read(self, name: str, stream: asyncio.StreamReader) -> None:
+        """Read a feed until it ends.
+
+        Raises:
+            OSError, FeedError: it is broken.
+        """
+        reader = Reader()
+        while piece := await stream.read(READ_BYTES):
+            for frame in reader.read(piece):
+                if not self._closed:
+                    self._take(name, frame)

@@ -6,455 +6,259 @@ purpose; one that is neither is counted, and a test finds it. Names follow Prome
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
+
+from prometheus_client.metrics_core import Metric as Exposed
 
 from skytether.shared.wire.protocol import Mode
 
 PREFIX = "skytether_"
 """Prefix of all metrics' names."""
-Kind = Literal["counter", "gauge", "histogram", "summary", "modes"]
-"""Kind of a metric; "modes" is one gauge per mode of a vehicle, 1 for its present mode."""
-MILLI, NANO = 1e-3, 1e-9
-
-
-class Label(NamedTuple):
-    """Label that takes the place of any name in a figure's path, and has this name as its value."""
-
-    name: str
-
-
-Path = tuple[str | Label, ...]
-"""Path of a figure: names of its groups, the outermost first, and its own name."""
+UNITS = {"_ms": 1e-3, "_ns": 1e-9}
+"""Units in figures' names, and their factors to the metrics' base units."""
 
 
 class Metric(NamedTuple):
-    """Metric, and the path of the figure that it exports."""
+    """Metric, and the figure that it exports."""
 
-    figure: Path
+    figure: str
+    """Path of the figure: the names of its groups and its own, with slashes between them. A name in
+    braces stands for any name, which is the value of a label."""
     name: str
     """Name of the metric, without the prefix."""
-    kind: Kind
+    labels: Mapping[str, str]
+    """Fixed labels, which separate figures of the same metric."""
     help: str
     """Help text of the metric: one sentence."""
-    scale: float = 1.0
-    """Factor from the figure's unit to the metric's."""
-    labels: tuple[tuple[str, str], ...] = ()
-    """Names and values of fixed labels that separate figures of the same metric."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the metric: counter, histogram, summary or gauge, as its name and labels show."""
+        if self.name.endswith("_total"):
+            return "counter"
+        if "{le}" in self.figure:
+            return "histogram"
+        return "summary" if "quantile" in self.labels else "gauge"
+
+    @property
+    def scale(self) -> float:
+        """Factor from the figure's unit to the metric's."""
+        return next((scale for unit, scale in UNITS.items() if unit in self.figure), 1.0)
+
+    def exposed(self) -> Exposed:
+        """The metric as prometheus_client knows it, without numbers."""
+        # prometheus_client adds the suffix of a counter's name itself.
+        return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
+
+    def add(self, exposed: Exposed, labels: Mapping[str, str], value: Any) -> None:
+        """Add a figure to the metric; a mode is a number for each mode, 1 for this one."""
+        name, labels = PREFIX + self.name, {**labels, **self.labels}
+        if isinstance(value, str):
+            for mode in map(str, Mode):
+                exposed.add_sample(name, {**labels, "mode": mode}, float(mode == value))
+        elif self.kind == "histogram":
+            edge = float(labels.pop("le")) * self.scale
+            last = edge == float("inf")
+            le = "+Inf" if last else f"{edge:g}"
+            exposed.add_sample(f"{name}_bucket", {**labels, "le": le}, float(value))
+            if last:
+                exposed.add_sample(f"{name}_count", labels, float(value))
+        else:
+            exposed.add_sample(name, labels, float(value) * self.scale)
 
 
-class MetricValue(NamedTuple):
-    """Number of a metric, with its labels."""
-
-    suffix: str
-    labels: dict[str, str]
-    value: float
-
-
-class Family(NamedTuple):
-    """Metric and its numbers."""
-
-    metric: Metric
-    samples: list[MetricValue]
+def _table(text: str) -> tuple[Metric, ...]:
+    """Metrics of a table with two lines each: figure and name, below them the help."""
+    lines = iter(text.strip().splitlines())
+    metrics = []
+    for head, told in zip(lines, lines, strict=True):
+        figure, name, *fixed = head.split()
+        metrics.append(Metric(figure, name, dict(each.split("=") for each in fixed), told.strip()))
+    return tuple(metrics)
 
 
-def _each_way(
-    figure: Path, name: str, kind: Kind, help_: str, scale: float = 1.0, **labels: str
-) -> list[Metric]:
-    """Metric of both directions; arguments as for `Metric`."""
-    return [
-        Metric((way, *figure), name, kind, help_, scale, (("direction", way), *labels.items()))
-        for way in ("uplink", "downlink")
-    ]
-
-
-_VEHICLE = ("by_vehicle", Label("vehicle"))
-"""Path of the figures of one vehicle."""
-_PROCESS = (
-    Metric(("cpu_s",), "cpu_seconds_total", "counter", "CPU time used."),
-    Metric(
-        ("kernel_drops",),
-        "kernel_dropped_datagrams_total",
-        "counter",
-        "Datagrams that the kernel dropped at the process's sockets.",
-    ),
-    Metric(("send_errors",), "send_errors_total", "counter", "Datagrams that could not be sent."),
-    Metric(("feed", "readers"), "feed_readers", "gauge", "Readers of the feed."),
-    Metric(
-        ("feed", "dropped"),
-        "feed_dropped_readers_total",
-        "counter",
-        "Readers of the feed that were disconnected because they were too slow.",
-    ),
-    Metric(
-        ("feed", "refused"),
-        "feed_refused_readers_total",
-        "counter",
-        "Readers of the feed that were refused because the feed was full.",
-    ),
-)
-_SERVER = (
-    Metric(("vehicles",), "server_vehicles", "gauge", "Vehicles in session."),
-    Metric(
-        ("degraded",),
-        "server_degraded",
-        "gauge",
-        "Whether the server misses more ticks than allowed: 1 or 0.",
-    ),
-    Metric(
-        ("missed",),
-        "server_missed_ticks_total",
-        "counter",
-        "Ticks that were missed because the process ran too late.",
-    ),
-    Metric(
-        ("observations",),
-        "server_observations_total",
-        "counter",
-        "Observations that were accepted as plausible.",
-    ),
-    Metric(
-        ("ticks_within_ms", Label("le")),
-        "server_tick_seconds",
-        "histogram",
-        "Duration of a tick, for all vehicles together.",
-        MILLI,
-    ),
-    Metric(
-        ("spent_ns", Label("part")),
-        "server_spent_seconds_total",
-        "counter",
-        "Time spent on each part of the work.",
-        NANO,
-    ),
-    Metric(
-        ("counts", "steps"),
-        "server_steps_total",
-        "counter",
-        "Steps of vehicles at which the server decided whether to send.",
-    ),
-    Metric(
-        ("counts", "events"),
-        "server_events_total",
-        "counter",
-        "Steps of vehicles at which the server sent a horizon.",
-    ),
-    Metric(
-        ("counts", "unsolved"),
-        "server_unsolved_total",
-        "counter",
-        "Steps for which no plan was found.",
-    ),
-    Metric(
-        ("counts", "horizons_lost"),
-        "server_lost_horizons_total",
-        "counter",
-        "Horizons that were sent but did not come into force in time.",
-    ),
-    Metric(
-        ("dropped", Label("reason")),
-        "server_dropped_datagrams_total",
-        "counter",
-        "Datagrams that came from no vehicle or could not be read, by reason.",
-    ),
-    Metric(
-        ("refused", Label("reason")),
-        "server_refused_vehicles_total",
-        "counter",
-        "Requests for a session (HELLO) that were refused, by reason.",
-    ),
-    Metric(
-        (*_VEHICLE, "step"),
-        "server_vehicle_step",
-        "gauge",
-        "Newest step of the vehicle for which the server made a decision.",
-    ),
-    Metric(
-        (*_VEHICLE, "clock_bound_ms"),
-        "server_vehicle_clock_bound_seconds",
-        "gauge",
-        "Half of the time that the vehicle's clock may lie apart, as far as the server knows.",
-        MILLI,
-    ),
-    Metric(
-        (*_VEHICLE, "clock_m"),
-        "server_vehicle_clock_metres",
-        "gauge",
-        "Distance by which the vehicle may be elsewhere on its motion, for want of its clock.",
-    ),
-)
-_NETEM = (
-    Metric(("flows",), "netem_flows", "gauge", "Clients whose packets are forwarded."),
-    Metric(
-        ("refused",),
-        "netem_refused_packets_total",
-        "counter",
-        "Packets of clients without a flow, or of strangers at the socket of a flow.",
-    ),
-    *_each_way(("packets",), "netem_packets_total", "counter", "Packets that entered."),
-    *_each_way(
-        ("bytes",), "netem_bytes_total", "counter", "UDP payload of the packets that entered."
-    ),
-    *_each_way(("forwarded",), "netem_forwarded_packets_total", "counter", "Packets that left."),
-    *_each_way(
-        ("lost",),
-        "netem_lost_packets_total",
-        "counter",
-        "Packets that the scenario's loss model dropped.",
-    ),
-    *_each_way(
-        ("reordered",),
-        "netem_reordered_packets_total",
-        "counter",
-        "Packets overtaken by a later one.",
-    ),
-    *_each_way(
-        ("oversized",),
-        "netem_oversized_packets_total",
-        "counter",
-        "Packets longer than network.mtu.",
-    ),
-    *_each_way(
-        ("overflowed",),
-        "netem_overflowed_packets_total",
-        "counter",
-        "Packets that were dropped because netem's memory for packets was full.",
-    ),
-    *_each_way(
-        ("dropped",),
-        "netem_dropped_packets_total",
-        "counter",
-        "Packets that the queue of a limited rate dropped.",
-    ),
-    *_each_way(
-        ("duplicated",),
-        "netem_duplicated_packets_total",
-        "counter",
-        "Duplicates of packets that were made.",
-    ),
-    *_each_way(
-        ("corrupted",),
-        "netem_corrupted_packets_total",
-        "counter",
-        "Packets in which a bit was flipped.",
-    ),
-    *_each_way(
-        ("queue",),
-        "netem_queued_packets",
-        "gauge",
-        "Packets that are delayed now and have not left.",
-    ),
-    *_each_way(
-        ("delays_within_ms", Label("le")),
-        "netem_delay_seconds",
-        "histogram",
-        "Delays that the network model drew for packets that left.",
-        MILLI,
-    ),
-    *(
-        metric
-        for figure, quantile in (("p50", "0.5"), ("p99", "0.99"), ("max", "1"))
-        for metric in _each_way(
-            (f"error_ms_{figure}",),
-            "netem_lateness_seconds",
-            "summary",
-            "Time by which packets left later than the network model demanded.",
-            MILLI,
-            quantile=quantile,
-        )
-    ),
-    *(
-        metric
-        for figure, quantile in (("p50", "0.5"), ("p99", "0.99"))
-        for metric in _each_way(
-            (f"queueing_ms_{figure}",),
-            "netem_queueing_seconds",
-            "summary",
-            "Time that packets waited for a limited rate.",
-            MILLI,
-            quantile=quantile,
-        )
-    ),
-)
-_CLIENT = (
-    Metric(
-        ("missed",),
-        "client_missed_steps_total",
-        "counter",
-        "Steps that were missed because the process ran too late.",
-    ),
-    Metric(
-        (*_VEHICLE, "mode"),
-        "client_mode",
-        "modes",
-        "Mode of the vehicle, see docs/failsafe.md: 1 for the present mode, 0 for the others.",
-    ),
-    Metric((*_VEHICLE, "step"), "client_step", "gauge", "Number of the vehicle's next step."),
-    Metric((*_VEHICLE, "steps"), "client_steps", "gauge", "Number of steps of the whole flight."),
-    Metric(
-        (*_VEHICLE, "age_ms"),
-        "client_age_seconds",
-        "gauge",
-        "Age of the observation from which the input in force was planned.",
-        MILLI,
-    ),
-    Metric(
-        (*_VEHICLE, "plan_age_ms"),
-        "client_plan_age_seconds",
-        "gauge",
-        "Time since the step that the horizon in force was made for.",
-        MILLI,
-    ),
-    Metric(
-        (*_VEHICLE, "horizons"),
-        "client_horizons_total",
-        "counter",
-        "Horizons received.",
-    ),
-    Metric(
-        (*_VEHICLE, "dropped", Label("reason")),
-        "client_dropped_datagrams_total",
-        "counter",
-        "Datagrams that were not the server's, came too late or could not be read, by reason.",
-    ),
-)
-_AUTOPILOT = (*_VEHICLE, "autopilot")
-"""Path of the figures of a vehicle's own autopilot."""
-_ABOARD = (
-    Metric(
-        (*_AUTOPILOT, "armed"),
-        "autopilot_armed",
-        "gauge",
-        "Whether the autopilot is armed: 1 or 0.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "mode_number"),
-        "autopilot_mode",
-        "gauge",
-        "Number of the autopilot's mode (custom_mode of its heartbeat).",
-    ),
-    Metric((*_AUTOPILOT, "battery"), "autopilot_battery_ratio", "gauge", "Charge of the battery."),
-    Metric(
-        (*_AUTOPILOT, "voltage_v"), "autopilot_battery_volts", "gauge", "Voltage of the battery."
-    ),
-    Metric(
-        (*_AUTOPILOT, "home", Label("coordinate")),
-        "autopilot_home",
-        "gauge",
-        "Autopilot's home: latitude and longitude in degrees, altitude above the sea in metres.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "fence", Label("parameter")),
-        "autopilot_fence",
-        "gauge",
-        "Values of the autopilot's own fence parameters.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "measurements"),
-        "autopilot_measurements_total",
-        "counter",
-        "Positions from the autopilot that were accepted.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "heard"),
-        "autopilot_messages_total",
-        "counter",
-        "Messages received from the autopilot.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "setpoints"),
-        "autopilot_setpoints_total",
-        "counter",
-        "Velocity set-points sent to the autopilot.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "dropped", Label("reason")),
-        "autopilot_dropped_messages_total",
-        "counter",
-        "Messages on the autopilot's line from others, for others, or with an impossible time.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "garbage_bytes"),
-        "autopilot_garbage_bytes_total",
-        "counter",
-        "Bytes on the autopilot's line that belong to no valid message.",
-    ),
-    Metric(
-        (*_AUTOPILOT, "round_trip_ms"),
-        "autopilot_round_trip_seconds",
-        "gauge",
-        "Smallest recent round-trip time to the autopilot.",
-        MILLI,
-    ),
-    Metric(
-        (*_AUTOPILOT, "drift_ppm"),
-        "autopilot_clock_drift_ppm",
-        "gauge",
-        "Rate at which the client's clock runs faster than the autopilot's.",
-    ),
-)
-TABLES = {
-    "server": _SERVER + _PROCESS,
-    "netem": _NETEM + _PROCESS,
-    "client": _CLIENT + _ABOARD + _PROCESS,
-}
+_SERVER = _table("""
+vehicles server_vehicles
+    Vehicles in session.
+degraded server_degraded
+    Whether the server misses more ticks than allowed: 1 or 0.
+missed server_missed_ticks_total
+    Ticks that were missed because the process ran too late.
+observations server_observations_total
+    Observations that were accepted as plausible.
+ticks_within_ms/{le} server_tick_seconds
+    Duration of a tick, for all vehicles together.
+spent_ns/{part} server_spent_seconds_total
+    Time spent on each part of the work.
+counts/steps server_steps_total
+    Steps of vehicles at which the server decided whether to send.
+counts/events server_events_total
+    Steps of vehicles at which the server sent a horizon.
+counts/unsolved server_unsolved_total
+    Steps for which no plan was found.
+counts/horizons_lost server_lost_horizons_total
+    Horizons that were sent but did not come into force in time.
+dropped/{reason} server_dropped_datagrams_total
+    Datagrams that came from no vehicle or could not be read, by reason.
+refused/{reason} server_refused_vehicles_total
+    Requests for a session (HELLO) that were refused, by reason.
+by_vehicle/{vehicle}/step server_vehicle_step
+    Newest step of the vehicle for which the server made a decision.
+by_vehicle/{vehicle}/clock_bound_ms server_vehicle_clock_bound_seconds
+    Half of the time that the vehicle's clock may lie apart, as far as the server knows.
+by_vehicle/{vehicle}/clock_m server_vehicle_clock_metres
+    Distance by which the vehicle may be elsewhere on its motion, for want of its clock.
+""")
+_NETEM = _table("""
+flows netem_flows
+    Clients whose packets are forwarded.
+refused netem_refused_packets_total
+    Packets of clients without a flow, or of strangers at the socket of a flow.
+{direction}/packets netem_packets_total
+    Packets that entered.
+{direction}/bytes netem_bytes_total
+    UDP payload of the packets that entered.
+{direction}/forwarded netem_forwarded_packets_total
+    Packets that left.
+{direction}/lost netem_lost_packets_total
+    Packets that the scenario's loss model dropped.
+{direction}/reordered netem_reordered_packets_total
+    Packets overtaken by a later one.
+{direction}/oversized netem_oversized_packets_total
+    Packets longer than network.mtu.
+{direction}/overflowed netem_overflowed_packets_total
+    Packets that were dropped because netem's memory for packets was full.
+{direction}/dropped netem_dropped_packets_total
+    Packets that the queue of a limited rate dropped.
+{direction}/duplicated netem_duplicated_packets_total
+    Duplicates of packets that were made.
+{direction}/corrupted netem_corrupted_packets_total
+    Packets in which a bit was flipped.
+{direction}/queue netem_queued_packets
+    Packets that are delayed now and have not left.
+{direction}/delays_within_ms/{le} netem_delay_seconds
+    Delays that the network model drew for packets that left.
+{direction}/error_ms_p50 netem_lateness_seconds quantile=0.5
+    Time by which packets left later than the network model demanded.
+{direction}/error_ms_p99 netem_lateness_seconds quantile=0.99
+    Time by which packets left later than the network model demanded.
+{direction}/error_ms_max netem_lateness_seconds quantile=1
+    Time by which packets left later than the network model demanded.
+{direction}/queueing_ms_p50 netem_queueing_seconds quantile=0.5
+    Time that packets waited for a limited rate.
+{direction}/queueing_ms_p99 netem_queueing_seconds quantile=0.99
+    Time that packets waited for a limited rate.
+""")
+_CLIENT = _table("""
+missed client_missed_steps_total
+    Steps that were missed because the process ran too late.
+by_vehicle/{vehicle}/mode client_mode
+    Mode of the vehicle, see docs/failsafe.md: 1 for the present mode, 0 for the others.
+by_vehicle/{vehicle}/step client_step
+    Number of the vehicle's next step.
+by_vehicle/{vehicle}/steps client_steps
+    Number of steps of the whole flight.
+by_vehicle/{vehicle}/age_ms client_age_seconds
+    Age of the observation from which the input in force was planned.
+by_vehicle/{vehicle}/plan_age_ms client_plan_age_seconds
+    Time since the step that the horizon in force was made for.
+by_vehicle/{vehicle}/horizons client_horizons_total
+    Horizons received.
+by_vehicle/{vehicle}/dropped/{reason} client_dropped_datagrams_total
+    Datagrams that were not the server's, came too late or could not be read, by reason.
+by_vehicle/{vehicle}/autopilot/armed autopilot_armed
+    Whether the autopilot is armed: 1 or 0.
+by_vehicle/{vehicle}/autopilot/mode_number autopilot_mode
+    Number of the autopilot's mode (custom_mode of its heartbeat).
+by_vehicle/{vehicle}/autopilot/battery autopilot_battery_ratio
+    Charge of the battery.
+by_vehicle/{vehicle}/autopilot/voltage_v autopilot_battery_volts
+    Voltage of the battery.
+by_vehicle/{vehicle}/autopilot/home/{coordinate} autopilot_home
+    Autopilot's home: latitude and longitude in degrees, altitude above the sea in metres.
+by_vehicle/{vehicle}/autopilot/fence/{parameter} autopilot_fence
+    Values of the autopilot's own fence parameters.
+by_vehicle/{vehicle}/autopilot/measurements autopilot_measurements_total
+    Positions from the autopilot that were accepted.
+by_vehicle/{vehicle}/autopilot/heard autopilot_messages_total
+    Messages received from the autopilot.
+by_vehicle/{vehicle}/autopilot/setpoints autopilot_setpoints_total
+    Velocity set-points sent to the autopilot.
+by_vehicle/{vehicle}/autopilot/dropped/{reason} autopilot_dropped_messages_total
+    Messages on the autopilot's line from others, for others, or with an impossible time.
+by_vehicle/{vehicle}/autopilot/garbage_bytes autopilot_garbage_bytes_total
+    Bytes on the autopilot's line that belong to no valid message.
+by_vehicle/{vehicle}/autopilot/round_trip_ms autopilot_round_trip_seconds
+    Smallest recent round-trip time to the autopilot.
+by_vehicle/{vehicle}/autopilot/drift_ppm autopilot_clock_drift_ppm
+    Rate at which the client's clock runs faster than the autopilot's.
+""")
+_PROCESS = _table("""
+cpu_s cpu_seconds_total
+    CPU time used.
+kernel_drops kernel_dropped_datagrams_total
+    Datagrams that the kernel dropped at the process's sockets.
+send_errors send_errors_total
+    Datagrams that could not be sent.
+feed/readers feed_readers
+    Readers of the feed.
+feed/dropped feed_dropped_readers_total
+    Readers of the feed that were disconnected because they were too slow.
+feed/refused feed_refused_readers_total
+    Readers of the feed that were refused because the feed was full.
+""")
+TABLES = {"server": _PROCESS + _SERVER, "netem": _PROCESS + _NETEM, "client": _PROCESS + _CLIENT}
 """Metrics of each kind of process."""
-LEFT_OUT: dict[str, tuple[Path, ...]] = {
-    "server": (
-        ("tick_ms_p50",),  # since the start; the histogram gives quantiles over any period
-        ("tick_ms_p99",),
-    ),
+OWN = _table("""
+- info
+    Labels that name the process and what it flies; the value is always 1.
+- step_seconds
+    Length of a step, the deadline of a tick.
+- snapshot_age_seconds
+    Time since the other metrics were updated.
+- unmapped_figures
+    Figures of the process that no metric exports; more than 0 is a mistake in Skytether.
+""")
+"""Metrics of the process itself and of the exporter, which export no figure."""
+LEFT_OUT = {
+    "server": ("tick_ms_p50", "tick_ms_p99"),  # since the start; the histogram has any period
     "netem": (
-        *((way, f"delay_ms_{each}") for way in ("uplink", "downlink") for each in ("p50", "p99")),
-        ("uplink", "delays_ms", Label("ms")),  # up to 500 numbers
-        ("downlink", "delays_ms", Label("ms")),
-        ("uplink", "queue_max"),  # since the start; Prometheus has the largest over any period
-        ("downlink", "queue_max"),
+        "{direction}/delay_ms_p50",
+        "{direction}/delay_ms_p99",
+        "{direction}/delays_ms/{ms}",  # up to 500 numbers
+        "{direction}/queue_max",  # since the start; Prometheus has the largest over any period
     ),
     "client": (
-        ("vehicles",),  # constant
-        (*_VEHICLE, "missed"),  # covered by the other metrics
-        (*_VEHICLE, "began_s"),  # from a clock that Prometheus does not know
-        (*_AUTOPILOT, "mode"),  # its number is exported
+        "vehicles",  # constant
+        "by_vehicle/{vehicle}/missed",  # covered by the other metrics
+        "by_vehicle/{vehicle}/began_s",  # from a clock that Prometheus does not know
+        "by_vehicle/{vehicle}/autopilot/mode",  # its number is exported
     ),
 }
 """Figures that are deliberately not exported."""
-OWN = (
-    Metric(
-        (),
-        "info",
-        "gauge",
-        "Labels that name the process and what it flies; the value is always 1.",
-    ),
-    Metric((), "step_seconds", "gauge", "Length of a step, the deadline of a tick."),
-    Metric((), "snapshot_age_seconds", "gauge", "Time since the other metrics were updated."),
-    Metric(
-        (),
-        "unmapped_figures",
-        "gauge",
-        "Figures of the process that no metric exports; more than 0 is a mistake in Skytether.",
-    ),
-)
-"""Metrics of the process itself and of the exporter, which export no figure."""
 
 
-def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Family], list[str]]:
+def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:
     """Metrics made of figures, and the paths of figures that no table has.
 
     Args:
-        process: server, netem or client.
+        process: server, netem or client; another process has no table, and figures of its own that
+            are not exported.
         figures: from `Endpoint.figures`, and those that the process adds.
     """
-    found: dict[str, Family] = {}
+    found: dict[str, Exposed] = {}
     unknown = []
     for path, value in flat(figures):
-        for metric in TABLES[process]:
+        for metric in TABLES.get(process, _PROCESS):
             labels = matched(metric.figure, path)
             if labels is not None:
-                family = found.setdefault(metric.name, Family(metric, []))
-                family.samples.extend(_samples(metric, labels, value))
+                if metric.name not in found:
+                    found[metric.name] = metric.exposed()
+                metric.add(found[metric.name], labels, value)
                 break
         else:
-            if not any(matched(figure, path) is not None for figure in LEFT_OUT[process]):
+            left_out = LEFT_OUT.get(process, ())
+            if process in TABLES and all(matched(each, path) is None for each in left_out):
                 unknown.append("/".join(path))
     return list(found.values()), unknown
 
@@ -492,32 +296,25 @@ def flat(
             yield (*groups, name), value
 
 
-def matched(figure: Path, path: tuple[str, ...]) -> dict[str, str] | None:
+def matched(figure: str, path: tuple[str, ...]) -> dict[str, str] | None:
     """Labels of a figure with this path; None where the metric's path does not match."""
-    if len(figure) != len(path):
+    meant = figure.split("/")
+    if len(meant) != len(path):
         return None
     labels = {}
-    for meant, name in zip(figure, path, strict=True):
-        if isinstance(meant, Label):
-            labels[meant.name] = name
-        elif meant != name:
+    for part, name in zip(meant, path, strict=True):
+        if part.startswith("{"):
+            labels[part[1:-1]] = name
+        elif part != name:
             return None
     return labels
 
 
-def _samples(metric: Metric, labels: dict[str, str], value: Any) -> Iterator[MetricValue]:
-    labels = {**labels, **dict(metric.labels)}
-    match metric.kind:
-        case "modes":
-            for mode in Mode:
-                yield MetricValue("", {**labels, "mode": str(mode)}, float(str(mode) == value))
-        case "histogram":
-            edge = float(labels["le"]) * metric.scale
-            if edge == float("inf"):
-                others = {name: text for name, text in labels.items() if name != "le"}
-                yield MetricValue("_bucket", labels | {"le": "+Inf"}, float(value))
-                yield MetricValue("_count", others, float(value))
-            else:
-                yield MetricValue("_bucket", labels | {"le": f"{edge:g}"}, float(value))
-        case _:
-            yield MetricValue("", labels, float(value) * metric.scale)
+def names() -> frozenset[str]:
+    """Names of all metrics that any process may serve."""
+    return frozenset(
+        PREFIX + metric.name + suffix
+        for table in (*TABLES.values(), OWN)
+        for metric in table
+        for suffix in (("_bucket", "_count") if metric.kind == "histogram" else ("",))
+    )

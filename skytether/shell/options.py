@@ -1,14 +1,16 @@
-"""Options of a command on its command line: a dataclass, whose nested fields are flags with dots.
+"""Options of a command on its command line: a dataclass, and a scenario whose keys are flags.
 
-tyro reads any command line, shows the help and reports wrong flags. But it first builds a
-description of all keys of a scenario, which takes longer than everything else until a vehicle's
-first packet, and keeps the memory. So plain flags, with which processes are started, are read here,
-and tyro is imported only for other lines.
+Flags of keys, as in `--control.trigger always`, are read here and checked with the scenario. tyro
+reads the options, shows the help and reports wrong flags. But importing it takes longer than most
+else until a vehicle's first packet, and keeps the memory: so plain flags, with which processes are
+started, are read here, too, and tyro knows of a scenario's keys in the help alone.
 """
 
 import dataclasses
+import json
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from inspect import cleandoc
@@ -16,8 +18,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import msgspec
-
+from skytether.shared.base import toml
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 
 T = TypeVar("T")
@@ -54,9 +57,99 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
     import tyro
 
     kind: Any = type(default)
-    _tell_tyro(kind)
+    _tell_tyro(kind, keys=asks_help(argv))
     about = cleandoc(help_ or "")
     return tyro.cli(kind, args=argv, default=default, prog=prog, description=about)
+
+
+def asks_help(argv: Sequence[str]) -> bool:
+    """Whether a command line asks for the help."""
+    return not {"-h", "--help"}.isdisjoint(argv)
+
+
+def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
+    """Command line without flags of a scenario's keys, and the plain values of these.
+
+    A key takes one word, a list all words up to the next flag, and a boolean none: it is written
+    `--control.feedback` or `--control.no-feedback`.
+
+    Args:
+        argv: the command line.
+        options: the command's options, whose flags are no keys.
+
+    Raises:
+        ConfigError: a key has no value.
+    """
+    words, rest, values = deque(argv), list[str](), dict[str, Any]()
+    own, _ = _flags(options)
+    while words:
+        word = words.popleft()
+        flag, equals, text = word.partition("=")
+        key = flag.removeprefix("--").replace("-", "_")
+        section, dot, name = key.rpartition(".")
+        negated = f"{section}{dot}{name.removeprefix('no_')}"
+        if not flag.startswith("--") or key in own or not (dot or _kinds(negated) or _slipped(key)):
+            rest.append(word)
+        elif bool in _kinds(negated):
+            values[negated] = toml_value(text) if equals else negated == key
+        else:
+            given = [text] if equals else []
+            while words and not equals and not words[0].startswith("--"):
+                given.append(words.popleft())
+                if _kinds(key) and tuple not in _kinds(key):
+                    break
+            values[key] = _key_value(key, given)
+    return rest, values
+
+
+def _slipped(flag: str) -> bool:
+    """Whether an unknown flag is much like a key that stands in no section."""
+    import difflib  # for mistakes alone
+
+    keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
+    return bool(difflib.get_close_matches(flag, keys, 1, 0.8))
+
+
+def _key_value(key: str, words: Sequence[str]) -> Any:
+    kinds = _kinds(key)
+    values = words if kinds <= {str} else [_number_or_other(word) for word in words]
+    if len(values) == 1 and (kinds != {tuple} or isinstance(values[0], list)):
+        return values[0]
+    if not values and tuple not in kinds:
+        raise ConfigError(f"{key}: got nothing, expected a value")
+    return values
+
+
+def _number_or_other(word: str) -> Any:
+    """Value of a text as TOML, or as Python writes a number: `1.`, `.5`."""
+    value = toml_value(word)
+    with suppress(ValueError):
+        return float(word) if isinstance(value, str) else value
+    return value
+
+
+@cache
+def _kinds(key: str) -> frozenset[Any]:
+    """Types of a key's values, without their arguments; none if there is no such key."""
+    kind: Any = Scenario
+    for name in key.split("."):
+        kind = get_type_hints(kind).get(name) if hasattr(kind, "__struct_fields__") else None
+    if kind is None:
+        return frozenset()
+    if hasattr(kind, "__struct_fields__"):  # a direction of the network may be a text
+        return frozenset({str})
+    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    words = {type(word) for each in kinds if get_origin(each) is Literal for word in get_args(each)}
+    return frozenset(words | {get_origin(each) or each for each in kinds} - {Literal})
+
+
+def toml_value(text: str) -> Any:
+    """Value of a text as TOML if JSON can express it too; any other text is a string itself."""
+    try:
+        table = toml.loads(f"value = {text}")
+        return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
+    except (ValueError, RecursionError, TypeError):
+        return text
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
@@ -71,30 +164,31 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
     if any(field.default is empty and field.default_factory is empty for field in fields):
         return None  # a required option may be missing: tyro reports it
     names, positional = _flags(type(default))
-    options, words = default, deque(argv)
+    hints, words = get_type_hints(type(default)), deque(argv)
+    given: dict[str, Any] = {}
     try:
         if words and not words[0].startswith("-"):
             (name,) = positional
-            options = _laid(options, (name,), words)
+            given[name] = _value(hints[name], words.popleft(), given=True)
         while words:
             flag, equals, value = words.popleft().partition("=")
             if not flag.startswith("--"):
                 return None
-            if equals:
-                words.appendleft(value)
-            first, *rest = flag[2:].replace("-", "_").split(".")
-            own = first in names and not rest
-            path = (names[first],) if own else (names[""], first, *rest)
-            options = _laid(options, path, words, given=bool(equals))
+            name = names[flag[2:].replace("-", "_")]
+            if hints[name] is bool and not equals:
+                given[name] = True
+            else:
+                text = value if equals else words.popleft()
+                given[name] = _value(hints[name], text, given=bool(equals))
     except (LookupError, ValueError):
         return None
-    return options
+    return dataclasses.replace(default, **given)  # type: ignore[type-var]
 
 
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
     """Fields of options by flag, and the positional ones."""
     flags, positional = {}, []
-    for name, hint in get_type_hints(options, include_extras=True).items():
+    for name, hint in _hints(options).items():
         argument = _argument(hint) or Argument()
         if argument.positional:
             positional.append(name)
@@ -108,24 +202,6 @@ def _argument(hint: Any) -> Argument | None:
     return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, Argument)), None)
 
 
-def _laid(holder: Any, path: Sequence[str], words: deque[str], *, given: bool = True) -> Any:
-    """Record with the next word as the value of one of its fields, or of a nested one.
-
-    Raises:
-        LookupError, ValueError: only tyro can read the value.
-    """
-    name, *below = path
-    hint = get_type_hints(type(holder))[name]
-    if below:
-        value = _laid(getattr(holder, name), below, words, given=given)
-    elif hint is bool and not given:
-        value = True
-    else:
-        value = _value(hint, words.popleft(), given=given)
-    change = dataclasses.replace if dataclasses.is_dataclass(holder) else msgspec.structs.replace
-    return change(holder, **{name: value})
-
-
 def _value(hint: Any, text: str, *, given: bool) -> Any:
     """Value of a text for a field with this annotation; `given` for `--flag=VALUE`.
 
@@ -133,8 +209,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
         ValueError: only tyro can read the value.
     """
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    # Where one number may stand for all axes, the text is that number.
-    (kind,) = (kind for kind in kinds if kind is not NoneType and get_origin(kind) is not tuple)
+    (kind,) = (kind for kind in kinds if kind is not NoneType)
     if kind in (str, Path) and text and text != "None" and (given or text[0] != "-"):
         return kind(text)
     if kind in (int, float) and text[:1].isdecimal() and text.isascii():
@@ -144,9 +219,8 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
     raise ValueError(text)
 
 
-@cache
-def _tell_tyro(options: type) -> None:
-    """Add tyro's annotations that correspond to the options' own."""
+def _tell_tyro(options: type, *, keys: bool) -> None:
+    """Add tyro's annotations that correspond to the options' own; keys of a scenario, or none."""
     from tyro import conf
 
     def told(hint: Any) -> Any:
@@ -155,10 +229,17 @@ def _tell_tyro(options: type) -> None:
             return Annotated[hint, conf.FlagCreatePairsOff]  # no --no-no-page
         if argument is None:
             return hint
+        if argument.name == "" and not keys:
+            return Annotated[hint, conf.SuppressFixed]
         words = [conf.arg(name=argument.name, metavar=argument.metavar, help=argument.help)]
         words += [conf.Positional] * argument.positional
         words += [conf.UseAppendAction] * argument.append
         return Annotated[(hint, *words)]
 
-    hints = get_type_hints(options, include_extras=True)
-    options.__annotations__ = {name: told(hint) for name, hint in hints.items()}
+    options.__annotations__ = {name: told(hint) for name, hint in _hints(options).items()}
+
+
+@cache
+def _hints(options: type) -> Mapping[str, Any]:
+    """Annotations of options, as they are written."""
+    return get_type_hints(options, include_extras=True)

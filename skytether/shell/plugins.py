@@ -8,7 +8,7 @@ runs with all rights of the user.
 import hashlib
 import sys
 import traceback
-from argparse import ArgumentError, ArgumentParser
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -53,12 +53,23 @@ _loaded: dict[str, Plugin] = {}
 
 def named(argv: Sequence[str]) -> list[str]:
     """Files that a command line names as plug-ins, found before anything else of it is parsed."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument(FLAG, action="append", default=[])
-    # a flag without its file: the parser of the whole line reports it
-    with suppress(ArgumentError):
-        return parser.parse_known_args(list(argv))[0].plugin
-    return []
+    return flag_values(argv, FLAG)[0]
+
+
+def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
+    """Values of a flag on a command line, and the line without them; a flag without its value
+    stays there.
+    """
+    words, values, rest = deque(argv), list[str](), list[str]()
+    while words:
+        word = words.popleft()
+        if word == flag and words and not words[0].startswith("-"):
+            values.append(words.popleft())
+        elif word.startswith(f"{flag}="):
+            values.append(word.removeprefix(f"{flag}="))
+        else:
+            rest.append(word)
+    return values, rest
 
 
 def load(paths: Iterable[str] = ()) -> None:

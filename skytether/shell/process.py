@@ -5,6 +5,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from socket import socket
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
@@ -26,14 +27,21 @@ from skytether.shared.core.events import (
 from skytether.shared.core.line import Line
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
-from skytether.shell import beside
-from skytether.shell.command import CONFIGURATION, CommandError, Options, unsealed, write
+from skytether.shell import beside, command
+from skytether.shell.command import (
+    CONFIGURATION,
+    CommandError,
+    ScenarioOptions,
+    unsealed,
+    write,
+)
 from skytether.shell.control import controlled
 from skytether.shell.driver import Shell, run
 from skytether.shell.feed import Feed
-from skytether.shell.journal import Journal
+from skytether.shell.journal import Journal, take_up
 from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
@@ -44,6 +52,28 @@ from skytether.shell.udp import AddressError, is_loopback
 # for type checking alone: they are slow to import, and a process that flies does without
 if TYPE_CHECKING:
     from skytether.shell.exporter import Metrics
+
+
+@dataclass(frozen=True)
+class ProcessOptions(ScenarioOptions):
+    """Options of every process."""
+
+    log: LogFormat = "text"
+    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
+    record: Path | None = None
+    """File for the process's part of the record; one that ends in .mcap becomes a recording with
+    all that it says, see `skytether join`."""
+    json: Path | None = None
+    """File for what was counted, and the CPU time it took."""
+    control: Path | None = None
+    """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    new_flight: bool = False
+    """Begin a new flight: what was set in flight in an earlier run, and lies beside the socket of
+    --control, does not count. A person says so; the command of a service must not."""
+    feed: Path | None = None
+    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    metrics: str | None = None
+    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
 
 
 @contextmanager
@@ -88,151 +118,211 @@ def _until_the_end(recording: RecordFile) -> Iterator[RecordFile]:
         raise CommandError(fault)
 
 
-def drive(
-    process: str,
-    endpoint: Endpoint,
-    options: Options,
-    *,
-    bind: Address | socket | None,
-    peers: Sequence[Address] = (),
-    forms: Sequence[Form] = (),
-    waiting_for: str,
-    secure: bool | None,
-    insecure: bool = False,
-    log: LogFormat,
-    json: Path | None = None,
-    stopwatch: Stopwatch | None = None,
-    recording: RecordFile | None = None,
-    control: Path | None = None,
-    journal: Journal | None = None,
-    feed: Feed | None = None,
-    metrics: Address | None = None,
-    line: Line | None = None,
-    is_patient: bool = False,
-    memory: MemoryFile | None = None,
-    warnings: Sequence[Event] = (),
-    ready: Callable[[], None] = lambda: None,
-) -> None:
-    """Run one endpoint as a process until it has finished or is told to stop.
+@dataclass(slots=True)
+class Process:
+    """One endpoint as a process, made by `begin`."""
 
-    Args:
-        process: name of the process in its log.
-        endpoint: what to run.
-        options: its options, with the scenario and its name.
-        bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
-        waiting_for: the peer whose datagrams it waits for, named to the operator.
-        secure: whether it has keys; None for one that only forwards datagrams.
-        insecure: whether it may run without keys even where other machines can reach it.
-        log: form of its log on stdout.
-        json: file for its last figures.
-        recording: its recorder, which is waited for at the end.
-        control: path of the socket for changes in flight.
-        journal: what was set in flight in an earlier run, and will be in this one.
-        feed: feed of its rows and events.
-        metrics: HTTP address for its figures.
-        warnings: warnings for the operator about the scenario.
-        ready: called once all checks have passed, before the first datagram is received.
+    name: str
+    """Name in its log."""
+    options: ProcessOptions
+    secure: bool | None
+    """Whether it has keys; None for one that only forwards datagrams."""
+    scenario: Scenario
+    """The scenario, with what was set in an earlier run."""
+    journal: Journal | None
+    """Journal of what is set in flight."""
+    warnings: list[Event]
+    """Warnings and news for the operator, said at the start."""
+    recording: RecordFile | None
+    """File of its rows, which is waited for at the end."""
+    feed: Feed | None
+    """Feed of its rows and events."""
+    recorder: Recorder | None
+    """Recorder of its rows, for a file, a feed or both; None for neither."""
 
-    Raises:
-        CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
-    """
-    running = journal.running(endpoint) if journal else Running(endpoint, options.config)
-    if feed:
-        feed.open(opened(process, options.scenario, running, feed))
-    with ExitStack() as stack:
-        served = stack.enter_context(_served(metrics, process, options))
-        try:
-            heeds = stack.enter_context(controlled(control, running, journal))
-            shell = Shell(
-                endpoint,
-                bind,
-                peers,
-                stopwatch,
-                forms,
-                heeds,
-                feed,
-                line,
-                is_patient=is_patient,
-                memory=memory,
-            )
-        except LocalError as error:
-            raise CommandError(f"--control: {error}", CONFIGURATION) from None
-        except AddressError as error:
-            raise CommandError(str(error)) from None
-        if secure is False and not (shell.is_local or insecure):
-            raise unsealed(*peers or (shell.address,))
-        ready()
-        began_s = time.process_time()
+    def fed(self, part: str, columns: np.dtype[np.void]) -> Recorder | None:
+        """Recorder of a further part of the record, for the feed alone; None without one."""
+        return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
-        def start() -> None:
-            host, port = shell.address
-            out.say(Listening(host=host, port=port, waiting_for=waiting_for))
-            if secure is False:
-                out.say(Plaintext(local=shell.is_local))
-            if served:
-                host, port = served.address
-                out.say(Measured(host=host, port=port, local=is_loopback(served.address)))
-            for each in warnings:
-                out.say(each)
+    def drive(
+        self,
+        endpoint: Endpoint,
+        *,
+        bind: Address | socket | None,
+        waiting_for: str,
+        peers: Sequence[Address] = (),
+        forms: Sequence[Form] = (),
+        insecure: bool = False,
+        stopwatch: Stopwatch | None = None,
+        line: Line | None = None,
+        is_patient: bool = False,
+        memory: MemoryFile | None = None,
+        ready: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Run an endpoint until it has finished or is told to stop.
 
-        def figures() -> dict[str, Any]:
-            counted = endpoint.figures() | {
-                "cpu_s": time.process_time() - began_s,
-                "kernel_drops": shell.kernel_drops(),
-                "send_errors": shell.send_errors,
-            }
-            return counted | ({"feed": feed.figures()} if feed else {})
+        Args:
+            endpoint: what to run.
+            bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
+            waiting_for: the peer whose datagrams it waits for, named to the operator.
+            insecure: whether it may run without keys even where other machines can reach it.
+            ready: called once all checks have passed, before the first datagram is received.
 
-        def each_second(*, last: bool = False) -> None:
-            for source in (recording, memory):
-                if source and (news := source.news()):
-                    out.say(news)
-            out.each_second(last=last)
-            _learn_time(endpoint, options)
-            if feed or served:
-                snapshot = figures()
+        Raises:
+            CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
+        """
+        options, feed, journal = self.options, self.feed, self.journal
+        running = journal.running(endpoint) if journal else Running(endpoint, options.config)
+        if feed:
+            feed.open(opened(self.name, options.scenario, running, feed))
+        with ExitStack() as stack:
+            served = stack.enter_context(_served(self.name, options))
+            try:
+                heeds = stack.enter_context(controlled(options.control, running, journal))
+                shell = Shell(
+                    endpoint,
+                    bind,
+                    peers,
+                    stopwatch,
+                    forms,
+                    heeds,
+                    feed,
+                    line,
+                    is_patient=is_patient,
+                    memory=memory,
+                )
+            except LocalError as error:
+                raise CommandError(f"--control: {error}", CONFIGURATION) from None
+            except AddressError as error:
+                raise CommandError(str(error)) from None
+            if self.secure is False and not (shell.is_local or insecure):
+                raise unsealed(*peers or (shell.address,))
+            ready()
+            began_s = time.process_time()
+
+            def start() -> None:
+                host, port = shell.address
+                out.say(Listening(host=host, port=port, waiting_for=waiting_for))
+                if self.secure is False:
+                    out.say(Plaintext(local=shell.is_local))
+                if served:
+                    host, port = served.address
+                    out.say(Measured(host=host, port=port, local=is_loopback(served.address)))
+                for each in self.warnings:
+                    out.say(each)
+
+            def figures() -> dict[str, Any]:
+                counted = endpoint.figures() | {
+                    "cpu_s": time.process_time() - began_s,
+                    "kernel_drops": shell.kernel_drops(),
+                    "send_errors": shell.send_errors,
+                }
+                return counted | ({"feed": feed.figures()} if feed else {})
+
+            def each_second(*, last: bool = False) -> None:
+                for source in (self.recording, memory):
+                    if source and (news := source.news()):
+                        out.say(news)
+                out.each_second(last=last)
+                _learn_time(endpoint, options)
+                snapshot = figures() if feed or served else {}
                 if feed:
                     feed.count(snapshot)
                 if served:
                     served.take(snapshot)
 
-        with (
-            _told_once() as told,
-            closing(Log(process, log, feed.say if feed else lambda _: None)) as out,
-        ):
-            run(
-                [shell],
-                on_start=start,
-                on_event=out.hear,
-                on_usr1=lambda: out.say(Counted(figures=figures())),
-                on_second=each_second,
-            )
-            told()
-            if recording:
-                recording.end()
-            each_second(last=True)
-            last = figures()
-            out.say(Counted(figures=last))
-            if json:
-                write(json, msgspec.json.encode(last))
+            with (
+                _told_once() as told,
+                closing(Log(self.name, options.log, feed.say if feed else lambda _: None)) as out,
+            ):
+                run(
+                    [shell],
+                    on_start=start,
+                    on_event=out.hear,
+                    on_usr1=lambda: out.say(Counted(figures=figures())),
+                    on_second=each_second,
+                )
+                told()
+                if self.recording:
+                    self.recording.end()
+                each_second(last=True)
+                last = figures()
+                out.say(Counted(figures=last))
+                if options.json:
+                    write(options.json, msgspec.json.encode(last))
 
 
-def _learn_time(endpoint: Endpoint, options: Options) -> None:
+@contextmanager
+def begin(
+    name: str,
+    options: ProcessOptions,
+    columns: np.dtype[np.void],
+    *,
+    secure: bool | None,
+    number: int = 0,
+    warnings: Sequence[Event] = (),
+    keeps_rows: bool = False,
+) -> Iterator[Process]:
+    """Take up what was set in an earlier run, and open record and feed for as long as the block
+    takes.
+
+    Args:
+        name, options, secure, warnings: see `Process`.
+        columns: columns of its rows.
+        number: number of a worker, which stands behind its name; 0 for a process alone.
+        keeps_rows: whether its rows are kept in a temporary file where no record is asked for.
+
+    Raises:
+        CommandError: a file or a socket cannot be made; at the end, the record is incomplete.
+    """
+    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
+    part = None if options.record and options.record.suffix == RECORDING else options.record
+    with ExitStack() as stack:
+        recording = None
+        if part:
+            recording = stack.enter_context(recorded(part, columns))
+        elif keeps_rows:
+            recording = stack.enter_context(recorded_meanwhile(columns))
+        feed = stack.enter_context(_fed(name, options, secure=bool(secure)))
+        recorder = recording.recorder if recording else None
+        if feed:
+            recorder = _followed(recorder or Recorder(columns), feed, name, columns)
+        news = [*warnings, *taken_up.news]
+        yield Process(
+            f"{name}.{number}" if number else name,
+            options,
+            secure,
+            taken_up.scenario,
+            taken_up.journal,
+            news,
+            recording,
+            feed,
+            recorder,
+        )
+
+
+def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.void]) -> Recorder:
+    recorder.follow(feed.part(part, columns))
+    return recorder
+
+
+def _learn_time(endpoint: Endpoint, options: ProcessOptions) -> None:
     """Tell an endpoint the time of day, where it is asked for and known."""
     if options.config.link.time_of_day == "host" and (told := host_time()):
         endpoint.learn_time(told.utc_ns, told.error_ns, now_ns=told.now_ns)
 
 
 @contextmanager
-def _served(address: Address | None, process: str, options: Options) -> Iterator["Metrics | None"]:
+def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]:
     """Serve metrics over HTTP for as long as the block takes; none without an address.
 
     Raises:
         CommandError: the address cannot be listened at.
     """
-    if address is None:
+    if options.metrics is None:
         yield None
         return
+    address = command.address("--metrics", options.metrics)
     from skytether.shell.exporter import Collected, Metrics, MetricsError
 
     collected = Collected(process, options.scenario, options.config.control.dt)
@@ -262,61 +352,33 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
     return make
 
 
-def part_of(record: Path | None) -> Path | None:
-    """File for a part of the record: `record`, unless it names a recording (see `fed`)."""
-    return None if record and record.suffix == RECORDING else record
-
-
 @contextmanager
-def fed(
-    path: Path | None, record: Path | None, process: str, options: Options, *, secure: bool
-) -> Iterator[Feed | None]:
-    """Open a feed for as long as the block takes; None where no feed was asked for.
-
-    Args:
-        path: path of its socket; None for no readers other than a recorder.
-        record: output file; if it is a recording (.mcap), another process writes it from the feed.
-        process: name of this process.
-        options: its options, with the scenario and its name.
-        secure: whether it has keys.
+def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Feed | None]:
+    """Open a feed for as long as the block takes; None where no reader and no recording is asked
+    for. A recording (.mcap) is written from the feed by another process.
 
     Raises:
         CommandError: the socket cannot be made, or the recording is incomplete at the end.
     """
-    recorded = record if record and not part_of(record) else None
-    if path is None and recorded is None:
+    record = options.record if options.record and options.record.suffix == RECORDING else None
+    if not (options.feed or record):
         yield None
         return
     with ExitStack() as stack:
-        at = stack.enter_context(beside.socket_of(path))
+        at = stack.enter_context(beside.socket_of(options.feed))
         try:
             feed = Feed(at)
         except LocalError as error:
             raise CommandError(f"--feed: {error}", CONFIGURATION) from None
-        if recorded is None:
-            with closing(feed):
-                yield feed
-            return
-        name, scenario = options.scenario, options.config
         try:
-            with (
-                beside.recorder(recorded, at, process, name, scenario, secure=secure),
-                closing(feed),
-            ):
-                yield feed
+            if record:
+                told = record, at, process, options.scenario, options.config
+                stack.enter_context(beside.recorder(*told, secure=secure))
+            stack.enter_context(closing(feed))
+            yield feed
+            stack.close()
         except beside.RecorderError as error:
             raise CommandError(str(error)) from None
-
-
-def recorder(
-    part: str, columns: np.dtype[np.void], recording: RecordFile | None, feed: Feed | None
-) -> Recorder | None:
-    """Recorder of a part of the record, for a file, a feed or both; None for neither."""
-    if feed is None:
-        return recording.recorder if recording else None
-    both = recording.recorder if recording else Recorder(columns)
-    both.follow(feed.part(part, columns))
-    return both
 
 
 @contextmanager

@@ -8,14 +8,11 @@ if __name__ == "__main__":  # first, before the imports below, which take a whil
     sys.exit(run("skytether.station.__main__:fly", "station"))
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 
-from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, process
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.shell.log import LogFormat
+from skytether.shell.command import CommandError, ScenarioName
+from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import is_loopback, look_up
 from skytether.station import laws
 from skytether.station.endpoint import Station
@@ -24,7 +21,7 @@ from skytether.station.laws import LawOptions
 
 
 @dataclass(frozen=True)
-class StationOptions(LawOptions):
+class StationOptions(LawOptions, ProcessOptions):
     """Options of `skytether station`."""
 
     scenario: ScenarioName = "autopilot"
@@ -33,14 +30,6 @@ class StationOptions(LawOptions):
     """HOST:PORT to receive MAVLink at; the first autopilot that is heard there is flown."""
     insecure: bool = False
     """Listen even where other machines can reach it: MAVLink has no keys."""
-    log: LogFormat = "text"
-    """Form of printed events: sentences, or lines of JSON for a program."""
-    record: Path | None = None
-    """File for the station's part of the record: what it heard and sent at each step."""
-    json: Path | None = None
-    """File for counters and the CPU time used."""
-    plugin: command.Plugins = ()
-    config: ScenarioFlags = Scenario()
 
 
 def fly(argv: Sequence[str]) -> None:
@@ -56,19 +45,9 @@ def fly(argv: Sequence[str]) -> None:
     if not (options.insecure or is_loopback(look_up(bind))):
         said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
         raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
-    columns, record = station_columns(scenario.model.axes), options.record
-    with process.recorded(record, columns) if record else nullcontext() as recording:
-        station = Station(scenario, law, recording.recorder if recording else None)
-        process.drive(
-            "station",
-            station,
-            options,
-            bind=bind,
-            waiting_for="an autopilot",
-            secure=None,
-            log=options.log,
-            json=options.json,
-            recording=recording,
-        )
+    columns = station_columns(scenario.model.axes)
+    with process.begin("station", options, columns, secure=None) as running:
+        station = Station(running.scenario, law, running.recorder)
+        running.drive(station, bind=bind, waiting_for="an autopilot")
         if failure := station.failure:
             raise CommandError(str(failure))

@@ -106,68 +106,38 @@ def start() -> Iterator[Callable[..., Process]]:
 
 
 @pytest.mark.parametrize(
-    ("argv", "code", "line"),
+    ("line", "said"),
     [
-        (["fly", "papr"], 2, "fly: papr: no such scenario; did you mean paper?"),
-        (["flyy"], 2, "skytether: no command 'flyy'; did you mean fly?"),
+        ("fly papr", "fly: papr: no such scenario; did you mean paper?"),
+        ("flyy", "skytether: no command 'flyy'; did you mean fly?"),
+        ("fly demo --virtual --control sockets", "fly: --control: got --virtual"),
+        ("set nobody armed", "set: got 'armed', expected KEY=VALUE"),
         (
-            ["fly", "demo", "--virtual", "--control", "sockets"],
-            2,
-            "fly: --control: got --virtual",
-        ),
-        (["set", "nobody", "armed"], 2, "set: got 'armed', expected KEY=VALUE"),
-        (
-            ["fly", "demo", "--control.dt", "0"],
-            2,
-            "fly: demo and the command line: control.dt: got 0.0, expected a number >= 0.001",
+            "fly demo --control.dt 0",
+            "fly: demo and the command line: control.dt: got 0, expected a number >= 0.001",
         ),
         (
-            ["fly", "demo-committed", "--control.horizon", "5"],
-            2,
+            "fly demo-committed --control.horizon 5",
             "fly: demo-committed and the command line: control.horizon: got 5, expected",
         ),
-        (
-            ["fly", "--figure", "flight.gif"],
-            2,
-            "fly: flight.gif: expected",
-        ),
-        (["server", "--bind", "47001"], 2, "server: --bind: got '47001', expected HOST:PORT"),
-        (
-            ["server", "--bind", "::1:47001"],
-            2,
-            "server: --bind: got '::1:47001', expected HOST:PORT",
-        ),
-        (["server", "--bind", "[::1]"], 2, "server: --bind: got '[::1]', expected HOST:PORT"),
-        (
-            ["netem", "--server", "[name]:1"],
-            2,
-            "netem: --server: got '[name]:1', expected HOST:PORT",
-        ),
-        (
-            ["client", "--server", "[1::2::3]:4"],
-            2,
-            "client: --server: got '[1::2::3]:4', expected HOST:PORT",
-        ),
-        (
-            ["client", "--server", "[::1]:65536"],
-            2,
-            "client: --server: got '[::1]:65536', expected HOST:PORT",
-        ),
-        (["client", "--id", "-1"], 2, "client: --id: got -1, expected 0 to 65535"),
-        (
-            ["netem", "--server", "nobody.invalid:1"],
-            1,
-            "netem: cannot find nobody.invalid: ",
-        ),
-        (["scenarios", "paper"], 2, "scenarios: got 'paper', expected nothing"),
+        ("fly --figure flight.gif", "fly: flight.gif: expected"),
+        ("server --bind 47001", "server: --bind: got '47001', expected HOST:PORT"),
+        ("server --bind ::1:47001", "server: --bind: got '::1:47001', expected HOST:PORT"),
+        ("server --bind [::1]", "server: --bind: got '[::1]', expected HOST:PORT"),
+        ("netem --server [name]:1", "netem: --server: got '[name]:1', expected HOST:PORT"),
+        ("client --server [1::2::3]:4", "client: --server: got '[1::2::3]:4', expected HOST:PORT"),
+        ("client --server [::1]:65536", "client: --server: got '[::1]:65536', expected HOST:PORT"),
+        ("client --id -1", "client: --id: got -1, expected 0 to 65535"),
+        ("netem --server nobody.invalid:1", "netem: cannot find nobody.invalid: "),
+        ("scenarios paper", "scenarios: got 'paper', expected nothing"),
     ],
 )
 def test_a_mistake_is_one_clear_line(
-    argv: list[str], code: int, line: str, capfd: pytest.CaptureFixture[str]
+    line: str, said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(argv) == code
-    (said,) = capfd.readouterr().err.splitlines()
-    assert said.startswith(line)
+    assert main(line.split()) == (1 if "cannot find" in said else 2)
+    (told,) = capfd.readouterr().err.splitlines()
+    assert told.startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -181,10 +151,9 @@ def test_an_address_is_read_as_it_is_written(address: Address) -> None:
 @pytest.mark.parametrize(
     "argv",
     [
-        ["--control.dt", "soon"],
-        ["--control.triger", "x"],
+        ["--triger", "x"],
+        ["--page"],
         ["more"],
-        ["--control.delay-bound", "fast"],
     ],
 )
 def test_a_wrong_flag_is_explained(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:

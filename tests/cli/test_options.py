@@ -10,22 +10,17 @@ import pytest
 import skytether.client.__main__ as client
 import skytether.netem.__main__ as netem
 from skytether.cli import fly, keygen
-from skytether.shell import options
+from skytether.shared.base.errors import ConfigError
+from skytether.shell import command, options
 
 PLAIN: list[tuple[Any, list[str]]] = [
     (client.ClientOptions(), []),
     (client.ClientOptions(), ["paper"]),
     (client.ClientOptions(), ["paper", "--server", "[::1]:1", "--id", "7", "--insecure"]),
-    (client.ClientOptions(), ["demo", "--server=netem:47000", "--keys=-k", "--duration=60"]),
-    (client.ClientOptions(), ["demo", "--duration", "20", "--seed", "3", "--settle", "0.5"]),
-    (client.ClientOptions(), ["--control.decay-rate", "1.5e-3", "--model.dead_time_s=0.5"]),
-    (client.ClientOptions(), ["--network.uplink.minimum-s", "0.03", "--log=json", "--key-id", "2"]),
-    (
-        client.ClientOptions(),
-        ["--control.scheme", "none", "--control.trigger", "cost_gap | silence(1)"],
-    ),
+    (client.ClientOptions(), ["demo", "--server=netem:47000", "--keys=-k"]),
+    (client.ClientOptions(), ["--log=json", "--key-id", "2"]),
     (client.ClientOptions(), ["--id", "1", "--id", "2", "--record", "a b", "--json", "c"]),
-    (netem.NetemOptions(), ["--flows", "5", "--network.downlink.delay", "constant"]),
+    (netem.NetemOptions(), ["--flows", "5"]),
     (fly.FlyOptions(), ["demo", "--virtual", "--no-page", "--figure", "a.png"]),
 ]
 NOT_PLAIN: list[tuple[Any, list[str]]] = [
@@ -35,23 +30,17 @@ NOT_PLAIN: list[tuple[Any, list[str]]] = [
     (client.ClientOptions(), ["--server", "--insecure"]),
     (client.ClientOptions(), ["--server", ""]),
     (client.ClientOptions(), ["--serve", "a:1"]),
-    (client.ClientOptions(), ["--control", "a", "--control.", "1"]),
-    (client.ClientOptions(), ["--config.duration", "1"]),
-    (client.ClientOptions(), ["--control.nothing", "1"]),
     (client.ClientOptions(), ["--id", "one"]),
     (client.ClientOptions(), ["--id", "1.5"]),
     (client.ClientOptions(), ["--id=-1"]),
     (client.ClientOptions(), ["--key-id", "None"]),
     (client.ClientOptions(), ["--record=None"]),
     (client.ClientOptions(), ["--log", "xml"]),
-    (client.ClientOptions(), ["--duration", "inf"]),
     (client.ClientOptions(), ["--insecure=True"]),
     (client.ClientOptions(), ["--no-insecure"]),
-    (client.ClientOptions(), ["--model.tau-s", "0.5", "0.6"]),
     (client.ClientOptions(), ["--insecure", "demo"]),
     (client.ClientOptions(), ["demo", "paper"]),
     (client.ClientOptions(), ["--"]),
-    (client.ClientOptions(), ["--control", "a", "--network.uplink", "1"]),
 ]
 
 
@@ -75,8 +64,71 @@ def test_any_other_line_is_for_tyro(default: Any, argv: list[str]) -> None:
     assert options.plain(default, argv) is None
 
 
+def test_the_help_shows_keys_after_a_mistake_as_well(capsys: pytest.CaptureFixture[str]) -> None:
+    for flag in ("--nonsense", "--help"):
+        with pytest.raises(SystemExit):
+            command.parse(client.ClientOptions(), ["demo", flag], "x", None)
+    assert "--control.decay-rate FLOAT" in capsys.readouterr().out
+
+
 def test_a_command_with_a_required_option_is_for_tyro() -> None:
     assert options.plain(keygen.KeygenOptions(options), ["file"]) is None  # type: ignore[arg-type]
+
+
+KEYS: list[tuple[list[str], dict[str, Any]]] = [
+    (
+        ["--duration", "20", "--seed=3", "--settle", ".5"],
+        {"duration": 20, "seed": 3, "settle": 0.5},
+    ),
+    (["--control.decay-rate", "1.5e-3"], {"control.decay_rate": 1.5e-3}),
+    (["--control.trigger", "cost_gap | silence(1)"], {"control.trigger": "cost_gap | silence(1)"}),
+    (["--control.delay-bound", "auto"], {"control.delay_bound": "auto"}),
+    (["--control.feedback"], {"control.feedback": True}),
+    (["--control.no-feedback", "--no-armed"], {"control.feedback": False, "armed": False}),
+    (["--model.axes", "3", "--vehicle.kind", "ideal"], {"model.axes": 3, "vehicle.kind": "ideal"}),
+    (["--title", "7"], {"title": "7"}),
+    (["--model.tau-s", "0.5", "0.6"], {"model.tau_s": [0.5, 0.6]}),
+    (["--model.tau-s", "0.5"], {"model.tau_s": [0.5]}),
+    (["--model.dead-time-s", "0.5"], {"model.dead_time_s": 0.5}),
+    (["--vehicle.start-m", "-1", "2"], {"vehicle.start_m": [-1, 2]}),
+    (["--reference.points-m", "[[0, 0], [9, 0]]"], {"reference.points_m": [[0, 0], [9, 0]]}),
+    (["--network.uplink", "loss(0.1)"], {"network.uplink": "loss(0.1)"}),
+    (["--seed", "1", "--seed", "2"], {"seed": 2}),
+    (["--control.nothing", "1"], {"control.nothing": "1"}),
+]
+
+
+@pytest.mark.parametrize(("flags", "values"), KEYS)
+def test_flags_of_keys_are_read_by_the_types_of_keys(
+    flags: list[str], values: dict[str, Any]
+) -> None:
+    own = ["--log", "json", "--control", "a"]
+    rest, read = options.key_values(["demo", *flags, *own], client.ClientOptions)
+    assert read == values
+    assert rest == ["demo", *own]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--control.dt", "soon"], "control.dt: got 'soon', expected a number"),
+        (["--control.dt"], "control.dt: got nothing, expected a value"),
+        (["--control.dt", "--insecure"], "control.dt: got nothing, expected a value"),
+        (["--vehicle.start", "0", "0"], "vehicle.start: no such key; did you mean start_m?"),
+        (["--durtion", "3"], "durtion: no such key; did you mean duration?"),
+        (["--network", "x"], "network: got 'x', expected a table"),
+        (["--control.triger", "x"], "control.triger: no such key; did you mean trigger?"),
+        (["--control.dt.x", "1"], "control.dt.x: no such key"),
+        (["--control.", "1"], "control.: no such key"),
+        (["--config.duration", "1"], "config: no such key"),
+        (["--duration", "inf"], "duration: got inf, expected a number <= 86400.0"),
+        (["--duration", "1", "--seed", "1.5"], "seed: got 1.5, expected a whole number"),
+    ],
+)
+def test_a_wrong_key_or_value_is_one_clear_line(flags: list[str], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        command.parse(client.ClientOptions(), ["demo", *flags], "x", None)
+    assert said in str(error.value)
 
 
 def test_what_flies_imports_neither_tyro_nor_rich_nor_cryptography_nor_extras() -> None:
@@ -84,7 +136,7 @@ def test_what_flies_imports_neither_tyro_nor_rich_nor_cryptography_nor_extras() 
     code = (
         "import sys; from skytether.client import __main__ as client; "
         "from skytether.netem import __main__; from skytether.shell import command; "
-        "command.parse(client.ClientOptions(), ['demo', '--duration', '30'], 'x', ''); "
+        "command.parse(client.ClientOptions(), ['demo', '--model.tau-s', '1', '1'], 'x', ''); "
         "names = {'tyro', 'rich', 'cryptography', 'prometheus_client', 'importlib.metadata'}; "
         "names |= {'numba', 'scipy', 'viser', 'mcap', 'matplotlib', 'skytether.server'}; "
         "print(sorted(names & set(sys.modules)))"

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import skytether.shell.control
-from skytether.cli.set import set_keys, value
+from skytether.cli.set import set_keys
 from skytether.netem.proxy import Proxy
 from skytether.shared.core.change import Running
 from skytether.shared.core.events import Changed, ChangeRefused, Event
@@ -23,6 +23,7 @@ from skytether.shell import command
 from skytether.shell.control import REST_S, RESTS, Caller, Control, ControlError, controlled
 from skytether.shell.driver import Shell, run
 from skytether.shell.local import LocalError
+from skytether.shell.options import toml_value
 
 DEMO = reading.load("demo")
 
@@ -297,7 +298,7 @@ def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
 )
 def test_a_value_is_toml_or_else_a_text(text: str, expected: object) -> None:
     """A value is read as TOML, and as plain text if it is none."""
-    assert value(text) == expected
+    assert toml_value(text) == expected
 
 
 @pytest.mark.parametrize(

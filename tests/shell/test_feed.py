@@ -354,7 +354,7 @@ def flooded(driven: Driven) -> tuple[int, int]:
         for _ in range(2):
             driven.loop.turn()
         got += quick.read()
-        waiting = max([waiting, *(reader._bytes for reader in driven.feed._readers)])
+        waiting = max([waiting, *(len(reader.waiting) for reader in driven.feed._readers)])
     assert numbers(got) == list(range(128))
     frames = slow.read()
     assert frames[0] == OPENED

@@ -21,9 +21,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from skytether.cli.processes import Child, started
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Measured, ModeChanged
-from skytether.shell.exporter import names
 from skytether.shell.log import LogLine
-from skytether.shell.metrics import TABLES
+from skytether.shell.metrics import TABLES, names
 
 pytestmark = pytest.mark.long
 

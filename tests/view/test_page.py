@@ -332,7 +332,8 @@ def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
 def heard(at: str, folder: Path, seconds: float = 30.0) -> list[str]:
     """Lines said by a page's process about its address, and the page itself if it is served."""
     said: list[str] = []
-    with page_process.beside([folder], at, said.append):
+    with pytest.MonkeyPatch.context() as patch, page_process.beside([folder], at):
+        patch.setattr(page_process, "say", said.append)
         ends_s = time.monotonic() + seconds
         while not said and time.monotonic() < ends_s:
             time.sleep(0.05)
