@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import feed
-from skytether.shared.telemetry.feed import Said
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded
 from skytether.view.rows import Columns, readable
 
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
@@ -32,24 +30,20 @@ STEPS = ("in_force", "observed_step")
 
 
 def tables(recorded: Recorded) -> dict[str, Columns]:
-    """Tables of a recording, by name; `time_s` counts from the first message.
-
-    Raises:
-        RecordingError: the file is damaged.
-    """
+    """Tables of a recording, by name; `time_s` counts from the first message."""
     times_ns: dict[str, list[int]] = {}
     pieces: dict[str, list[bytes]] = {}
-    events: list[tuple[float, str, str, str]] = []
-    columns = recorded.columns()
-    for time_ns, process, frame in recorded.frames():
+    columns = {part: rows.dtype for part, rows in recorded.parts.items()}
+    for time_ns, _, frame in recorded.frames:
         if isinstance(frame, feed.Rows):
             count = len(frame.rows) // columns[frame.part].itemsize
             times_ns.setdefault(frame.part, []).extend([time_ns] * count)
             pieces.setdefault(frame.part, []).append(frame.rows)
-        elif isinstance(frame, Said) and not isinstance(frame.event, Counted):
-            said = type(frame.event).__name__, str(frame.event)
-            events.append((time_ns / SECOND_NS, process, *said))
     parts = {part: np.frombuffer(b"".join(rows), columns[part]) for part, rows in pieces.items()}
+    events = [
+        (time_ns / SECOND_NS, process, type(event).__name__, str(event))
+        for time_ns, process, event in recorded.events()
+    ]
     made = {
         part: {"time_s": np.array(times_ns[part]) / SECOND_NS}
         | dict(_in_ms(name, column) for name, column in readable(rows).items())

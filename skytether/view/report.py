@@ -14,16 +14,15 @@ from skytether.figures.flights import draw_reference
 from skytether.figures.page import Picture, Table, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Rows as RowsFrame
-from skytether.shared.telemetry.feed import Said
+from skytether.shared.telemetry.feed import table
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows, compared
 from skytether.shared.telemetry.summary import desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,25 +101,29 @@ def page(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> str:
         summary: names and values of its summary.
 
     Raises:
-        RecordingError: nothing was flown in it, or the file is damaged.
+        RecordingError: nothing was flown in it.
     """
     return rendered("view/report.html.jinja", drawn=_drawn(recorded, summary))
 
 
 def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightReport:
-    parts, scenario, about = recorded.parts(), recorded.scenario, recorded.about
+    parts, scenario, about = recorded.parts, recorded.scenario, recorded.about
     client = parts.get("client")
     if client is None or not len(client) or recorded.summary is None:
         raise RecordingError(f"{recorded.path}: no vehicle has flown a step in it")
     number = client["vehicle"].min()
-    epoch_ns, events = _events(recorded)
+    epoch_ns = _epoch_ns(recorded)
+    events = [
+        (f"{round((time_ns - epoch_ns) / SECOND_NS, 2) + 0.0:.2f}", process, str(event))
+        for time_ns, process, event in recorded.events()
+    ]
     empty = client[:0]
     flown = ReportedFlight(
         scenario,
         client[client["vehicle"] == number],
         parts["server"][parts["server"]["vehicle"] == number] if "server" in parts else empty,
         parts.get("netem", empty),
-        epoch_ns,
+        recorded.begin_ns + epoch_ns,
     )
     began = f"{about.began[:10]} {about.began[11:16]} UTC"
     where = f"over UDP, {began}" if about.began else "in virtual time"
@@ -132,14 +135,14 @@ def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightRepo
     rows = [list(row) for row in summary]
     table = Table("summary", "Summary", "What came of the flight.", "", ("figure", "value"), rows)
     made = {
-        "scenario": recorded.name,
+        "scenario": about.scenario,
         "seed": str(scenario.seed),
         "flown": where,
         "with": f"Skytether {about.version}",
         "recording": recorded.path.name,
     }
     return FlightReport(
-        title=f"Flight of {recorded.name}, seed {scenario.seed}",
+        title=f"Flight of {about.scenario}, seed {scenario.seed}",
         about=f"{recorded.summary.duration_s:g} s {where}.{others}",
         verdict=f"{off}a horizon was sent at {sent} of the steps.",
         tables=[table],
@@ -151,22 +154,13 @@ def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightRepo
     )
 
 
-def _events(recorded: Recorded) -> tuple[int, list[tuple[str, str, str]]]:
-    """Time of step 0 [ns], and events with times counted from it."""
-    columns = recorded.columns()
-    dt_ns = recorded.scenario.dt_ns
-    epoch_ns, said = None, []
-    for _, process, frame in recorded.frames():
-        if isinstance(frame, Said) and not isinstance(frame.event, Counted):
-            said.append((frame.time_ns, process, str(frame.event)))
-        elif epoch_ns is None and isinstance(frame, RowsFrame) and frame.part == "client":
-            first = np.frombuffer(frame.rows, columns["client"])[0]
-            epoch_ns = frame.time_ns - int(first["step"]) * dt_ns
-    begin_ns = epoch_ns or 0
-    return begin_ns, [
-        (f"{round((time_ns - begin_ns) / SECOND_NS, 2) + 0.0:.2f}", process, text)
-        for time_ns, process, text in said
-    ]
+def _epoch_ns(recorded: Recorded) -> int:
+    """Time of step 0, counted from the first frame [ns]."""
+    client = recorded.parts["client"].dtype
+    for time_ns, _, frame in recorded.frames:
+        if isinstance(frame, RowsFrame) and frame.part == "client" and frame.rows:
+            return time_ns - int(table(frame.rows, client)["step"][0]) * recorded.scenario.dt_ns
+    return 0
 
 
 def _colour(mode: Mode) -> str:
