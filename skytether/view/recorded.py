@@ -17,6 +17,7 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Counted, Event
+from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import feed
@@ -48,6 +49,8 @@ class Recorded:
     """Frames in order of time, counted from the first one [ns]."""
     parts: Mapping[str, Table]
     """Rows of each part of the record that has any, by its name, in the order of recording."""
+    times_ns: Mapping[str, Indices]
+    """Time of each of these rows [ns], counted from the first frame."""
     lost_bytes: int | None
     """Size of what could not be read of a file that has no end [B]; None for one that has."""
 
@@ -104,8 +107,8 @@ def read(path: Path) -> Recorded:
             if topic.startswith(FEED):
                 frames.add(topic.removeprefix(FEED), feed.unpack(data))
         lost_bytes = None if file.is_whole else file.lost_bytes
-        timed, parts = frames.in_time(), frames.parts()
-        return Recorded(path, begun.about, scenario, timed, parts, lost_bytes)
+        timed, parts, times_ns = frames.in_time(), frames.parts(), frames.times_ns()
+        return Recorded(path, begun.about, scenario, timed, parts, times_ns, lost_bytes)
 
 
 class _Frames:
@@ -122,7 +125,8 @@ class _Frames:
         """Columns by process and part."""
         self._begun_ns: dict[str, int] = {}
         """Time of each process's beginning [ns]."""
-        self._rows: dict[str, list[Table]] = {}
+        self._rows: dict[str, list[tuple[int, Table]]] = {}
+        """Time [ns] and rows of each frame with rows of a part, by the part's name."""
 
     def add(self, process: str, frame: Frame) -> None:
         """Add a frame.
@@ -146,15 +150,15 @@ class _Frames:
                 if frame.time_ns < self._begun_ns[process]:
                     raise ValueError(f"rows of {process[:20]} from before it began")
                 rows = self._rows.setdefault(frame.part, [])
-                rows.append(feed.table(frame.rows, known))
-                if rows[0].dtype != known:
+                rows.append((frame.time_ns, feed.table(frame.rows, known)))
+                if rows[0][1].dtype != known:
                     raise ValueError(f"the part {frame.part} has columns of two kinds")
         self._frames.append((process, frame))
 
     def in_time(self) -> list[Timed]:
         """All frames in order of time, counted from the first one [ns]."""
+        begin_ns = self._begin_ns()
         ordered = sorted(self._frames, key=lambda each: each[1].time_ns)
-        begin_ns = ordered[0][1].time_ns if ordered else 0
         timed = [(frame.time_ns - begin_ns, process, frame) for process, frame in ordered]
         if timed and timed[-1][0] > SPAN_NS_MAX:
             raise ValueError(f"a frame {timed[-1][0]} ns after the first")
@@ -162,10 +166,25 @@ class _Frames:
 
     def parts(self) -> dict[str, Table]:
         """Rows of each part."""
-        made = {part: np.concatenate(tables) for part, tables in self._rows.items()}
+        made = {
+            part: np.concatenate([table for _, table in rows]) for part, rows in self._rows.items()
+        }
         for part, table in made.items():
             check_values(part, table, self._scenario)
         return made
+
+    def times_ns(self) -> dict[str, Indices]:
+        """Time of each row, counted from the first frame [ns]."""
+        begin_ns = self._begin_ns()
+        return {
+            part: np.repeat(
+                [time_ns - begin_ns for time_ns, _ in rows], [len(table) for _, table in rows]
+            )
+            for part, rows in self._rows.items()
+        }
+
+    def _begin_ns(self) -> int:
+        return min((frame.time_ns for _, frame in self._frames), default=0)
 
 
 @lru_cache(64)
