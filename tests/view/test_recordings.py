@@ -9,8 +9,8 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -56,7 +56,7 @@ from skytether.shell.log import Log
 from skytether.sim import flight
 from skytether.view import container, recorded
 from skytether.view import report as view_report
-from skytether.view.frames import of_flight
+from skytether.view.frames import Timed, of_flight
 from skytether.view.recorded import read
 from skytether.view.recording import VEHICLES_MAX, Recording
 from skytether.view.rows import RowTable, planned
@@ -79,6 +79,27 @@ def record(path: Path, scenario: Scenario = SCENARIO, of: Record | None = None) 
     summary = summarise(scenario, "demo", of.client, of.server, of.netem)
     assert recorder.write(path, scenario, "demo", of, summary) is None
     return path
+
+
+def write_frames(
+    file: Any,
+    frames: Iterable[Timed],
+    *,
+    scenario: Scenario = SCENARIO,
+    chunk: int | None = None,
+    end: bool = True,
+) -> None:
+    """Record frames, so many in a chunk, with the end of a file or without."""
+    about = recorder._about(scenario, "demo", began=None, offset_ns=0, secure=False)
+    made = Recording(file, scenario, about)
+    for number, (_, process, frame) in enumerate(frames):
+        made.add(process, frame)
+        if chunk and number % chunk == 0:
+            made.flush()
+    if end:
+        made.finish(None)
+    else:
+        made.flush()
 
 
 @pytest.fixture(scope="module")
@@ -141,11 +162,7 @@ def test_a_fleet_in_space_comes_back() -> None:
     )
     two = flight.fly(scenario, vehicles=2)
     file = io.BytesIO()
-    about = recorder._about(scenario, "fleet", began=None, offset_ns=0, secure=False)
-    recording = Recording(file, scenario, about)
-    for _, process, frame in of_flight(scenario, "fleet", two):
-        recording.add(process, frame)
-    recording.finish(None)
+    write_frames(file, of_flight(scenario, "fleet", two), scenario=scenario)
     topics = topics_of(file)
     assert {"/vehicle/1/flown", "/vehicle/2/flown", "/vehicle/2/scene/vehicle"} <= topics.keys()
     assert topics["/vehicle/1/flown"] == topics["/vehicle/2/flown"]
@@ -292,32 +309,24 @@ def test_a_plan_is_drawn_where_its_inputs_and_the_disturbance_lead() -> None:
 def test_rows_are_read_in_the_order_in_which_they_were_made(tmp_path: Path) -> None:
     """Also where a clock has gone back between them; frames are in the order of their times."""
     path, columns = tmp_path / "back.mcap", client_columns(2)
-    about = recorder._about(SCENARIO, "demo", began=None, offset_ns=0, secure=False)
+    frames = [opened(columns)]
+    for step, time_ns in enumerate((300, 100, 200)):
+        frames.append(msgspec.structs.replace(row_at(step), time_ns=time_ns))
     with path.open("wb") as file:
-        recording = Recording(file, SCENARIO, about)
-        recording.add("client", opened(columns))
-        for step, time_ns in enumerate((300, 100, 200)):
-            row = np.zeros(1, columns)
-            row["vehicle"], row["step"] = 1, step
-            recording.add("client", Rows(part="client", time_ns=time_ns, rows=row.tobytes()))
-        recording.finish(None)
+        write_frames(file, ((0, "client", frame) for frame in frames))
     back = read(path)
     assert back.parts["client"]["step"].tolist() == [0, 1, 2]
-    frames = [frame for _, _, frame in back.frames if isinstance(frame, Rows)]
-    steps = [np.frombuffer(frame.rows, columns)["step"].tolist() for frame in frames]
-    assert steps == [[1], [2], [0]]
+    assert back.times_ns["client"].tolist() == [300, 100, 200]
+    assert [frame for _, _, frame in back.frames] == [frames[0], *frames[2:], frames[1]]
 
 
 def test_of_many_vehicles_only_the_first_are_drawn() -> None:
     """The rows of the others are recorded all the same."""
     file, columns = io.BytesIO(), client_columns(2)
-    about = recorder._about(SCENARIO, "demo", began=None, offset_ns=0, secure=False)
-    recording = Recording(file, SCENARIO, about)
     rows = np.zeros(VEHICLES_MAX + 1, columns)
     rows["vehicle"] = np.arange(1, VEHICLES_MAX + 2)
-    recording.add("client", opened(columns))
-    recording.add("client", Rows(part="client", time_ns=1, rows=rows.tobytes()))
-    recording.finish(None)
+    each = opened(columns), Rows(part="client", time_ns=1, rows=rows.tobytes())
+    write_frames(file, ((0, "client", frame) for frame in each))
     topics = topics_of(file)
     assert f"/vehicle/{VEHICLES_MAX}/pose" in topics
     assert f"/vehicle/{VEHICLES_MAX + 1}/pose" not in topics
@@ -336,17 +345,8 @@ def opened(columns: np.dtype[np.void], part: str = "client") -> Opened:
 
 def write_in_chunks(path: Path, frames: int, *, end: bool) -> Path:
     """A recording of the short flight, a chunk for so many frames, with its end or without."""
-    about = recorder._about(SCENARIO, "demo", began=None, offset_ns=0, secure=False)
     with path.open("wb") as file:
-        recording = Recording(file, SCENARIO, about)
-        for i, (_, process, frame) in enumerate(of_flight(SCENARIO, "demo", flown())):
-            recording.add(process, frame)
-            if i % frames == 0:
-                recording.flush()
-        if end:
-            recording.finish(None)
-        else:
-            recording.flush()
+        write_frames(file, of_flight(SCENARIO, "demo", flown()), chunk=frames, end=end)
     return path
 
 
@@ -357,20 +357,17 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @cache
-def chunks(path: Path) -> list[tuple[int, int]]:
-    """End of each chunk of a torn file [B], and number of frames up to there."""
-    found, count, content = [], 0, path.read_bytes()
-    stream, frames = io.BytesIO(content), set[int]()
-    try:
+def ends(path: Path) -> list[tuple[int, int]]:
+    """End of each whole record of a torn file [B], and number of frames up to there."""
+    stream, feeds, count = io.BytesIO(path.read_bytes()), set[int](), 0
+    found = [(len(container.MAGIC), 0)]
+    with suppress(EndOfFile):
         for each in StreamReader(stream, emit_chunks=True).records:
             for record in breakup_chunk(each) if isinstance(each, Chunk) else ():
                 if isinstance(record, Channel) and record.topic.startswith("/feed/"):
-                    frames.add(record.id)
-                count += isinstance(record, Message) and record.channel_id in frames
-            if isinstance(each, Chunk):
-                found.append((stream.tell(), count))
-    except EndOfFile:
-        pass
+                    feeds.add(record.id)
+                count += isinstance(record, Message) and record.channel_id in feeds
+            found.append((stream.tell(), count))
     return found
 
 
@@ -409,34 +406,18 @@ def test_cut_anywhere_no_whole_chunk_is_lost(
 ) -> None:
     """At a byte of the whole file, or near the end of a chunk, where it matters most."""
     size = torn.stat().st_size
-    ends = [end for end, _ in chunks(torn)]
-    near = st.builds(lambda end, off: end + off, st.sampled_from(ends), st.integers(-3, 3))
+    near = st.builds(lambda end, off: end[0] + off, st.sampled_from(ends(torn)), st.integers(-3, 3))
     cut = min(data.draw(st.integers(0, size) | near), size)
     path = tmp_path_factory.mktemp("cut") / "cut.mcap"
     path.write_bytes(torn.read_bytes()[:cut])
-    expected = max((count for end, count in chunks(torn) if end <= cut), default=0)
+    whole, expected = max((each for each in ends(torn) if each[0] <= cut), default=(0, 0))
     try:
         back = read(path)
     except RecordingError:
         assert expected == 0
     else:
-        assert len(back.frames) == expected
         assert back.frames == read(torn).frames[:expected]
-        assert back.lost_bytes is not None
-        assert cut - back.lost_bytes in {0, *records_ends(torn)}
-
-
-@cache
-def records_ends(path: Path) -> set[int]:
-    """End of each whole record of a torn file [B]."""
-    stream = io.BytesIO(path.read_bytes())
-    ends = {len(container.MAGIC)}
-    try:
-        for _ in StreamReader(stream, emit_chunks=True).records:
-            ends.add(stream.tell())
-    except EndOfFile:
-        pass
-    return ends
+        assert back.lost_bytes == cut - whole
 
 
 @pytest.fixture(scope="module")
