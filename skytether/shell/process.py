@@ -28,7 +28,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
-from skytether.shell import beside
+from skytether.shell import recorder_process
 from skytether.shell.command import CONFIGURATION, CommandError, Options, unsealed, write
 from skytether.shell.control import controlled
 from skytether.shell.driver import Shell, run
@@ -288,7 +288,7 @@ def fed(
         yield None
         return
     with ExitStack() as stack:
-        at = stack.enter_context(beside.socket_of(path))
+        at = stack.enter_context(recorder_process.socket_of(path))
         try:
             feed = Feed(at)
         except LocalError as error:
@@ -300,11 +300,11 @@ def fed(
         name, scenario = options.scenario, options.config
         try:
             with (
-                beside.recorder(recorded, at, process, name, scenario, secure=secure),
+                recorder_process.recorder(recorded, at, process, name, scenario, secure=secure),
                 closing(feed),
             ):
                 yield feed
-        except beside.RecorderError as error:
+        except recorder_process.RecorderError as error:
             raise CommandError(str(error)) from None
 
 
