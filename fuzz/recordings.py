@@ -1,7 +1,7 @@
 """Target for recordings: carefully altered files, and everything that commands make of them.
 
-Each is read as `export` and `report` read it: it is accepted, or `RecordingError` says why not; and
-reading takes little memory, whatever sizes the file claims.
+Each is read as `export`, `join` and `report` read it: it is accepted, or `RecordingError` says why
+not; and reading takes little memory, whatever sizes the file claims.
 """
 
 import io
@@ -31,13 +31,14 @@ from skytether.shared.telemetry import feed
 from skytether.shared.telemetry import summary as summaries
 from skytether.shared.telemetry.summary import summarise
 from skytether.view import container, export, recorded, rows
+from skytether.view.joining import join
 from skytether.view.recorded import read
 from skytether.view.recording import BEGUN, FEED
 from skytether.view.report import page
 
-REPORTED = 500
+REPORTED = 50
 """Rate at which readable recordings are also drawn, one in this number, because drawing is slow."""
-MEMORY_MAX_MB = 600
+MEMORY_MAX_MB = 300
 """Memory that reading may take above the process's earlier peak [MB]."""
 ODD: tuple[Any, ...] = (
     *(
@@ -160,9 +161,9 @@ def changed_value(rng: Random, found: list[Any]) -> None:
 
 def changed_column(rng: Random, found: list[Any]) -> None:
     """One value in a column of every row, or of one."""
-    opened = rng.choice(list(frames_of(found, "Opened").values()))
-    part = rng.choice(list(opened["parts"]))
-    columns = feed.columns_of(opened["parts"][part])
+    part = rng.choice([each["part"] for each in frames_of(found, "Rows").values()])
+    parts = [each["parts"] for each in frames_of(found, "Opened").values()]
+    columns = next(feed.columns_of(each[part]) for each in parts if part in each)
     name, bits = rng.choice(columns.names or ()), rng.choice(BITS).to_bytes(8, "little")
     rows = [(i, e) for i, e in frames_of(found, "Rows").items() if e["part"] == part]
     for i, each in rows if rng.random() < 0.5 else rng.sample(rows, 1):
@@ -351,12 +352,13 @@ class RecordingFile(Target):
         return hostile(rng, payload, self._records)[1]
 
     def __call__(self, payload: bytes) -> None:
-        """Read the recording, and make tables and sometimes a report of it."""
+        """Read the recording, and make another, tables and sometimes a report of it."""
         self._path.write_bytes(payload)
         with suppress(RecordingError):
             known = read(self._path)
             for columns in export.tables(known).values():
                 export.csv(columns)
+            join([known], io.BytesIO())
             if crc32(payload) % REPORTED == 0:
                 page(known, [])
         assert peak_mb() < self._before_mb + MEMORY_MAX_MB

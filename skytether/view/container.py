@@ -20,7 +20,7 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from skytether.shared.base import files
-from skytether.shared.base.errors import RecordingError
+from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.telemetry.record import RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -62,6 +62,8 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except RecordingError:
         raise
+    except ConfigError as error:  # of another version, or its trajectory's file is elsewhere
+        raise RecordingError(f"{path}: {error}") from None
     except BROKEN as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
         raise RecordingError(f"{path}: it is damaged: {what}") from None

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from skytether.shared.base import toml
-from skytether.shared.base.errors import ConfigError, RecordingError
+from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Counted, Event
 from skytether.shared.law.model import Indices
@@ -97,11 +97,7 @@ def read(path: Path) -> Recorded:
         begun = msgspec.msgpack.decode(data, type=Begun)
         if abs(begun.about.offset_ns) > TIME_NS_MAX:
             raise ValueError(f"a clock that is {begun.about.offset_ns} ns off")
-        try:
-            scenario = check(toml.loads(begun.scenario), f"{path}: its scenario")
-        # written by another version, or its trajectory's file is on another machine
-        except ConfigError as error:
-            raise RecordingError(str(error)) from None
+        scenario = check(toml.loads(begun.scenario), "its scenario")
         frames = _Frames(scenario)
         for topic, data in messages:
             if topic.startswith(FEED):

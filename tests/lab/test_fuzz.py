@@ -31,7 +31,7 @@ COUNTS = {
     "handshake": 3_000,
     "holder": 300,
     "control": 150,
-    "recording": 4,
+    "recording": 100,
     "scenario": 150,
     "files": 1_000,
     "feed": 5_000,

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -29,7 +28,6 @@ from mcap.records import Attachment, Channel, Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-import hostile_recordings
 from fuzz.recordings import frames_of, put, records, written
 from skytether.cli import page_process, recorder
 from skytether.cli.export import export
@@ -61,8 +59,6 @@ from skytether.view.recorded import read
 from skytether.view.recording import VEHICLES_MAX, Recording
 from skytether.view.rows import RowTable, planned
 
-BLAS = {"OPENBLAS_NUM_THREADS": "1"}
-"""Environment in which numpy takes no address space for threads."""
 PARTS = ("client", "server", "plan", "netem")
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=6.0, settle=3.0)
 
@@ -986,21 +982,3 @@ def test_a_process_that_begins_thousands_of_times_is_checked_once(
     back = read(changed(recording, tmp_path / "it.mcap", repeat))
     assert sum(isinstance(frame, Opened) for *_, frame in back.frames) == 2003
     assert checked.count("the scenario of a process") == 1
-
-
-@pytest.mark.parametrize("count", [30, pytest.param(400, marks=pytest.mark.long)])
-def test_mutated_recordings_end_in_a_line_in_little_memory(tmp_path: Path, count: int) -> None:
-    """Dozens, and hundreds in the long tests, in a process of its own; by hand there are more."""
-    scenario = msgspec.structs.replace(SCENARIO, duration=2.0, settle=0.0)
-    path = record(tmp_path / "flight.mcap", scenario, flight.fly(scenario))
-    argv = [
-        sys.executable,
-        hostile_recordings.__file__,
-        str(path),
-        str(tmp_path),
-        "--count",
-        str(count),
-    ]
-    done = subprocess.run(argv, capture_output=True, text=True, check=False, env=os.environ | BLAS)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert f"{count} recordings, 0 faults" in done.stdout
