@@ -28,7 +28,6 @@ reorders and loses their packets.
   page FOLDER...        the page of flights in a browser; `fly` serves one by itself
   report FILE           a recording as a page with figures, for the browser
   export FILE           a recording as tables, CSV or Parquet
-  recover FILE          a recording whose flight was killed, mended
   join FILE... --out F  recordings of server, netem and client, as one
   set PATH KEY=VALUE    change something while it flies, at a process with --control
   probe HOST:PORT       a real path measured both ways, and flown over; with --listen, its far end
@@ -84,7 +83,6 @@ COMMANDS = {
     "page": "skytether.view.__main__:show",
     "report": "skytether.cli.report:report",
     "export": "skytether.cli.export:export",
-    "recover": "skytether.cli.recover:recover",
     "join": "skytether.cli.join:join",
     "set": "skytether.cli.set:set_keys",
     "probe": "skytether.cli.probe:probe",

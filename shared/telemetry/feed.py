@@ -81,9 +81,26 @@ _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
 """Errors that the decoder has for what is no frame."""
 
 
+def pack(frame: Frame) -> bytes:
+    """A frame as msgpack."""
+    return _ENCODER.encode(frame)
+
+
+def unpack(body: bytes | bytearray) -> Frame:
+    """The frame that `pack` made these bytes of.
+
+    Raises:
+        FeedError: they are no frame.
+    """
+    try:
+        return _DECODER.decode(body)
+    except _UNDECODABLE as error:
+        raise FeedError(f"got no frame: {error}") from None
+
+
 def encode(frame: Frame) -> bytes:
     """A frame as bytes, its length first."""
-    body = _ENCODER.encode(frame)
+    body = pack(frame)
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
@@ -109,10 +126,7 @@ class Reader:
                 raise FeedError(f"got a frame of {size} B, expected at most {FRAME_BYTES_MAX} B")
             if len(self._bytes) < body + size:
                 break
-            try:
-                frames.append(_DECODER.decode(self._bytes[body : body + size]))
-            except _UNDECODABLE as error:
-                raise FeedError(f"got no frame: {error}") from None
+            frames.append(unpack(self._bytes[body : body + size]))
             begin = body + size
         del self._bytes[:begin]
         return frames

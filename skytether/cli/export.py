@@ -14,7 +14,7 @@ from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 from skytether.view import export as view
 from skytether.view import traffic
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ def export(argv: Sequence[str]) -> None:
         said = "expected at least one of --csv, --parquet, --traces and --pcap"
         raise CommandError(said, CONFIGURATION)
     to_parquet = view.parquet() if options.parquet else None
-    with recordings.opened(options.file) as recorded:
-        if options.traces or options.pcap:
-            _traffic(options, recorded)
-        if not (options.csv or options.parquet):
-            return
-        tables = view.tables(recorded)
+    recorded = recordings.opened(options.file)
+    if options.traces or options.pcap:
+        _traffic(options, recorded)
+    if not (options.csv or options.parquet):
+        return
+    tables = view.tables(recorded)
     command.claim_folder("--csv", options.csv, *(f"{name}.csv" for name in tables))
     command.claim_folder("--parquet", options.parquet, *(f"{name}.parquet" for name in tables))
     for name, columns in tables.items():
@@ -69,7 +69,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
     Raises:
         CommandError: the recording has no netem part, or a file cannot be written.
     """
-    packets = recorded.parts().get("netem")
+    packets = recorded.parts.get("netem")
     if packets is None or not len(packets):
         said = f"{options.file}: got no packets of netem, expected some"
         raise CommandError(said, CONFIGURATION)

@@ -76,8 +76,8 @@ class FlyOptions(ScenarioOptions):
     """File for a picture of the flight (.png, .pdf or .svg)."""
     record: Path | None = None
     """File for a recording of the flight (.mcap): all rows and events of its processes, written
-    during the flight. See `skytether report`, `replay`, `export` and `recover`; Foxglove and
-    Lichtblick can show the file."""
+    during the flight. See `skytether report`, `replay` and `export`; Foxglove and Lichtblick can
+    show the file."""
     beside: str | None = None
     """Second scenario to compare with, flown in virtual time with the same duration and seed."""
 

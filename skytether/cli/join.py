@@ -1,7 +1,6 @@
 """`skytether join`: merge recordings of server, netem and client into one."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,6 @@ import tyro
 from skytether.cli import recorder, recordings
 from skytether.shared.base import files
 from skytether.shell import command
-from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 from skytether.view.joining import join as joined
 
@@ -21,7 +19,8 @@ class JoinOptions:
     """Options of `skytether join`."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
-    """Recordings (.mcap), one from each process."""
+    """Recordings (.mcap), one from each process; or one alone, that of a killed flight, to give it
+    an end for other programs."""
     out: Path
     """File for the recording of the flight (.mcap)."""
     plugin: command.Plugins = ()
@@ -34,12 +33,9 @@ def join(argv: Sequence[str]) -> None:
     is that of the first vehicle.
     """
     options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
-    if len(options.files) < 2:
-        said = f"got {len(options.files)} recordings, expected two or more"
-        raise CommandError(said, CONFIGURATION)
     recorder.check(options.out, "--out")
     command.claim_output("--out", options.out)
-    with ExitStack() as stack:
-        opened = [stack.enter_context(recordings.opened(path)) for path in options.files]
-        joined(opened, stack.enter_context(files.replacing(options.out)))
+    opened = [recordings.opened(path) for path in options.files]
+    with files.replacing(options.out) as file:
+        joined(opened, file)
     print(options.out)

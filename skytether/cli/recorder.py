@@ -19,9 +19,9 @@ from skytether.shared.telemetry.feed import Frame, Opened, Rows
 from skytether.shared.telemetry.record import RECORDING, Record
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell import command, plugins
-from skytether.shell.beside import RecorderOrder
 from skytether.shell.command import CommandError
 from skytether.shell.feed import Subscriber
+from skytether.shell.recorder_process import RecorderOrder
 from skytether.view.frames import of_flight
 from skytether.view.recording import About, Recording
 

@@ -1,38 +1,25 @@
-"""Recordings as commands open them: with one line for what is wrong."""
+"""Recordings as commands read them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from skytether.shared.base.errors import RecordingError
+from skytether.cli.page_process import say
 from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded, read
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[Recorded]:
-    """Open a recording, for as long as the block takes.
-
-    Raises:
-        CommandError: the file cannot be read, or is no recording.
-    """
-    with refused(path), Recorded(path) as recorded:
-        yield recorded
-
-
-@contextmanager
-def refused(path: Path) -> Iterator[None]:
-    """Turn errors of a recording within the block into one line.
+def opened(path: Path) -> Recorded:
+    """Read a recording; a line on stderr says if it has no end.
 
     Raises:
-        CommandError: the block found the recording to be damaged.
+        CommandError: the file cannot be read.
+        RecordingError: it is no recording, or damaged.
     """
     try:
-        yield
-    except RecordingError as error:
-        raise CommandError(str(error), CONFIGURATION) from None
+        recorded = read(path)
     except OSError as error:
-        if error.filename not in {path, str(path)}:
-            raise
         said = f"{path}: cannot be read: {error.strerror}"
         raise CommandError(said, CONFIGURATION) from None
+    if recorded.lost_bytes is not None:
+        lost = f"{recorded.lost_bytes} bytes at the end are lost"
+        say(f"{path}: it has no end, as that of a killed flight: {lost}")
+    return recorded

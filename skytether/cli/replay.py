@@ -8,15 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from skytether.shared.base.errors import RecordingError
+from skytether.cli import recordings
 from skytether.shell import command
-from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
 from skytether.view.browser.serve import until_told
-from skytether.view.recording import Recorded
 
 
 @dataclass(frozen=True)
@@ -34,14 +32,7 @@ def replay(argv: Sequence[str]) -> None:
     """Show a recorded flight in a browser, from any time and at any speed, until Ctrl-C."""
     options = read(ReplayOptions(tyro.MISSING), argv, "skytether replay", replay.__doc__)
     at = command.address("--page", options.page)
-    try:
-        with Recorded(options.file) as recorded:
-            frames = list(recorded.frames())
-    except OSError as error:
-        said = f"{options.file}: cannot be read: {error.strerror}"
-        raise CommandError(said, command.CONFIGURATION) from None
-    except RecordingError as error:
-        raise CommandError(str(error), command.CONFIGURATION) from None
+    recorded = recordings.opened(options.file)
     flight = PageFlight()
-    with closing(Player([flight], [frames])) as player:
+    with closing(Player([flight], [recorded.frames])) as player:
         until_told(at, [flight], now_ns=player.now_ns, more=player.controls)

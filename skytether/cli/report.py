@@ -33,9 +33,9 @@ def report(argv: Sequence[str]) -> None:
     """
     options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
     command.claim_output("--out", options.out)
-    with recordings.opened(options.file) as recorded:
-        summary = terminal.summary_rows(recorded.summary) if recorded.summary else []
-        written = page(recorded, summary)
+    recorded = recordings.opened(options.file)
+    figures = terminal.summary_rows(recorded.summary) if recorded.summary else []
+    written = page(recorded, figures)
     try:
         files.write(options.out, written.encode())
     except OSError as error:

@@ -17,7 +17,7 @@ from skytether.shared.base.hint import hint
 from skytether.shared.core.aboard import VehicleEvent
 from skytether.shared.core.events import Event, Failure, RecordIncomplete
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.feed import Figures, Rows, Said
+from skytether.shared.telemetry.feed import Figures, Said
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     RECORDING,
@@ -189,28 +189,19 @@ class Flight:
             OSError: the file cannot be read.
             RecordingError: the file is no recording, or damaged.
         """
-        from skytether.view.recording import Recorded
+        from skytether.view.recorded import read
 
-        pieces: dict[str, list[bytes]] = {part: [] for part in PARTS}
         events: list[FlightEvent] = []
         figures: dict[str, Any] = {}
-        begin_ns = 0
-        with Recorded(Path(path)) as recorded:
-            for time_ns, process, frame in recorded.frames():
-                begin_ns = frame.time_ns - time_ns
-                match frame:
-                    case Rows():
-                        pieces[frame.part].append(frame.rows)
-                    case Said():
-                        events.append(FlightEvent(time_ns, process, frame.event))
-                    case Figures():
-                        figures[process] = frame.figures
-            parts: dict[str, Any] = {**_no_rows(recorded.scenario)}
-            parts |= {
-                part: np.frombuffer(bytearray().join(pieces[part]), columns)
-                for part, columns in recorded.columns().items()
-            }
-        parts["netem"]["arrived_ns"] -= begin_ns
+        recorded = read(Path(path))
+        for time_ns, process, frame in recorded.frames:
+            match frame:
+                case Said():
+                    events.append(FlightEvent(time_ns, process, frame.event))
+                case Figures():
+                    figures[process] = frame.figures
+        parts: dict[str, Any] = {**_no_rows(recorded.scenario), **recorded.parts}
+        parts["netem"]["arrived_ns"] -= recorded.begin_ns
         told = [each.event for each in events]
         record = Record(
             **parts,

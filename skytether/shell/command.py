@@ -19,7 +19,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 import msgspec
 
 from skytether.shared.base import extras, files
-from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.base.printable import printable
 from skytether.shared.core.endpoint import Address
@@ -277,7 +277,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
             sys.stdout.flush()
     except CommandError as error:
         return _refuse(prog, str(error), error.code)
-    except (ConfigError, ExtraMissing) as error:
+    except (ConfigError, RecordingError, ExtraMissing) as error:
         return _refuse(prog, str(error), CONFIGURATION)
     except KeyboardInterrupt:  # Ctrl-C before `interruptible` was entered
         return INTERRUPTED

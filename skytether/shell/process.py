@@ -30,7 +30,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
-from skytether.shell import beside, command
+from skytether.shell import command, recorder_process
 from skytether.shell.command import (
     CONFIGURATION,
     CommandError,
@@ -365,7 +365,7 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
         yield None
         return
     with ExitStack() as stack:
-        at = stack.enter_context(beside.socket_of(options.feed))
+        at = stack.enter_context(recorder_process.socket_of(options.feed))
         try:
             feed = Feed(at)
         except LocalError as error:
@@ -373,11 +373,11 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
         try:
             if record:
                 told = record, at, process, options.scenario, options.config
-                stack.enter_context(beside.recorder(*told, secure=secure))
+                stack.enter_context(recorder_process.recorder(*told, secure=secure))
             stack.enter_context(closing(feed))
             yield feed
             stack.close()
-        except beside.RecorderError as error:
+        except recorder_process.RecorderError as error:
             raise CommandError(str(error)) from None
 
 

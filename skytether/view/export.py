@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry import feed
-from skytether.shared.telemetry.feed import Said
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded
 from skytether.view.rows import Columns, readable
 
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
@@ -32,38 +29,24 @@ STEPS = ("in_force", "observed_step")
 
 
 def tables(recorded: Recorded) -> dict[str, Columns]:
-    """Tables of a recording, by name; `time_s` counts from the first message.
-
-    Raises:
-        RecordingError: the file is damaged.
-    """
-    times_ns: dict[str, list[int]] = {}
-    pieces: dict[str, list[bytes]] = {}
-    events: list[tuple[float, str, str, str]] = []
-    columns = recorded.columns()
-    for time_ns, process, frame in recorded.frames():
-        if isinstance(frame, feed.Rows):
-            count = len(frame.rows) // columns[frame.part].itemsize
-            times_ns.setdefault(frame.part, []).extend([time_ns] * count)
-            pieces.setdefault(frame.part, []).append(frame.rows)
-        elif isinstance(frame, Said) and not isinstance(frame.event, Counted):
-            said = type(frame.event).__name__, str(frame.event)
-            events.append((time_ns / SECOND_NS, process, *said))
-    parts = {part: np.frombuffer(b"".join(rows), columns[part]) for part, rows in pieces.items()}
+    """Tables of a recording, by name; `time_s` counts from the first message."""
+    parts = recorded.parts
     made = {
-        part: {"time_s": np.array(times_ns[part]) / SECOND_NS}
+        part: {"time_s": recorded.times_ns[part] / SECOND_NS}
         | dict(_in_ms(name, column) for name, column in readable(rows).items())
         for part, rows in parts.items()
     }
     if "client" in parts:
         client, server = parts["client"], parts.get("server")
         made["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
+    events = [
+        (time_ns / SECOND_NS, process, type(event).__name__, str(event))
+        for time_ns, process, event in recorded.events()
+    ]
     if events:
         names = ("time_s", "process", "type", "text")
-        made["events"] = {
-            name: np.array(values)
-            for name, values in zip(names, zip(*events, strict=True), strict=True)
-        }
+        columns = zip(*events, strict=True)
+        made["events"] = dict(zip(names, map(np.array, columns), strict=True))
     return made
 
 

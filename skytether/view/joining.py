@@ -7,7 +7,7 @@ process that owns the key; keys that both ends predict with must be equal. Times
 the clock of the first client, by the difference of the times of day.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from heapq import merge
 from typing import BinaryIO
 
@@ -23,8 +23,8 @@ from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import Rows as Table
-from skytether.view.frames import Timed
-from skytether.view.recording import Recorded, Recording, summary_of
+from skytether.view.recorded import Recorded, summary_of
+from skytether.view.recording import Recording
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
 """Owner of the keys whose values a process's recording has, by the part of the record that it
@@ -38,11 +38,11 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
         OSError: the file cannot be written.
         RecordingError: the recordings are not of one flight, or one is damaged.
     """
-    first = next((each for each in recordings if "client" in each.columns()), recordings[0])
+    first = next((each for each in recordings if "client" in each.parts), recordings[0])
     about, scenario = first.about, _scenario(first, recordings)
     joined = Recording(file, scenario, about)
     streams = [_moved(each, about.offset_ns) for each in recordings]
-    for _, process, frame in merge(*streams, key=lambda timed: timed[0]):
+    for process, frame in merge(*streams, key=lambda each: each[1].time_ns):
         joined.add(process, frame)
     joined.finish(summary_of(scenario, about, _parts(recordings)))
 
@@ -55,35 +55,29 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
         if different := catalogue.differences(*terms):
             said = f"it is of another flight than {first.path}: {different[0]}"
             raise RecordingError(f"{each.path}: {said}")
-        owners = {OWNERS.get(part) for part in each.columns()}
+        owners = {OWNERS.get(part) for part in each.parts}
         values = flat(to_table(each.scenario))
         lay({key: value for key, value in values if KEYS[key].owner in owners}, table)
     return check(table, "the scenarios together")
 
 
-def _moved(recorded: Recorded, offset_ns: int) -> Iterator[Timed]:
+def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
     """Frames of a recording, with times on the clock whose offset is given."""
     late_ns = recorded.about.offset_ns - offset_ns
-    columns = recorded.columns()
-    for time_ns, process, frame in recorded.timed():
-        yield time_ns, process, _later(frame, columns, late_ns)
-
-
-def _later(frame: Frame, columns: Mapping[str, np.dtype[np.void]], late_ns: int) -> Frame:
-    """Frame with all its times shifted."""
-    moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
-    if isinstance(moved, Rows) and moved.part == "netem":
-        rows = np.frombuffer(moved.rows, columns["netem"]).copy()
-        rows["arrived_ns"] += late_ns
-        return msgspec.structs.replace(moved, rows=rows.tobytes())
-    return moved
+    for _, process, frame in recorded.frames:
+        moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
+        if isinstance(moved, Rows) and moved.part == "netem":
+            rows = np.frombuffer(moved.rows, recorded.parts["netem"].dtype).copy()
+            rows["arrived_ns"] += late_ns
+            moved = msgspec.structs.replace(moved, rows=rows.tobytes())
+        yield process, moved
 
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
     """Rows of each part, from all recordings."""
     pieces: dict[str, list[Table]] = {}
     for each in recordings:
-        for part, rows in each.parts().items():
+        for part, rows in each.parts.items():
             pieces.setdefault(part, []).append(rows)
     for part, tables in pieces.items():
         if len({table.dtype for table in tables}) > 1:

@@ -1,7 +1,7 @@
 """Report of a recorded flight: a page that opens offline, with figures, summary and events."""
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,16 +14,13 @@ from skytether.figures.flights import draw_reference
 from skytether.figures.page import Picture, Table, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.feed import Rows as RowsFrame
-from skytether.shared.telemetry.feed import Said
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows, compared
 from skytether.shared.telemetry.summary import desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.view.recording import Recorded
+from skytether.view.recorded import Recorded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,30 +33,6 @@ WIDTH = 9.0
 LETTERS: Any = {"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8}
 LETTERS |= {"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}
 """Settings of matplotlib for every figure."""
-
-
-@dataclass(frozen=True, slots=True)
-class FlightReport:
-    """Report of one flight, with its figures drawn."""
-
-    title: str
-    """Heading of the page."""
-    about: str
-    """Introduction: one or two sentences on the scenario."""
-    verdict: str
-    """Result: one or two sentences on the outcome."""
-    tables: Sequence[Table]
-    """Tables."""
-    pictures: Sequence[Picture]
-    """Figures."""
-    events: Sequence[tuple[str, str, str]]
-    """Time, process and sentence of each event."""
-    untold: int
-    """Number of events that were left out for lack of room."""
-    made: Mapping[str, str]
-    """Facts about the recording's origin, by name."""
-    toml: str
-    """Scenario as TOML."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,78 +68,62 @@ class ReportedFlight:
             yield Mode(modes[begin]), slice(begin, end + 1)
 
 
-def page(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> str:
+def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     """The page of a recording, as HTML.
 
     Args:
-        summary: names and values of its summary.
+        figures: names and values of its summary.
 
     Raises:
-        RecordingError: nothing was flown in it, or the file is damaged.
+        RecordingError: nothing was flown in it.
     """
-    return rendered("view/report.html.jinja", drawn=_drawn(recorded, summary))
-
-
-def _drawn(recorded: Recorded, summary: Sequence[tuple[str, str]]) -> FlightReport:
-    parts, scenario, about = recorded.parts(), recorded.scenario, recorded.about
+    parts, scenario, about = recorded.parts, recorded.scenario, recorded.about
     client = parts.get("client")
     if client is None or not len(client) or recorded.summary is None:
         raise RecordingError(f"{recorded.path}: no vehicle has flown a step in it")
     number = client["vehicle"].min()
-    epoch_ns, events = _events(recorded)
+    epoch_ns = int(recorded.times_ns["client"][0]) - int(client["step"][0]) * scenario.dt_ns
+    events = [
+        (f"{round((time_ns - epoch_ns) / SECOND_NS, 2) + 0.0:.2f}", process, str(event))
+        for time_ns, process, event in recorded.events()
+    ]
     empty = client[:0]
     flown = ReportedFlight(
         scenario,
         client[client["vehicle"] == number],
         parts["server"][parts["server"]["vehicle"] == number] if "server" in parts else empty,
         parts.get("netem", empty),
-        epoch_ns,
+        recorded.begin_ns + epoch_ns,
     )
     began = f"{about.began[:10]} {about.began[11:16]} UTC"
     where = f"over UDP, {began}" if about.began else "in virtual time"
     fleet = len(np.unique(client["vehicle"]))
     others = f" Drawn is vehicle {number} of {fleet}." if fleet > 1 else ""
-    sent = "–" if recorded.summary.event_ratio is None else f"{recorded.summary.event_ratio:.1%}"
-    rmse = recorded.summary.rmse_xy
+    summary = recorded.summary
+    sent = "–" if summary.event_ratio is None else f"{summary.event_ratio:.1%}"
+    rmse = summary.rmse_xy
     off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
-    rows = [list(row) for row in summary]
+    rows = [list(row) for row in figures]
     table = Table("summary", "Summary", "What came of the flight.", "", ("figure", "value"), rows)
     made = {
-        "scenario": recorded.name,
+        "scenario": about.scenario,
         "seed": str(scenario.seed),
         "flown": where,
         "with": f"Skytether {about.version}",
         "recording": recorded.path.name,
     }
-    return FlightReport(
-        title=f"Flight of {recorded.name}, seed {scenario.seed}",
-        about=f"{recorded.summary.duration_s:g} s {where}.{others}",
-        verdict=f"{off}a horizon was sent at {sent} of the steps.",
-        tables=[table],
-        pictures=[path(flown), timeline(flown)],
-        events=events[:EVENTS_MAX],
-        untold=max(0, len(events) - EVENTS_MAX),
-        made=made,
-        toml=to_toml(scenario).decode(),
-    )
-
-
-def _events(recorded: Recorded) -> tuple[int, list[tuple[str, str, str]]]:
-    """Time of step 0 [ns], and events with times counted from it."""
-    columns = recorded.columns()
-    dt_ns = recorded.scenario.dt_ns
-    epoch_ns, said = None, []
-    for _, process, frame in recorded.frames():
-        if isinstance(frame, Said) and not isinstance(frame.event, Counted):
-            said.append((frame.time_ns, process, str(frame.event)))
-        elif epoch_ns is None and isinstance(frame, RowsFrame) and frame.part == "client":
-            first = np.frombuffer(frame.rows, columns["client"])[0]
-            epoch_ns = frame.time_ns - int(first["step"]) * dt_ns
-    begin_ns = epoch_ns or 0
-    return begin_ns, [
-        (f"{round((time_ns - begin_ns) / SECOND_NS, 2) + 0.0:.2f}", process, text)
-        for time_ns, process, text in said
-    ]
+    drawn = {
+        "title": f"Flight of {about.scenario}, seed {scenario.seed}",
+        "about": f"{summary.duration_s:g} s {where}.{others}",
+        "verdict": f"{off}a horizon was sent at {sent} of the steps.",
+        "tables": [table],
+        "pictures": [path(flown), timeline(flown)],
+        "events": events[:EVENTS_MAX],
+        "untold": max(0, len(events) - EVENTS_MAX),
+        "made": made,
+        "toml": to_toml(scenario).decode(),
+    }
+    return rendered("view/report.html.jinja", drawn=drawn)
 
 
 def _colour(mode: Mode) -> str:

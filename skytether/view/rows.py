@@ -1,10 +1,10 @@
 """Rows of the record as plain columns: one number each, with axis and unit in its name.
 
-A recording and an exported table hold plain columns. They are a view of the same memory under other
-names, so rows are restored to the last bit. An array of the library has all axes of one quantity.
+An exported table has plain columns, and a recording's messages for other programs have them as
+keys. An array of the library has all axes of one quantity.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
@@ -31,10 +31,6 @@ AXES = "xyz"
 """Names of the axes."""
 SHORT = {"inputs": "input"}
 """Column names of velocities that become other names here."""
-NOT_FINITE = "not_finite"
-"""Key of a message for numbers that JSON cannot express."""
-NAN = np.float64(np.nan)
-"""Value of a number that is missing in a message."""
 WORDS: Mapping[str, Mapping[int, str]] = {
     "mode": {mode: str(mode) for mode in Mode},
     "reason": {reason: str(reason) for reason in Reason},
@@ -88,10 +84,9 @@ def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 class RowTable:
-    """Converter of a part's rows to messages, and back.
+    """Converter of a part's rows to messages of JSON, with a key for each plain column.
 
-    A message has a key for each plain column. JSON has no numbers that are not finite: NaN is left
-    out, and other bit patterns stand in the list NOT_FINITE, as "column=bytes in memory".
+    JSON has no numbers that are not finite; they are left out.
 
     Args:
         columns: columns of the rows.
@@ -103,65 +98,30 @@ class RowTable:
     def __init__(self, columns: np.dtype[np.void]) -> None:
         self.columns = columns
         """Columns of the rows."""
-        self.plain = plain(columns)
-        """Plain columns."""
-        self.names: tuple[str, ...] = self.plain.names or ()
+        self._plain = plain(columns)
+        self.names: tuple[str, ...] = self._plain.names or ()
         """Names of the plain columns."""
-        kinds = {name: self.plain[name] for name in self.names if self.plain[name].base.kind == "f"}
-        self._numbers = [name for name, kind in kinds.items() if not kind.shape]
-        self._lists = [name for name, kind in kinds.items() if kind.shape]
-
-    def schema(self) -> dict[str, Any]:
+        self.schema = {"type": "object", "properties": dict(map(self._property, self.names))}
         """JSON schema of a message."""
-        properties: dict[str, Any] = {}
-        for name in self.names:
-            kind = {"b": "boolean", "f": "number"}.get(self.plain[name].base.kind, "integer")
-            several = self.plain[name].shape
-            properties[name] = (
-                {"type": "array", "items": {"type": kind}} if several else {"type": kind}
-            )
-        properties[NOT_FINITE] = {"type": "array", "items": {"type": "string"}}
-        return {"type": "object", "properties": properties}
+
+    def _property(self, name: str) -> tuple[str, dict[str, Any]]:
+        column = self._plain[name]
+        kind = {"type": {"b": "boolean", "f": "number"}.get(column.base.kind, "integer")}
+        return name, {"type": "array", "items": kind} if column.shape else kind
 
     def messages(self, rows: Rows) -> list[dict[str, Any]]:
         """Messages, one per row."""
-        flat = np.ascontiguousarray(rows).view(self.plain)
-        values = [flat[name].tolist() for name in self.names]
-        messages = [dict(zip(self.names, each, strict=True)) for each in zip(*values, strict=True)]
-        for i, message in enumerate(messages):
-            odd = [name for name in self._numbers if not isfinite(message[name])]
-            odd += [name for name in self._lists if not all(map(isfinite, message[name]))]
-            for name in odd:
-                del message[name]
-                bits = flat[name][i].tobytes()
-                if bits != NAN.astype(self.plain[name].base).tobytes():
-                    message.setdefault(NOT_FINITE, []).append(f"{name}={bits.hex()}")
-        return messages
+        flat = np.ascontiguousarray(rows).view(self._plain)
+        values = zip(*(flat[name].tolist() for name in self.names), strict=True)
+        return [
+            {name: value for name, value in zip(self.names, row, strict=True) if _is_finite(value)}
+            for row in values
+        ]
 
-    def rows(self, messages: Iterable[Mapping[str, Any]]) -> Rows:
-        """Rows that messages were made of.
 
-        Raises:
-            ValueError: they are no messages of such rows.
-        """
-        given = list(messages)
-        lists = {name: np.full(self.plain[name].shape, NAN) for name in self._lists}
-        absent = dict.fromkeys(self._numbers, NAN) | lists
-        names = [(name, absent.get(name)) for name in self.names]
-        try:
-            values = [tuple(each.get(name, default) for name, default in names) for each in given]
-            with np.errstate(over="raise"):
-                flat = np.array(values, self.plain)
-        except (TypeError, ValueError, ArithmeticError) as error:
-            raise ValueError(f"a row is none: {error}") from None
-        for i, message in enumerate(given):
-            for each in message.get(NOT_FINITE, ()):
-                name, _, bits = each.partition("=")
-                kind = self.plain[name] if name in absent else None
-                if kind is None or len(bits) != 2 * kind.itemsize:
-                    raise ValueError(f"a row has {each[:40]!r} for a number")
-                flat[name][i] = np.frombuffer(bytes.fromhex(bits), kind)[0]
-        return flat.view(self.columns)
+def _is_finite(value: Any) -> bool:
+    """Whether a number is finite, or all numbers of a list are."""
+    return all(map(isfinite, value)) if isinstance(value, list) else isfinite(value)
 
 
 def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> None:
@@ -226,11 +186,10 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
 
 def readable(rows: Rows) -> Columns:
     """Plain columns of rows, with words for modes, and one column per input of a plan."""
-    table = RowTable(rows.dtype)
-    flat = np.ascontiguousarray(rows).view(table.plain)
+    flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
     made: Columns = {}
-    for name in table.names:
-        if table.plain[name].shape:
+    for name in flat.dtype.names or ():
+        if flat.dtype[name].shape:
             made |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
         elif name in WORDS:
             words = WORDS[name]

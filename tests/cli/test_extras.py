@@ -61,7 +61,6 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "page": ("page",),
     "replay": ("page", "record"),
     "export": ("record",),
-    "recover": ("record",),
     "join": ("record",),
     "report": ("record",),
     **dict.fromkeys(LAB, ("lab",)),

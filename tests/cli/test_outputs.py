@@ -51,7 +51,6 @@ LINES = {
     "export --parquet": "export RECORDING OUT/client.parquet",
     "export --traces": "export RECORDING OUT/uplink-0.csv",
     "export --pcap": "export RECORDING OUT",
-    "recover --out": "recover RECORDING OUT.mcap",
     "join --out": "join RECORDING OTHER OUT.mcap",
     "probe --out": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT/uplink.csv",
     "probe --json": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT",
@@ -74,7 +73,7 @@ READ = {"plugin", "keys", "replay", "file", "files", "folders", "path"}
 """Options that name files to read, or sockets and folders of sockets."""
 SOCKETS = {"control", "feed"}
 """Options that name sockets to make, for which no file is replaced."""
-IN_PLACE = {("keygen", "file"), ("recover", "file")}
+IN_PLACE = {("keygen", "file")}
 """Options whose file is read and written on purpose."""
 
 
@@ -242,7 +241,6 @@ def locked(path: Path) -> Iterator[None]:
         (("sweep", "demo", "--runs", "1", "--out"), "folder"),
         (("margins", "demo", "--maps"), "folder"),
         (("export", "FLIGHT", "--csv"), "folder"),
-        (("recover",), "it.mcap"),
     ],
     ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),
 )
@@ -284,7 +282,7 @@ def test_a_new_file_is_locked_at_once_and_gone_where_nothing_was_written(tmp_pat
 def test_a_flight_that_is_killed_leaves_the_older_recording(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Meanwhile no other command may write there; what was recorded can be recovered."""
+    """Meanwhile no other command may write there; what was recorded can be read."""
     at, part = tmp_path / "it.mcap", tmp_path / "it.part1.mcap"
     at.write_bytes(recording.read_bytes())
     argv = ["fly", "demo", "--no-page", "--duration", "60", "--record", str(at)]
@@ -300,7 +298,7 @@ def test_a_flight_that_is_killed_leaves_the_older_recording(
         child.send_signal(signal.SIGKILL)
         child.wait()
     assert at.read_bytes() == recording.read_bytes()
-    assert main(["recover", str(part), "--out", str(tmp_path / "mended.mcap")]) == 0
+    assert main(["export", str(part), "--csv", str(tmp_path / "tables")]) == 0
 
 
 # -- a full disk ---------------------------------------------------------------------------------
@@ -323,7 +321,6 @@ def room_for(size: int) -> Iterator[None]:
         (("fly", "demo", *SHORT, "--record"), "it.mcap"),
         (("fly", "demo", *SHORT, "--figure"), "it.png"),
         (("report", "FLIGHT", "--out"), "it.html"),
-        (("recover", "FLIGHT", "--out"), "it.mcap"),
         (("join", "FLIGHT", "FLIGHT", "--out"), "it.mcap"),
         (("export", "FLIGHT", "--pcap"), "it.pcap"),
     ],

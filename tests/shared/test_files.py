@@ -12,7 +12,7 @@ from skytether.cli import keygen
 from skytether.cli.export import export
 from skytether.cli.fleet import fleet
 from skytether.cli.fly import fly
-from skytether.cli.recover import recover
+from skytether.cli.join import join
 from skytether.cli.report import report
 from skytether.client.__main__ import fly as client
 from skytether.lab.commands.margins import margins
@@ -35,7 +35,7 @@ CALLS: list[tuple[Any, tuple[str, ...], str]] = [
     (serve, ("demo", "--record"), ""),
     (emulate, ("demo", "--record"), ""),
     (report, ("FLIGHT", "--out"), ""),
-    (recover, ("FLIGHT", "--out"), ".mcap"),
+    (join, ("FLIGHT", "--out"), ".mcap"),
 ]
 
 
@@ -101,19 +101,6 @@ def test_tables_are_not_written_through_a_link(
     assert command.main(export, [str(flight), "--csv", str(tmp_path)], "export") == 2
     assert "client.csv: cannot be written: it is a link" in capsys.readouterr().err
     assert not (tmp_path / "elsewhere").exists()
-
-
-def test_recover_in_place_leaves_a_link_and_its_file_alone(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It would replace the link by a file."""
-    at = tmp_path / "it.mcap"
-    at.symlink_to(flight)
-    before = flight.read_bytes()
-    assert command.main(recover, [str(at)], "recover") == 2
-    assert "cannot be written: it is a link" in capsys.readouterr().err
-    assert at.is_symlink()
-    assert flight.read_bytes() == before
 
 
 def test_journals_and_keys_are_not_written_through_a_link(tmp_path: Path) -> None:

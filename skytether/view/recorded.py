@@ -1,0 +1,199 @@
+"""Recordings that are read: a flight's frames, and the rows in them to the last bit.
+
+A file is not trusted: `view.container` bounds what reading it takes, and whatever no flight of its
+scenario can have is refused.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from skytether.shared.base import toml
+from skytether.shared.base.errors import RecordingError
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import Counted, Event
+from skytether.shared.law.model import Indices
+from skytether.shared.scenario.reading import check
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry import feed
+from skytether.shared.telemetry.feed import Frame, Opened, Rows, Said, columns_of
+from skytether.shared.telemetry.record import Rows as Table
+from skytether.shared.telemetry.summary import Summary, summarise
+from skytether.view.container import Container, reading
+from skytether.view.frames import Timed
+from skytether.view.recording import BEGUN, FEED, About, Begun
+from skytether.view.rows import check_columns, check_values
+
+SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
+"""Longest time from the first frame of a recording to its last [ns]."""
+TIME_NS_MAX = 2**62
+"""Largest time of a frame, and largest offset of a clock [ns]."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recording that was read."""
+
+    path: Path
+    """File of the recording."""
+    about: About
+    """Facts about it."""
+    scenario: Scenario
+    """Scenario at the beginning of the flight."""
+    frames: Sequence[Timed]
+    """Frames in order of time, counted from the first one [ns]."""
+    parts: Mapping[str, Table]
+    """Rows of each part of the record that has any, by its name, in the order of recording."""
+    times_ns: Mapping[str, Indices]
+    """Time of each of these rows [ns], counted from the first frame."""
+    lost_bytes: int | None
+    """Size of what could not be read of a file that has no end [B]; None for one that has."""
+
+    @cached_property
+    def summary(self) -> Summary | None:
+        """Summary of the flight; None where nothing was flown."""
+        return summary_of(self.scenario, self.about, self.parts)
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the first frame [ns; clock of the processes]."""
+        return self.frames[0][2].time_ns if self.frames else 0
+
+    def events(self) -> Iterator[tuple[int, str, Event]]:
+        """Events but for counted figures: time [ns], process and event."""
+        for time_ns, process, frame in self.frames:
+            if isinstance(frame, Said) and not isinstance(frame.event, Counted):
+                yield time_ns, process, frame.event
+
+
+def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> Summary | None:
+    """Summary of the first vehicle's flight; None where nothing was flown."""
+    client = parts.get("client")
+    if client is None or not len(client):
+        return None
+    client = client[client["vehicle"] == client["vehicle"].min()]
+    others = parts.get("server"), parts.get("netem")
+    return summarise(scenario, about.scenario, client, *others, secure=about.secure)
+
+
+def read(path: Path) -> Recorded:
+    """Recording in a file; of one without an end, whose writer was killed, all that is whole.
+
+    Raises:
+        OSError: the file cannot be read.
+        RecordingError: the file is no recording, or is damaged.
+    """
+    with closing(Container(path)) as file, reading(path):
+        messages = file.messages()
+        topic, data = next(messages, ("", b""))
+        if topic != BEGUN:
+            said = "it is no recording of Skytether, or nothing is whole of it"
+            raise RecordingError(f"{path}: {said}")
+        begun = msgspec.msgpack.decode(data, type=Begun)
+        if abs(begun.about.offset_ns) > TIME_NS_MAX:
+            raise ValueError(f"a clock that is {begun.about.offset_ns} ns off")
+        scenario = check(toml.loads(begun.scenario), "its scenario")
+        frames = _Frames(scenario)
+        for topic, data in messages:
+            if topic.startswith(FEED):
+                frames.add(topic.removeprefix(FEED), feed.unpack(data))
+        lost_bytes = None if file.is_whole else file.lost_bytes
+        timed, parts, times_ns = frames.in_time(), frames.parts(), frames.times_ns()
+        return Recorded(path, begun.about, scenario, timed, parts, times_ns, lost_bytes)
+
+
+class _Frames:
+    """Frames of a recording, each of which is checked.
+
+    Args:
+        scenario: what is flown in it.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._frames: list[tuple[str, Frame]] = []
+        self._columns: dict[tuple[str, str], np.dtype[np.void]] = {}
+        """Columns by process and part."""
+        self._begun_ns: dict[str, int] = {}
+        """Time of each process's beginning [ns]."""
+        self._rows: dict[str, list[tuple[int, Table]]] = {}
+        """Time [ns] and rows of each frame with rows of a part, by the part's name."""
+
+    def add(self, process: str, frame: Frame) -> None:
+        """Add a frame.
+
+        Raises:
+            ValueError: flights of this scenario have no such frame.
+        """
+        if abs(frame.time_ns) > TIME_NS_MAX:
+            raise ValueError(f"a frame at {frame.time_ns} ns")
+        match frame:
+            case Opened():
+                self._begun_ns[process] = frame.time_ns
+                _check_begun(frame.scenario)
+                for part, described in frame.parts.items():
+                    columns = self._columns[process, part] = _columns(described)
+                    check_columns(part, columns, self._scenario)
+            case Rows():
+                known = self._columns.get((process, frame.part))
+                if known is None:
+                    raise ValueError(f"{process[:20]} has no part {frame.part[:20]!r}")
+                if frame.time_ns < self._begun_ns[process]:
+                    raise ValueError(f"rows of {process[:20]} from before it began")
+                rows = self._rows.setdefault(frame.part, [])
+                rows.append((frame.time_ns, feed.table(frame.rows, known)))
+                if rows[0][1].dtype != known:
+                    raise ValueError(f"the part {frame.part} has columns of two kinds")
+        self._frames.append((process, frame))
+
+    def in_time(self) -> list[Timed]:
+        """All frames in order of time, counted from the first one [ns]."""
+        begin_ns = self._begin_ns()
+        ordered = sorted(self._frames, key=lambda each: each[1].time_ns)
+        timed = [(frame.time_ns - begin_ns, process, frame) for process, frame in ordered]
+        if timed and timed[-1][0] > SPAN_NS_MAX:
+            raise ValueError(f"a frame {timed[-1][0]} ns after the first")
+        return timed
+
+    def parts(self) -> dict[str, Table]:
+        """Rows of each part."""
+        made = {
+            part: np.concatenate([table for _, table in rows]) for part, rows in self._rows.items()
+        }
+        for part, table in made.items():
+            check_values(part, table, self._scenario)
+        return made
+
+    def times_ns(self) -> dict[str, Indices]:
+        """Time of each row, counted from the first frame [ns]."""
+        begin_ns = self._begin_ns()
+        return {
+            part: np.repeat(
+                [time_ns - begin_ns for time_ns, _ in rows], [len(table) for _, table in rows]
+            )
+            for part, rows in self._rows.items()
+        }
+
+    def _begin_ns(self) -> int:
+        return min((frame.time_ns for _, frame in self._frames), default=0)
+
+
+@lru_cache(64)
+def _columns(described: str) -> np.dtype[np.void]:
+    return columns_of(described)
+
+
+@lru_cache(8)
+def _check_begun(scenario: str) -> None:
+    """Check the scenario of a process; equal ones, which may come thousands of times, only once.
+
+    Raises:
+        ConfigError: the scenario is invalid.
+        ValueError: the text is no TOML.
+    """
+    check(toml.loads(scenario), "the scenario of a process")
