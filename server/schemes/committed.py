@@ -92,7 +92,7 @@ class Replay:
         # One horizon a step at most, and none is flown for longer than `age_max`.
         ring = terms.age_max + H
         self._memory = ReplayMemory(
-            sent=nothing_sent(capacity, ring, terms, control),
+            sent=nothing_sent(capacity, ring, terms, control, most),
             seen=np.zeros(capacity, dtype=OBSERVATIONS),
             state=np.zeros((capacity, axes), dtype=AXIS_STATE),
             horizons=np.zeros((capacity, ring), dtype=SENT_HORIZON),

@@ -23,7 +23,7 @@ from skytether.server.schemes.delay_bound import (
 from skytether.shared.base.kernel import I1, part, record, records
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
-from skytether.shared.wire.protocol import NO_HORIZON, committed_max
+from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
 """Number of a plan where there is none (the vehicle brakes and stands still), and where it was sent
@@ -81,7 +81,7 @@ class Sent(NamedTuple):
     """Length of a step [ns]."""
 
 
-def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig) -> Sent:
+def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
     """Tracker of vehicles to which nothing was sent.
 
     Args:
@@ -89,13 +89,14 @@ def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig)
         ring: number of plans that are remembered of each.
         terms: the rule of flight.
         control: `delay_bound`.
+        most: largest d, what a plan has room for.
     """
     fixed_s = None if control.delay_bound == "auto" else control.delay_bound
     sent = Sent(
         observed=np.full(capacity, -1, dtype=np.int64),
         heard=np.zeros(capacity, dtype=HEARD),
         plans=np.zeros((capacity, ring), dtype=SENT_PLAN),
-        bound=delay_bound(capacity, terms.dt_s, committed_max(terms), fixed_s),
+        bound=delay_bound(capacity, terms.dt_s, most, fixed_s),
         dt_ns=terms.dt_ns,
     )
     for row in range(capacity):

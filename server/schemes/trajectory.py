@@ -79,7 +79,7 @@ from skytether.shared.law import spline
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
-from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation
+from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
 ROOM = 64
 """Number of trajectories that are remembered of each vehicle: the newest that were sent."""
@@ -189,7 +189,7 @@ class Guidance(Scheme):
             plans=bool(plans),
         )
         self._memory = Memory(
-            sent=nothing_sent(capacity, ROOM, terms, control),
+            sent=nothing_sent(capacity, ROOM, terms, control, committed_max(terms)),
             state=np.zeros((capacity, axes, 2)),
             trajectories=np.zeros((capacity, ROOM), dtype=TRAJECTORY),
             knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
