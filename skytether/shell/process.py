@@ -338,18 +338,14 @@ def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]
 def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
     """Function that makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
-
-    def make() -> Opened:
-        return Opened(
-            process=process,
-            name=name,
-            scenario=reading.to_toml(running.scenario).decode(),
-            parts=feed.parts,
-            wall_ns=wall_ns,
-            time_ns=time_ns,
-        )
-
-    return make
+    return lambda: Opened(
+        process=process,
+        name=name,
+        scenario=reading.to_toml(running.scenario).decode(),
+        parts=feed.parts,
+        wall_ns=wall_ns,
+        time_ns=time_ns,
+    )
 
 
 @contextmanager
