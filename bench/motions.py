@@ -40,7 +40,6 @@ from skytether.server.missions.dual_active_set import DualActiveSet
 from skytether.server.missions.half_planes import HalfPlanes
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.trajectory_qp import TrajectoryQP
-from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -98,8 +97,8 @@ class MotionProblem(NamedTuple):
 
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
-    """Keep every QP that is solved, of vehicles far from all others as well."""
-    real, straight = TrajectoryQP.solve, UnconstrainedPlanner.motions
+    """Keep every QP that is solved."""
+    real = TrajectoryQP.solve
 
     def solve(
         self: TrajectoryQP, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
@@ -108,14 +107,12 @@ def kept(problems: list[MotionProblem]) -> Iterator[None]:
         problems.append(MotionProblem(self.solver, linear, columns, least, p.shape[1]))
         return real(self, p, v, goal, planes)
 
-    plan, unconstrained = cast(Any, TrajectoryQP), cast(Any, UnconstrainedPlanner)
+    plan = cast(Any, TrajectoryQP)
     plan.solve = solve
-    # Vehicles that could fly straight are planned for one by one, with the same result.
-    unconstrained.motions = lambda *_: []
     try:
         yield
     finally:
-        plan.solve, unconstrained.motions = real, straight
+        plan.solve = real
 
 
 def filled_up(problem: MotionProblem) -> tuple[Any, Array]:

@@ -29,7 +29,6 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from operator import sub
-from typing import NamedTuple
 
 import numpy as np
 
@@ -47,9 +46,9 @@ from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes
 from skytether.server.missions.mission_state import PLAN_DUE, REPEAT_DUE, MissionState
+from skytether.server.missions.possible_motions import PossibleMotion
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.trajectory_qp import TrajectoryQP
-from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
 from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.server.missions.waypoints import DETOUR_S, TURN_BACK, Waypoints
 from skytether.server.missions.yielding import YIELD_S, Yielding
@@ -89,17 +88,6 @@ SILENT = np.zeros((), dtype=FIGURES)
 SILENT["gap"], SILENT["solved"] = 1, True
 
 
-class DirectFlight(NamedTuple):
-    """Vehicle that may fly straight to its goal."""
-
-    row: int
-    vehicle: VehicleMotions
-    k: int
-    """Present step of the vehicle."""
-    goal: Array
-    """Shape (axes,) [m]."""
-
-
 class MissionPlanner(Scheme):
     """The scheme "trajectory" for missions: motions that keep apart.
 
@@ -111,7 +99,7 @@ class MissionPlanner(Scheme):
     """
 
     def __init__(self, scenario: Scenario, terms: Terms, block: int, state: MissionState) -> None:
-        self.figures: Figures = np.zeros(block, dtype=FIGURES)
+        self.figures: Figures = np.repeat(SILENT, block)
         self.planned = np.zeros((block, terms.axes, 2))
         self._state, self._terms = state, terms
         self.counts = state.counts
@@ -135,14 +123,10 @@ class MissionPlanner(Scheme):
         )
         self._repeating: list[VehicleMotions] = []
         """Vehicles that are sent a motion once more at this step."""
-        kept = self._kept_steps // SPACING + 1
         self._scale = state.possible.metric.scale.copy()
         self._scale[ALTITUDE:] = scenario.rest_scale
         """Factors of the coordinates before distances of vehicles at rest are taken; shape
         (axes,)."""
-        self._unconstrained = UnconstrainedPlanner(
-            self._qp, state.possible, kept, clearances.apart_m, STUCK
-        )
 
     @property
     def left_tube(self) -> list[tuple[int, float]]:
@@ -175,14 +159,13 @@ class MissionPlanner(Scheme):
         """Plan for vehicles every SPACING steps, not all at the same."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
-        figures[:n] = SILENT
+        figures["expected_gap"][:n] = 0.0
         figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
         # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
         # before it.
         for each in self._repeating:
             each.repeat = None
         self._repeating.clear()
-        direct: list[DirectFlight] = []
         looked_at = self._state.due[:n].nonzero()[0].tolist()
         for i in looked_at:
             row, k = int(rows[i]), int(step[i])
@@ -191,8 +174,7 @@ class MissionPlanner(Scheme):
                 vehicle.repeat = vehicle.repeat_at(k)
                 self._repeating.append(vehicle)
             if self._state.due[i] & PLAN_DUE and self._may_plan(row, vehicle, k):
-                self._plan_to_goal(row, vehicle, k, direct)
-        self._plan_direct(direct)
+                self._plan_to_goal(row, vehicle, k)
         for i in looked_at:
             vehicle = self._state.vehicles[int(rows[i])]
             # A figure above any threshold: a motion that was found has to be sent.
@@ -319,16 +301,8 @@ class MissionPlanner(Scheme):
             return f"vehicle {number}, of another server's motion"
         return ""
 
-    def _plan_to_goal(
-        self, row: int, vehicle: VehicleMotions, k: int, direct: list[DirectFlight]
-    ) -> None:
-        """Find a motion to a vehicle's goal, or to the place where it yields.
-
-        Args:
-            row, vehicle: row and motions of the vehicle.
-            k: its step.
-            direct: takes the vehicles that may fly straight, to be planned for in one call.
-        """
+    def _plan_to_goal(self, row: int, vehicle: VehicleMotions, k: int) -> None:
+        """Find a motion to a vehicle's goal, or to the place where it yields, at its step k."""
         assert vehicle.in_force is not None
         home = self._state.goal(row)
         yields = vehicle.yielding
@@ -347,16 +321,9 @@ class MissionPlanner(Scheme):
                 vehicle.waits_for = f"vehicle {asker} to pass"
             return
         self._state.update_possible()
-        way = self._way(row, goal) if self._zones else np.array([place, goal])
+        way = self._way(row, goal) if self._zones else (place, goal)
         is_stuck = vehicle.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:])))
-        is_on_detour = vehicle.detour and k < vehicle.detour_until
-        roams = vehicle.turned_rad or vehicle.yielding or is_on_detour
-        if not (is_stuck or roams or self._zones):
-            direct.append(DirectFlight(row, vehicle, k, goal))
-            return
-        # A plan reckons with all that were decided before it.
-        self._plan_direct(direct)
-        asked = is_stuck and self._ask_to_yield(row, way)
+        asked = is_stuck and self._ask_to_yield(row, np.array(way))
         self._plan_motion(row, vehicle, k, goal)
         if is_stuck:
             is_blocked = vehicle.zone_blocks and not asked
@@ -389,26 +356,10 @@ class MissionPlanner(Scheme):
                 return there
         return None
 
-    def _plan_direct(self, direct: list[DirectFlight]) -> None:
-        """Find motions of vehicles that may fly straight, one after the other; none are left."""
-        while direct:
-            rows, steps = np.array([(each.row, each.k) for each in direct]).T.copy()
-            goals = np.array([each.goal for each in direct])
-            motions = self._unconstrained.motions(rows, steps, self._state.rows.ahead[rows], goals)
-            for (_, vehicle, _, _), motion in zip(direct, motions, strict=False):
-                vehicle.next, vehicle.waits_for = motion, ""
-            del direct[: len(motions)]
-            if direct:  # the first that is left cannot fly straight
-                self._plan_motion(*direct.pop(0))
-
     def _plan_motion(self, row: int, vehicle: VehicleMotions, k: int, goal: Array) -> None:
         """Find a motion towards a goal, around others that are in the way."""
         vehicle.next = self._motion_toward(row, vehicle, k, goal)
-        if vehicle.next is None:
-            self.counts["stuck"] += 1
-        else:
-            planned = self._state.possible_motion(row, vehicle.next)
-            self._state.possible.add(row, planned, vehicle.outside_m)
+        self.counts["stuck"] += vehicle.next is None
 
     def _way(self, row: int, goal: Array) -> Array:
         """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
@@ -464,6 +415,8 @@ class MissionPlanner(Scheme):
     ) -> Motion | None:
         """A motion from the one in force towards a goal, apart from all; None where none is found.
 
+        It is added to those that may be flown: the next vehicle's plan reckons with it.
+
         Only those constraints are added that a solution without them has violated: mostly
         nothing is near, and the way is straight.
         """
@@ -482,8 +435,9 @@ class MissionPlanner(Scheme):
                     self.counts["unsolved"] += 1
                     return None
                 motion = Motion(k, *solved)
-                conflicts = self._conflicts(row, motion, k)
-                if not (conflicts & ~violated).any():
+                planned = self._state.possible_motion(row, motion)
+                conflicts = self._conflicts(row, motion, planned)
+                if not (conflicts > violated).any():
                     break
                 violated |= conflicts
                 planes = planes or self._half_planes(row, base, due)
@@ -491,6 +445,7 @@ class MissionPlanner(Scheme):
             moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(waypoint, p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not conflicts.any():
                 vehicle.waits_for, vehicle.turned_rad = "", max(0.0, vehicle.turned_rad - TURN_BACK)
+                self._state.possible.add(row, planned, vehicle.outside_m)
                 return motion
             if constraints:
                 vehicle.waits_for = vehicle.waits_for or self._blocker(solved, constraints)
@@ -539,21 +494,26 @@ class MissionPlanner(Scheme):
             return ZONE
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
-    def _conflicts(self, row: int, motion: Motion, k: int) -> Flags:
-        """Which motions of others one comes too near to, ever, and last whether it does a zone."""
+    def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
+        """Which motions of others one comes too near to, ever, and last whether it does a zone.
+
+        Args:
+            row: row of the vehicle.
+            motion: its motion, by its own steps.
+            planned: the same, by the steps in common.
+        """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
-        ahead, in_force = self._state.ahead(row), vehicle.in_force.motion
         conflicts = too_near(
-            self._state.possible_motion(row, motion),
-            in_force._replace(first=in_force.first - ahead),
-            k - ahead,
+            planned,
+            self._state.in_common(row, vehicle.in_force.motion),
+            planned.motion.first,
             row,
             self._state.possible,
             self._clearances.apart_m + vehicle.outside_m,
         )
         if self._zones:
-            points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
+            points, _ = motion.at(pieces_of(motion.first, motion.last), self._dt_s)
             conflicts[-1] = self._enters_zone(points)
         return conflicts
 

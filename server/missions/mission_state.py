@@ -127,6 +127,8 @@ class MissionState:
         scale[ALTITUDE:] = scenario.mission.height_scale
         self.possible = PossibleMotions(scale, terms.dt_s)
         """All motions that may be flown, as of the last `update_possible`."""
+        self._is_updated = False
+        """Whether `possible` is as of the present step."""
         self._changed: set[int] = set()
         """Rows of which the motions, the distance kept from these, or the place on the grid have
         changed since then."""
@@ -168,9 +170,12 @@ class MissionState:
         return int(self.rows.ahead[row])
 
     def possible_motion(self, row: int, motion: Motion) -> PossibleMotion:
+        """A motion that a vehicle may fly, by the steps in common."""
+        return PossibleMotion(self.in_common(row, motion), self.lands(row), self.error(row))
+
+    def in_common(self, row: int, motion: Motion) -> Motion:
         """A motion of a vehicle, by the steps in common."""
-        common = motion._replace(first=motion.first - self.ahead(row))
-        return PossibleMotion(common, self.lands(row), self.error(row))
+        return motion._replace(first=motion.first - self.ahead(row))
 
     def lands(self, row: int) -> int:
         """First step in common at which a vehicle may begin to land, or NEVER."""
@@ -299,7 +304,7 @@ class MissionState:
 
     def align(self, rows: Indices, step: Indices) -> None:
         """Bring the steps of all vehicles onto one grid; nothing is to be sent yet."""
-        n = len(rows)
+        n, self._is_updated = len(rows), False
         self.now = self._clock.tick_ns // self._dt_ns
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
         # Of all rows, for others keep apart from those that are silent too.
@@ -317,7 +322,10 @@ class MissionState:
         self.foreign = None if foreign < 0 else foreign
 
     def update_possible(self) -> None:
-        """Replace the possible motions of all vehicles of which these have changed."""
+        """Replace the possible motions of all vehicles of which these have changed; once a step."""
+        if self._is_updated:
+            return
+        self._is_updated = True
         for row in self._changed & self.vehicles.keys():
             each = self.vehicles[row]
             # Also motions whose acknowledgement is still under way.

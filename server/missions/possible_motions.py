@@ -95,7 +95,10 @@ class PossibleMotions:
             motion: its motion.
             extra_m: distance kept from this motion beyond that from others [m].
         """
-        self.reserve(1)
+        if self.count == len(self.arrays.row):
+            self.arrays = MotionArrays._make(
+                np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
+            )
         _add(self.arrays, self.count, row, motion, extra_m, self.metric)
         self.count += 1
 
@@ -107,13 +110,6 @@ class PossibleMotions:
         """
         n, rows = self.count, self.rows
         self.arrays.early[:n], self.arrays.late[:n] = early[rows], late[rows]
-
-    def reserve(self, more: int) -> None:
-        """Have capacity for so many more motions."""
-        while self.count + more > len(self.arrays.row):
-            self.arrays = MotionArrays._make(
-                np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
-            )
 
     @property
     def rows(self) -> Indices:

@@ -44,6 +44,8 @@ class Routes:
         Returns:
             shape (n, axes); n >= 1.
         """
+        if not self._zones:
+            return goal[None]
         corners = self._graph(self._heights(place, goal)).corners(place[:2], goal[:2])
         points = np.repeat(goal[None], len(corners) + 1, axis=0)
         points[:-1, :2] = corners

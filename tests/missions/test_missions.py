@@ -32,7 +32,6 @@ from skytether.server.missions.possible_motions import NEVER, PossibleMotion, Po
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.trajectory_qp import TrajectoryQP
-from skytether.server.missions.unconstrained_motion import UnconstrainedPlanner
 from skytether.server.missions.vehicle_motions import PROMPT_COUNT, SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
 from skytether.shared.base.chance import stream
@@ -189,37 +188,6 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
     knots[:, :1] = p, v
     trajectory_qp._integrate(plan.constants, x, 1, knots[0], knots[1])
     assert np.array(found).tobytes() == knots.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "radius_m"), [("swap", 4.0), ("swap", 40.0), ("sphere", 4.0), ("corridor", 4.0)]
-)
-def test_planned_together_or_one_by_one_motions_are_the_same(
-    name: str, radius_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Vehicles that fly straight reckon with all that were planned before them at the step."""
-    table = reading.to_table(reading.load(name)) | {"duration": 25.0}
-    table["reference"]["radius_m"] = radius_m
-    flown = reading.check(table, name)
-    vehicles = len(flown.make_reference().vehicles)  # type: ignore[attr-defined]
-    at_once = list[int]()
-    real = UnconstrainedPlanner.motions
-
-    def motions(self: UnconstrainedPlanner, *given: Any) -> list[Motion]:
-        found = real(self, *given)
-        at_once.append(len(found))
-        return found
-
-    monkeypatch.setattr(UnconstrainedPlanner, "motions", motions)
-    one = flight.fly(flown, vehicles=vehicles)
-    monkeypatch.setattr(UnconstrainedPlanner, "motions", lambda *_: [])
-    other = flight.fly(flown, vehicles=vehicles)
-    assert one.trace_hash() == other.trace_hash()
-    assert one.events == other.events
-    assert one.figures["server"]["counts"] == other.figures["server"]["counts"]
-    if not flown.zones:  # with zones, each is planned for by itself
-        assert sum(at_once) > (vehicles if radius_m > 4.0 else 0)
-        assert 0 in at_once or radius_m > 4.0
 
 
 # -- distances of motions --------------------------------------------------------------------------
@@ -421,7 +389,8 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     made._state.update_possible()
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
-    assert made._conflicts(0, near, 100).tolist() == [False, is_hit, False]
+    planned = made._state.possible_motion(0, near)
+    assert made._conflicts(0, near, planned).tolist() == [False, is_hit, False]
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.5])

@@ -138,13 +138,14 @@ def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_nex
     made._state.align(BOTH, np.array([101, 101]))
     made._state.update_possible()
     made._state.vehicles[0].outside_m = 0.1
-    place = np.array([-4.0 + scenario(2).clearances.apart_m + 0.05, 0.0])
-    assert made._conflicts(0, resting(101, place), 101).tolist() == [False, True, False]
+    near = resting(101, np.array([-4.0 + scenario(2).clearances.apart_m + 0.05, 0.0]))
+    possible = made._state.possible_motion(0, near)
+    assert made._conflicts(0, near, possible).tolist() == [False, True, False]
     made._state.vehicles[0].outside_m, made._state.vehicles[0].turned_rad = 0.4, 0.5
     made._state._changed.add(0)
     planned(made)
-    possible = made._state.possible
-    mine = [possible.arrays.extra[m] for m in range(possible.count) if possible.rows[m] == 0]
+    motions = made._state.possible
+    mine = [motions.arrays.extra[m] for m in range(motions.count) if motions.rows[m] == 0]
     assert mine == pytest.approx([0.4] * len(mine))
 
 
