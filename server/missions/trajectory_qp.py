@@ -29,7 +29,7 @@ from skytether.server.missions.dual_active_set import (
     workspace,
 )
 from skytether.server.missions.half_planes import HalfPlanes
-from skytether.shared.base.kernel import F1, F2, F3, kernel, making_kernel, making_part, part
+from skytether.shared.base.kernel import F1, F2, F3, kernel, making_kernel, part
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING
 from skytether.shared.law.terms import Terms
@@ -121,7 +121,7 @@ class TrajectoryQP:
         """Columns of the constraints that are always there."""
         self._axes = axes
         of_axis = [range(x * n, (x + 1) * n) for x in range(axes)]
-        # In the order of `_fill_axis_qp`.
+        # In the order of `_fill_axis`.
         rows = [
             [x, *(axes + group * n * axes + i for group in range(6) for i in of_axis[x])]
             for x in range(axes)
@@ -157,7 +157,7 @@ class TrajectoryQP:
         position, velocity = np.empty((2, kept + INTERVALS, self._axes))
         position[:kept], velocity[:kept] = kept_p, kept_v
         if not planes or not len(planes.time):
-            is_solved = _solve_axes(
+            is_solved = solve_axes(
                 self.constants, self.axis_problem, kept, goal, position, velocity
             )
             return (position, velocity) if is_solved else None
@@ -200,55 +200,44 @@ class TrajectoryQP:
 @kernel
 def _fill_qp(constants: QPConstants, p0: F1, v0: F1, goal: F1, linear: F1, bounds: F1) -> None:
     """Fill in the linear term, and the bounds of the constraints that are always there."""
-    n, axes, a = len(constants.weights), len(p0), constants.acceleration
-    N = n * axes
+    axes = len(p0)
     for x in range(axes):
-        v, most = v0[x], constants.most[x]
-        bounds[x] = -v
-        for i in range(n):
-            linear[x * n + i] = 0.0
-            # In the order of `_fixed`: accelerations, inputs at the ends and at the begins of
-            # intervals, each from below and then from above.
-            for group, limit in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
-                bounds[axes + group * N + x * n + i] = limit
-        for j in range(n):
-            free = p0[x] + (j + 1) * constants.T * v
-            for i in range(n):
-                weighed = constants.weights[j] * (free - goal[x])
-                linear[x * n + i] -= constants.to_position[j, i] * weighed
+        _fill_axis(constants, x, p0[x], v0[x], goal[x], linear, bounds, x, axes)
 
 
 @part
-def _fill_axis_qp(
-    constants: QPConstants, x: int, p0: float, v: float, goal: float, problem: AxisProblem
+def _fill_axis(
+    constants: QPConstants,
+    x: int,
+    p0: float,
+    v: float,
+    goal: float,
+    linear: F1,
+    bounds: F1,
+    at: int,
+    axes: int,
 ) -> None:
-    """Fill in linear term and bounds of the QP of an axis; see `_fill_qp`."""
+    """Fill in linear term and bounds of axis x, number `at` of the axes of a QP."""
     n, a, most = len(constants.weights), constants.acceleration, constants.most[x]
-    problem.bounds[0] = -v
+    bounds[at] = -v
     for i in range(n):
-        problem.linear[i] = 0.0
+        linear[at * n + i] = 0.0
+        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and at the begins
+        # of intervals, each from below and then from above.
         for group, limit in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
-            problem.bounds[1 + group * n + i] = limit
+            bounds[axes + (group * axes + at) * n + i] = limit
     for j in range(n):
         free = p0 + (j + 1) * constants.T * v
         for i in range(n):
             weighed = constants.weights[j] * (free - goal)
-            problem.linear[i] -= constants.to_position[j, i] * weighed
+            linear[at * n + i] -= constants.to_position[j, i] * weighed
 
 
 @making_kernel
-def _solve_axes(
-    constants: QPConstants, problem: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
-) -> bool:
-    """Fill in the knots of a motion that nothing is near; see `solve_axes`."""
-    return solve_axes(constants, problem, kept, goal, position, velocity)
-
-
-@making_part
 def solve_axes(
     constants: QPConstants, problem: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
 ) -> bool:
-    """Fill in the knots of a motion that nothing is near; whether there is problem.
+    """Fill in the knots of a motion that nothing is near; whether there is one.
 
     Args:
         constants, problem: see `TrajectoryQP`.
@@ -256,19 +245,12 @@ def solve_axes(
         goal: what it aims at, g [m]; shape (axes,).
         position, velocity: the knots, those that are given first [m, m/s]; shape (kept + N, axes).
     """
+    linear, bounds = problem.linear, problem.bounds
     for x in range(len(goal)):
         p0, v0 = position[kept - 1, x], velocity[kept - 1, x]
-        _fill_axis_qp(constants, x, p0, v0, goal[x], problem)
-        outcome = solve_qp(
-            problem.root[x],
-            problem.linear,
-            problem.x,
-            problem.columns[x],
-            problem.bounds,
-            1,
-            problem.scratch,
-        )
-        if outcome != SOLVED:
+        _fill_axis(constants, x, p0, v0, goal[x], linear, bounds, 0, 1)
+        columns, scratch = problem.columns[x], problem.scratch
+        if solve_qp(problem.root[x], linear, problem.x, columns, bounds, 1, scratch) != SOLVED:
             return False
         _integrate_axis(constants, problem.x, 0, x, kept, position, velocity)
     return True
