@@ -6,7 +6,6 @@ A mission is the reference of each of its vehicles: the goal from each time on, 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count, product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -314,14 +313,13 @@ def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
     return Mission(goals, 3, 1)
 
 
-def mission(path: Path, axes: int) -> Mission:
+def mission(content: bytes, axes: int) -> Mission:
     """Goals from a table with the columns vehicle, t [s], x, y, z [m] (as many as there are axes).
 
     Raises:
-        OSError: see `reference.read`.
         ValueError: with what is wrong, and in which line.
     """
-    rows = read_table(path, ["vehicle", "t", "x", "y", "z"][: axes + 2])
+    rows = read_table(content, ["vehicle", "t", "x", "y", "z"][: axes + 2])
     numbers = rows[:, 0]
     known = (numbers >= 1) & (numbers <= VEHICLES_MAX) & (numbers == np.rint(numbers))
     if not len(rows) or not known.all():

@@ -6,13 +6,11 @@ A reference is a function of time since the epoch [s; any shape] that gives the 
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.base import files
 from skytether.shared.law.model import Array
 
 FAR_M = 1e6
@@ -244,24 +242,13 @@ def sampled(reference: Reference, axes: int) -> bytes:
     return np.rint(1000.0 * states).astype(np.int64).tobytes()
 
 
-def read(path: Path) -> bytes:
-    """The content of a table's file.
-
-    Raises:
-        OSError: it cannot be read, or is no table's.
-        ValueError: no file can have this name.
-    """
-    return files.read(path, FILE_BYTES_MAX)
-
-
-def from_csv(path: Path, axes: int) -> Reference:
+def from_csv(content: bytes, axes: int) -> Reference:
     """Path from a table with the columns t [s], x, y, z [m] (as many as there are axes).
 
     Raises:
-        OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
-    data = read_table(path, ["t", "x", "y", "z"][: axes + 1])
+    data = read_table(content, ["t", "x", "y", "z"][: axes + 1])
     if len(data) < 2:
         raise ValueError("expected at least two lines of finite numbers")
     if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
@@ -269,16 +256,15 @@ def from_csv(path: Path, axes: int) -> Reference:
     return timed_path(data[:, 0], data[:, 1:])
 
 
-def read_table(path: Path, names: list[str]) -> Array:
+def read_table(content: bytes, names: list[str]) -> Array:
     """Columns of a table; shape (rows, columns).
 
     Raises:
-        OSError: see `read`.
         ValueError: with what is wrong, and in which line.
     """
     import csv  # for files alone
 
-    text = io.StringIO(read(path).decode("utf-8-sig"), newline="")
+    text = io.StringIO(content.decode("utf-8-sig"), newline="")
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
     try:

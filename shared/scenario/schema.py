@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
@@ -199,6 +200,16 @@ class ReferenceConfig(Section, frozen=True):
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
     """CSV file with the columns t, x, y (and z), of a mission also vehicle, relative to the
     scenario's own folder."""
+
+    @property
+    def table(self) -> bytes:
+        """Content of `file`, of a shape that is read from it; empty for every other shape.
+
+        Raises:
+            OSError: it cannot be read, or is no table's.
+            ValueError: no file can have this name.
+        """
+        return files.read(Path(self.file), shapes.FILE_BYTES_MAX) if self.shape in TABLES else b""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -583,7 +594,6 @@ class Scenario(Section, frozen=True):
     def terms(self) -> Terms:
         """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
-        table = shapes.read(Path(reference.file)) if reference.shape in TABLES else b""
         return Terms(
             dt_ns=self.dt_ns,
             horizon=control.horizon,
@@ -606,7 +616,7 @@ class Scenario(Section, frozen=True):
             points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
             speed_mps=reference.speed_mps,
             loop=reference.loop,
-            table=_digest(table),
+            table=_digest(reference.table),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:

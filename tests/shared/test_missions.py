@@ -2,7 +2,6 @@
 
 import resource
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,12 +57,12 @@ def grid(vehicles: int) -> Array:
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
 
 
-def test_many_vehicles_are_checked_in_proportion(tmp_path: Path) -> None:
+def test_many_vehicles_are_checked_in_proportion() -> None:
     """In a table, with places apart, all at one place, and one place visited by all in turn."""
     lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
-    (tmp_path / "goals.csv").write_text("\n".join(["vehicle,t,x,y", *lines]))
+    table = "\n".join(["vehicle,t,x,y", *lines]).encode()
     before = resource.getrusage(resource.RUSAGE_SELF)
-    read = mission(tmp_path / "goals.csv", 2)
+    read = mission(table, 2)
     assert read.nearest(0.99, 1.0) is None
     assert read.nearest(1.01, 1.0) == (1, 2, 0.0, 1.0)
     heap = Mission({i + 1: (np.zeros(1), np.zeros((1, 2))) for i in range(MANY)}, 2, 1)
@@ -78,10 +77,8 @@ def test_many_vehicles_are_checked_in_proportion(tmp_path: Path) -> None:
     assert after.ru_utime - before.ru_utime < CPU_S
 
 
-def test_numbers_of_vehicles_are_those_that_fly(tmp_path: Path) -> None:
+def test_numbers_of_vehicles_are_those_that_fly() -> None:
     """The link has two bytes for them."""
-    path = tmp_path / "goals.csv"
     for number in (0, 65_536, 1.5):
-        path.write_text(f"vehicle,t,x,y\n{number},0,0,0\n")
         with pytest.raises(ValueError, match="column vehicle: expected numbers"):
-            mission(path, 2)
+            mission(f"vehicle,t,x,y\n{number},0,0,0\n".encode(), 2)

@@ -219,21 +219,18 @@ def test_a_target_that_turns_now_and_then_flies_straight_in_between() -> None:
     assert (changes**2).sum() / (2 * 3000.0) == pytest.approx(0.3**2, rel=0.1)
 
 
-def test_file_is_flown_in_straight_lines(tmp_path: Path) -> None:
+def test_file_is_flown_in_straight_lines() -> None:
     """Linear between its lines, at rest after the last, further columns ignored."""
-    path = tmp_path / "path.csv"
-    path.write_text("note,t,x,y,z\na,0,1,2,3\nb,2,5,2,1\nc,3,5,0,1\n")
-    desired = reference.from_csv(path, 3)
+    desired = reference.from_csv(b"note,t,x,y,z\na,0,1,2,3\nb,2,5,2,1\nc,3,5,0,1\n", 3)
     assert sample(desired, 0.5) == ([2.0, 2.0, 2.5], [2.0, 0.0, -1.0])
     assert sample(desired, 2.5) == ([5.0, 1.0, 1.0], [0.0, -2.0, 0.0])
     assert sample(desired, 3.0) == ([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])
 
 
-def test_file_for_space_can_be_flown_in_the_plane(tmp_path: Path) -> None:
+def test_file_for_space_can_be_flown_in_the_plane() -> None:
     """With two axes the column z is not asked for."""
-    path = tmp_path / "path.csv"
-    path.write_text("t,x,y,z\n0,0,0,9\n1,2,4,9\n")
-    assert sample(reference.from_csv(path, 2), 0.5) == ([1.0, 2.0], [2.0, 4.0])
+    desired = reference.from_csv(b"t,x,y,z\n0,0,0,9\n1,2,4,9\n", 2)
+    assert sample(desired, 0.5) == ([1.0, 2.0], [2.0, 4.0])
 
 
 FINITE = "expected at least two lines of finite numbers"
@@ -243,6 +240,8 @@ BAD_FILES = [
     ("t,x\n0,0\n1,1\n", "line 1: expected the columns t, x, y"),
     ("0,0,0\n1,1,1\n", "line 1: expected the columns t, x, y"),
     ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 numbers"),
+    # Empty lines count too: the line named is the one that an editor shows.
+    ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 numbers"),
     ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 numbers"),
     ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 numbers"),
     ("t,x,y\n0.1,0,0\n1,1,1\n", RISING),
@@ -257,29 +256,18 @@ BAD_FILES = [
 
 
 @pytest.mark.parametrize(("text", "message"), BAD_FILES)
-def test_bad_file_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "path.csv"
-    path.write_text(text)
+def test_bad_file_says_what_is_wrong(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        reference.from_csv(path, 2)
-
-
-def test_line_of_a_bad_number_counts_empty_lines_too(tmp_path: Path) -> None:
-    """The line named is the one that an editor shows."""
-    path = tmp_path / "path.csv"
-    path.write_text("t,x,y\n0,0,0\n\n\n1,one,1\n")
-    with pytest.raises(ValueError, match=r"^line 5: expected 3 numbers$"):
-        reference.from_csv(path, 2)
+        reference.from_csv(text.encode(), 2)
 
 
 @pytest.mark.parametrize("lines_before", [0, 1, 2])
-def test_file_that_is_no_table_is_refused_in_words(tmp_path: Path, lines_before: int) -> None:
+def test_file_that_is_no_table_is_refused_in_words(lines_before: int) -> None:
     """Somebody's JSON in one long line, as the header or below it."""
-    path = tmp_path / "path.csv"
-    path.write_text("".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n")
+    text = "".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n"
     line = lines_before + 1
     with pytest.raises(ValueError, match=rf"^line {line}: field larger than field limit"):
-        reference.from_csv(path, 2)
+        reference.from_csv(text.encode(), 2)
 
 
 def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> None:

@@ -15,6 +15,11 @@ CORES = (
     *("shared", "quadrotor", "mavlink", "server", "client", "netem", "autopilot"),
     *("sim", "figures", "view", "lab"),
 )
+WITHOUT_FILES = (
+    *("shared/law", "shared/core", "quadrotor", "mavlink", "server", "client", "netem"),
+    *("autopilot", "station", "probe", "sim"),
+)
+"""Rooms whose modules import neither paths nor the operating system."""
 DRIVERS = ("lab/commands", "view/browser")
 """Rooms within a core that drive processes, and are none themselves."""
 
@@ -35,9 +40,9 @@ def name(module: Path, copy: Path) -> str:
     return ".".join(parts).removesuffix(".__init__")
 
 
-def cores(copy: Path) -> list[Path]:
-    """Files of all core modules; a `__main__` is a process, and none of them."""
-    files = (file for room in CORES for file in (copy / room).rglob("*.py"))
+def cores(copy: Path, rooms: Iterable[str] = CORES) -> list[Path]:
+    """Files of all core modules of some rooms; a `__main__` is a process, and none of them."""
+    files = (file for room in rooms for file in (copy / room).rglob("*.py"))
     drivers = tuple(copy / room for room in DRIVERS)
     return [
         file
@@ -87,6 +92,12 @@ def test_no_core_module_may_have_a_clock_a_socket_or_dice(copy: Path) -> None:
     append("\n".join(forbidden), cores(copy))
     every = {name(module, copy) for module in cores(copy)}
     assert complaints(copy, *forbidden.values()) == [every] * len(forbidden)
+
+
+def test_no_end_may_import_paths_or_the_operating_system(copy: Path) -> None:
+    append("import os\nimport pathlib", cores(copy, WITHOUT_FILES))
+    every = {name(module, copy) for module in cores(copy, WITHOUT_FILES)}
+    assert complaints(copy, "os", "pathlib") == [every] * 2
 
 
 def test_a_new_core_module_is_silent_as_well(copy: Path) -> None:
