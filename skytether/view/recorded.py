@@ -103,8 +103,7 @@ def read(path: Path) -> Recorded:
             if topic.startswith(FEED):
                 frames.add(topic.removeprefix(FEED), feed.unpack(data))
         lost_bytes = None if file.is_whole else file.lost_bytes
-        timed, parts, times_ns = frames.in_time(), frames.parts(), frames.times_ns()
-        return Recorded(path, begun.about, scenario, timed, parts, times_ns, lost_bytes)
+        return Recorded(path, begun.about, scenario, *frames.together(), lost_bytes)
 
 
 class _Frames:
@@ -151,36 +150,24 @@ class _Frames:
                     raise ValueError(f"the part {frame.part} has columns of two kinds")
         self._frames.append((process, frame))
 
-    def in_time(self) -> list[Timed]:
-        """All frames in order of time, counted from the first one [ns]."""
-        begin_ns = self._begin_ns()
+    def together(self) -> tuple[list[Timed], dict[str, Table], dict[str, Indices]]:
+        """All frames in order of time; rows of each part, and their times.
+
+        Raises:
+            ValueError: no flight takes so long, or has such rows.
+        """
         ordered = sorted(self._frames, key=lambda each: each[1].time_ns)
+        begin_ns = ordered[0][1].time_ns if ordered else 0
         timed = [(frame.time_ns - begin_ns, process, frame) for process, frame in ordered]
         if timed and timed[-1][0] > SPAN_NS_MAX:
             raise ValueError(f"a frame {timed[-1][0]} ns after the first")
-        return timed
-
-    def parts(self) -> dict[str, Table]:
-        """Rows of each part."""
-        made = {
-            part: np.concatenate([table for _, table in rows]) for part, rows in self._rows.items()
-        }
-        for part, table in made.items():
-            check_values(part, table, self._scenario)
-        return made
-
-    def times_ns(self) -> dict[str, Indices]:
-        """Time of each row, counted from the first frame [ns]."""
-        begin_ns = self._begin_ns()
-        return {
-            part: np.repeat(
-                [time_ns - begin_ns for time_ns, _ in rows], [len(table) for _, table in rows]
-            )
-            for part, rows in self._rows.items()
-        }
-
-    def _begin_ns(self) -> int:
-        return min((frame.time_ns for _, frame in self._frames), default=0)
+        parts, times_ns = {}, {}
+        for part, frames in self._rows.items():
+            begins_ns, tables = zip(*frames, strict=True)
+            parts[part] = np.concatenate(tables)
+            times_ns[part] = np.repeat(np.array(begins_ns) - begin_ns, list(map(len, tables)))
+            check_values(part, parts[part], self._scenario)
+        return timed, parts, times_ns
 
 
 @lru_cache(64)
