@@ -145,7 +145,9 @@ def test_a_flight_by_hand_is_recorded_and_joined(
     assert command.main(report, [str(out), "--out", str(tmp_path / "page.html")], "it") == 0
     parts, summary = read(out).parts, read(out).summary
     assert set(parts) == {"client", "server", "plan", "netem"}
-    assert parts["client"]["step"].tolist() == list(range(len(parts["client"])))
+    # A busy machine makes the vehicle sleep through steps, and no row is missing beside theirs.
+    last = parts["client"][-1]
+    assert last["step"] + 1 == len(parts["client"]) + last["missed"]
     assert summary is not None
     assert summary.event_ratio is not None
     assert summary.uplink_packets
