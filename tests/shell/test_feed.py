@@ -23,7 +23,8 @@ from hypothesis import strategies as st
 
 import skytether.shell.feed
 from skytether.netem.proxy import Proxy
-from skytether.server import tick
+from skytether.server.common import splines
+from skytether.server.schemes import horizons
 from skytether.shared.core.change import Running
 from skytether.shared.core.events import Changed, Degraded, Event, Finished
 from skytether.shared.law.spline import along
@@ -651,7 +652,7 @@ def test_the_plans_told_are_those_that_are_sent(
     scheme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each horizon has a row: its inputs behind the committed ones, and where they begin."""
-    sent, encode_horizon, encode = [], tick.encode_horizon, tick.encode
+    sent, encode_horizon, encode = [], horizons.encode_horizon, splines.encode
 
     def spied(vehicle: int, session: int, step: int, *rest: Any) -> bytes:
         sent.append((vehicle, step, np.frombuffer(rest[2], np.float32).reshape(2, -1).copy()))
@@ -667,8 +668,8 @@ def test_the_plans_told_are_those_that_are_sent(
             sent.append((message.vehicle, message.step, np.clip(inputs, -u_max, u_max)))
         return bytes(encode(message))
 
-    monkeypatch.setattr(tick, "encode_horizon", spied)
-    monkeypatch.setattr(tick, "encode", watched)
+    monkeypatch.setattr(horizons, "encode_horizon", spied)
+    monkeypatch.setattr(splines, "encode", watched)
     raw = reading.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
     raw["control"] |= {"scheme": scheme, "trigger": "always"}
     raw["control"] |= {"feedback": scheme == "trajectory", "observer_s": 0.0}
