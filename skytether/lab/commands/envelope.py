@@ -4,7 +4,6 @@ points.
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, get_args
@@ -13,9 +12,8 @@ import tyro
 from rich.table import Table
 
 from skytether.lab import figures
-from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
+from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
-from skytether.lab.journal import Journal
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, terminal
@@ -60,21 +58,11 @@ def envelope(argv: Sequence[str]) -> None:
     plan = Envelope(options.scenario, options.config)
     command.claim_folder("--out", options.out, "points.csv", "envelope.png")
     title = f"flying points of {options.scenario}"
-    with (
-        writing(options.out),
-        closing(Journal(options.out, plan.settings(), EnvelopePoint)) as journal,
-    ):
-        done = {point.number for point in journal.entries if point.number < options.points}
-        todo = [number for number in range(options.points) if number not in done]
-        with crew(options.pool, title, options.points, "points") as flyers:
-            flyers.advance(len(done))
-
-            def keep(_: int, point: EnvelopePoint) -> None:
-                journal.append(point)
-                flyers.advance(1)
-
-            flyers.share(plan.fly, todo, keep)
-        points = sorted(journal.entries, key=lambda point: point.number)[: options.points]
+    numbers, settings = range(options.points), plan.settings()
+    points = study(
+        plan.fly, numbers, EnvelopePoint, settings, options.out, options.pool, title, "points"
+    )
+    with writing(options.out):
         _finish(options, plan, points)
 
 

@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,8 +15,7 @@ from rich.table import Table
 
 from skytether.lab import maps
 from skytether.lab import margins as lab
-from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
-from skytether.lab.journal import Journal
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
 from skytether.lab.maps import Box, MapPoint
 from skytether.lab.margins import Limit, Margin
 from skytether.shared.base import files
@@ -101,16 +99,9 @@ def margins(argv: Sequence[str]) -> None:
             ]
             runs = min(options.runs, lab.LIMIT_RUNS)
             parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
-            found: dict[int, Margin | Limit] = {}
-
-            def keep(number: int, result: Margin | Limit) -> None:
-                found[number] = result
-                flyers.advance(1)
-
-            flyers.share(_fly, parts, keep)
+            results = flyers.map(_fly, parts, 1)
     except Interrupted as interrupted:  # nothing is kept of what was flown
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
-    results = [found[number] for number in range(len(parts))]
     flown = [each for each in results if isinstance(each, Margin)]
     limits = [each for each in results if isinstance(each, Limit)]
     if options.json is not None:
@@ -154,21 +145,13 @@ def _box(options: MarginsOptions, trigger: str) -> Box:
 def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
     """Fly the missing points of the box; write and print the results of all."""
     box = _box(options, trigger)
-    count = len(box.places)
-    title = f"flying vehicles like {options.scenario}'s"
-    with writing(folder), closing(Journal(folder, box.settings(), MapPoint)) as journal:
-        done = {point.number for point in journal.entries}
-        with crew(options.pool, title, count, "points") as flyers:
-            flyers.advance(len(done))
-
-            def keep(_: int, point: MapPoint) -> None:
-                journal.append(point)
-                flyers.advance(1)
-
-            flyers.share(box.fly, [number for number in range(count) if number not in done], keep)
-        points = sorted(journal.entries, key=lambda point: point.number)
+    numbers, title = range(len(box.places)), f"flying vehicles like {options.scenario}'s"
+    points = study(
+        box.fly, numbers, MapPoint, box.settings(), folder, options.pool, title, "points"
+    )
+    title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
+    with writing(folder):
         files.write(folder / "points.csv", box.csv(points).encode())
-        title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
         maps.draw(folder / "maps.png", title, box, points)
     _show_points(title, box, points)
     print(f"{folder}: points.csv, maps.png")
