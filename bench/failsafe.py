@@ -37,6 +37,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
 from skytether.shared.wire.protocol import Mode
+from skytether.shell import command
 from skytether.sim import straight
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, plan_changes
 from skytether.sim.world import Clock, World
@@ -362,9 +363,9 @@ def _fly(cell: tuple[CaseName, FlavourName, int]) -> FaultOutcome:
     return fly(*cell)
 
 
-def main() -> int:
-    """Fly as the command line says, and return the exit code."""
-    options = tyro.cli(FailsafeBenchmarkOptions, description=__doc__)
+def main(argv: Sequence[str]) -> None:
+    """Fly as the command line says, and print the tables."""
+    options = tyro.cli(FailsafeBenchmarkOptions, args=argv, description=__doc__)
     cells = product(options.only, options.flavours, range(1, options.seeds + 1))
     outcomes = study(_fly, list(cells), FaultOutcome, {}, None, Flags(options.jobs))
     made = tables(outcomes)
@@ -372,8 +373,7 @@ def main() -> int:
         table.show(title)
     if options.write:
         files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command.main(main, sys.argv[1:], "failsafe"))

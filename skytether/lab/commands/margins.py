@@ -10,18 +10,17 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import tyro
-from rich.markup import escape
-from rich.table import Table
 
 from skytether.lab import maps
 from skytether.lab import margins as lab
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
 from skytether.lab.maps import Box, MapPoint
 from skytether.lab.margins import Limit, Margin
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
@@ -162,24 +161,23 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
     groups: dict[tuple[float, float], list[MapPoint]] = defaultdict(list)
     for place, point in zip(box.places, points, strict=True):
         groups[place.burst_s, place.dead_time_s].append(point)
-    table = Table(title=title, title_justify="left", min_width=len(title))
     headings = ("bursts [s]", "dead time [s]", "vehicles", "limit cycles", "not stable")
-    for heading in (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"):
-        table.add_column(escape(heading), justify="right")
+    rows = []
     for (burst_s, dead_time_s), group in groups.items():
         rmse = np.array([point.rmse_m or np.nan for point in group])
         saturated = max(point.saturated or 0.0 for point in group)
-        table.add_row(
+        row = (
             f"{burst_s:g}",
             f"{dead_time_s:g}",
-            str(len(group)),
-            str(sum(point.cycles for point in group)),
-            str(sum(point.growth >= 1.0 for point in group)),
+            len(group),
+            sum(point.cycles for point in group),
+            sum(point.growth >= 1.0 for point in group),
             f"{np.nanmedian(rmse):.3f}",
             f"{np.nanmax(rmse):.3f}",
             f"{saturated:.1%}",
         )
-    terminal.show(table)
+        rows.append(row)
+    tables.show(title, (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"), rows)
 
 
 def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> None:
@@ -194,24 +192,20 @@ def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> Non
             f"control.trigger: {scenario.control.trigger!r} looks at the state; pushes are flown "
             f"with {trigger!r}, which sends as often"
         )
-    table = Table(title=title, title_justify="left", min_width=len(title))
-    table.add_column("vehicle")
-    table.add_column("growth")
-    table.add_column("stable")
-    for axis in "xyz"[: scenario.model.axes]:
-        table.add_column(escape(f"RMS {axis} [m]"), justify="right")
-    table.add_column("bound", justify="right")
+    rms_headings = [f"RMS {axis} [m]" for axis in "xyz"[: scenario.model.axes]]
+    rows = []
     for each in found:
         rms: Sequence[float | None] = each.rms_m or [None] * scenario.model.axes
         halves = each.rms_ci95_m or [None] * len(rms)
-        table.add_row(
+        row = (
             each.vehicle,
             _with_interval(each.growth, each.growth_ci95),
             "yes" if each.stable else "no",
             *map(_with_interval, rms, halves),
             "-" if each.saturated is None else f"{each.saturated:.1%}",
         )
-    terminal.show(table)
+        rows.append(row)
+    tables.show(title, ("vehicle", "growth", "stable", *rms_headings, "bound"), rows)
 
 
 def _with_interval(value: float | None, half: float | None) -> str:
@@ -223,11 +217,9 @@ def _with_interval(value: float | None, half: float | None) -> str:
 
 def _show_limits(limits: Sequence[Limit]) -> None:
     """Print a row for each limit."""
-    table = Table(title="stable up to, relative to the model", title_justify="left", min_width=36)
-    table.add_column("quantity")
-    table.add_column("limit", justify="right")
+    rows = []
     for each in limits:
         beyond = "<" if each.quantity.endswith("least") else ">"
         unknown = f"{beyond} {each.searched:g}"
-        table.add_row(escape(each.quantity), unknown if each.value is None else f"{each.value:.3g}")
-    terminal.show(table)
+        rows.append((each.quantity, unknown if each.value is None else f"{each.value:.3g}"))
+    tables.show("stable up to, relative to the model", ("quantity", "limit"), rows)
