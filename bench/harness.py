@@ -21,11 +21,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table as RichTable
 
+from skytether.lab.commands import tables
 from skytether.lab.commands.machine import commit, processor
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
@@ -183,12 +182,7 @@ class TextTable:
 
     def show(self, title: str) -> None:
         """Print the table on the console."""
-        table = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for i, heading in enumerate(self.headings):
-            table.add_column(heading, justify="right" if i else "left")
-        for row in self.rows:
-            table.add_row(*row)
-        CONSOLE.print(table)
+        tables.show(title, self.headings, self.rows)
 
 
 def refresh(document: str, tables: Mapping[str, TextTable]) -> str:

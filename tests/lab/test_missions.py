@@ -1,13 +1,14 @@
 """Missions as benchmarks: reproducible, also with links that are cut and servers that die."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench import missions, motions
-from bench.missions import RandomOptions
+from bench.missions import MissionFlight, RandomOptions, SwapOptions
 from bench.motions import MotionsOptions
 from skytether.lab.commands.pool import Flags, study
 from skytether.server.missions import yielding
@@ -64,6 +65,14 @@ def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
     assert study(math.fabs, [4.0], float, {"seed": 1}, None, one) == [4.0]
     with pytest.raises(ConfigError, match="seed: got 2, expected 1"):
         study(math.fabs, [4.0], float, {"seed": 2}, out, one)
+
+
+def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:
+    """Its distance from a zone is None, which JSON can hold, and no infinity."""
+    fly = partial(missions.fly_swap, SwapOptions(vehicles=2, duration=4.0))
+    again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(1)) for _ in range(2)]
+    assert again[0] == again[1]
+    assert again[1][0].clear_m is None
 
 
 def test_solvers_agree_on_the_problems_of_a_flight() -> None:
