@@ -10,7 +10,6 @@ repeated with the network cut for a while. With --write, the tables go into docs
 import io
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -20,9 +19,10 @@ import msgspec
 import numpy as np
 import tyro
 
-from bench.harness import TextTable, progress, refresh
+from bench.harness import TextTable, refresh
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.flavours import FlavourName
+from skytether.lab.commands.pool import Flags, crew
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying
@@ -242,7 +242,8 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
     made = {}
     for flavour, air in product(get_args(FlavourName), get_args(Air)):
         of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
-        names = dict.fromkeys(each.contender for each in of_case)
+        flown = {each.contender for each in of_case}
+        names = [name for name in contenders(flavour) if name in flown]
         if of_case:
             rows = [row(name, [e for e in of_case if e.contender == name]) for name in names]
             made[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
@@ -307,9 +308,9 @@ class AutopilotBenchmarkOptions:
     """Put the tables into docs/compare.md."""
 
 
-def main() -> int:
-    """Fly as the command line says, and return the exit code."""
-    options = tyro.cli(AutopilotBenchmarkOptions, description=__doc__)
+def main(argv: Sequence[str]) -> None:
+    """Fly as the command line says, and print the tables."""
+    options = tyro.cli(AutopilotBenchmarkOptions, args=argv, description=__doc__)
     seeds = range(1, options.seeds + 1)
     flights = kept(options.json)
     done = {(each.contender, each.flavour, each.air, each.seed) for each in flights}
@@ -320,18 +321,20 @@ def main() -> int:
         for seed in seeds
         if (not options.only or name in options.only) and (name, flavour, air, seed) not in done
     ]
-    with ProcessPoolExecutor(options.jobs) as pool:
-        flying = [pool.submit(fly_cell, cell) for cell in cells]
-        for each in progress(flying, "flying"):
-            flights.append(each.result())
+    with crew(Flags(options.jobs), "flying", len(cells), "flights") as flyers:
+
+        def keep(_: int, flown: FlownCell) -> None:
+            flights.append(flown)
+            flyers.advance(1)
             if options.json:
                 command.write(options.json, msgspec.json.encode(flights))
+
+        flyers.share(fly_cell, cells, keep)
     made = tables(flights)
     for title, table in made.items():
         table.show(title)
     if options.write:
         files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
-    return 0
 
 
 def kept(file: Path | None) -> list[FlownCell]:
@@ -342,4 +345,4 @@ def kept(file: Path | None) -> list[FlownCell]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command.main(main, sys.argv[1:], "autopilots"))

@@ -9,7 +9,6 @@ flies on, distances are those until then. With --write, the tables go into docs/
 import io
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -21,12 +20,13 @@ import numpy as np
 import tyro
 
 from bench import autopilots
-from bench.harness import TextTable, progress, refresh
+from bench.harness import TextTable, refresh
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import FaultName, Script, ScriptedFault
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
+from skytether.lab.commands.pool import Flags, study
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base import files
@@ -37,6 +37,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
 from skytether.shared.wire.protocol import Mode
+from skytether.shell import command
 from skytether.sim import straight
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, plan_changes
 from skytether.sim.world import Clock, World
@@ -357,20 +358,22 @@ class FailsafeBenchmarkOptions:
     """Put the tables into docs/fly-a-real-one.md."""
 
 
-def main() -> int:
-    """Fly as the command line says, and return the exit code."""
-    options = tyro.cli(FailsafeBenchmarkOptions, description=__doc__)
+def _fly(cell: tuple[CaseName, FlavourName, int]) -> FaultOutcome:
+    """See `fly`; called in a worker."""
+    return fly(*cell)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Fly as the command line says, and print the tables."""
+    options = tyro.cli(FailsafeBenchmarkOptions, args=argv, description=__doc__)
     cells = product(options.only, options.flavours, range(1, options.seeds + 1))
-    with ProcessPoolExecutor(options.jobs) as pool:
-        flying = [pool.submit(fly, case, flavour, seed) for case, flavour, seed in cells]
-        outcomes = [each.result() for each in progress(flying, "flying")]
+    outcomes = study(_fly, list(cells), FaultOutcome, {}, None, Flags(options.jobs))
     made = tables(outcomes)
     for title, table in made.items():
         table.show(title)
     if options.write:
         files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command.main(main, sys.argv[1:], "failsafe"))

@@ -11,24 +11,21 @@ import os
 import platform
 import re
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from importlib import metadata
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table as RichTable
 
+from skytether.lab.commands import tables
+from skytether.lab.commands.machine import commit, processor
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 Durations = NDArray[np.int64]
@@ -151,26 +148,16 @@ def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, 
 def machine() -> dict[str, Any]:
     """Description of the machine, the packages and the commit that are measured."""
     return {
-        "cpu": _cpu(),
+        "cpu": processor(),
         "cores": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "packages": {name: version for name in PACKAGES if (version := _version(name))},
-        "commit": _commit(),
+        "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
-
-
-def _cpu() -> str:
-    try:
-        found = re.search(
-            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
-        )
-    except OSError:
-        found = None
-    return found[1] if found else platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str | None:
@@ -178,23 +165,6 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-@cache
-def _commit() -> str | None:
-    """Commit of the checkout, with a + where something has changed since; None without git.
-
-    It is asked once: a benchmark that writes down its figures changes the checkout.
-    """
-    here = Path(__file__).parent
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
-            cwd=here, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
 
 
 @dataclass(frozen=True)
@@ -212,12 +182,7 @@ class TextTable:
 
     def show(self, title: str) -> None:
         """Print the table on the console."""
-        table = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for i, heading in enumerate(self.headings):
-            table.add_column(heading, justify="right" if i else "left")
-        for row in self.rows:
-            table.add_row(*row)
-        CONSOLE.print(table)
+        tables.show(title, self.headings, self.rows)
 
 
 def refresh(document: str, tables: Mapping[str, TextTable]) -> str:

@@ -28,8 +28,8 @@ constant, over a network that is near (20 ms, no loss) and over the paper's with
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -41,8 +41,7 @@ import numpy as np
 import tyro
 
 from bench.harness import TextTable
-from skytether.lab.commands.pool import Flags, crew, writing
-from skytether.lab.journal import Journal
+from skytether.lab.commands.pool import Flags, study
 from skytether.server.common.scheme import Foresight
 from skytether.server.endpoint import Server
 from skytether.server.missions.mission_planner import MissionPlanner
@@ -60,10 +59,9 @@ from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Sce
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command, temporary
+from skytether.shell import command
 from skytether.sim import flight
 
-F = TypeVar("F")
 C = TypeVar("C")
 
 GOAL_AT_S = 2.0
@@ -114,10 +112,11 @@ class Amount:
     markdown: Path | None = None
     """File for the table as Markdown."""
 
-    def settings(self) -> dict[str, Any]:
-        """Options that the result of a flight follows from."""
+    def fly(self, fly: "Callable[[C], MissionFlight]", cells: Sequence[C]) -> "list[MissionFlight]":
+        """Results of the flights of some cells, in order; see `lab.commands.pool.study`."""
         amount = Amount.__dataclass_fields__
-        return {key: value for key, value in asdict(self).items() if key not in amount}
+        settings = {key: value for key, value in asdict(self).items() if key not in amount}
+        return study(fly, cells, MissionFlight, settings, self.out, Flags(self.workers))
 
 
 @dataclass(frozen=True)
@@ -163,8 +162,8 @@ class MissionFlight(NamedTuple):
     network: str
     least_m: float
     """Smallest distance between two vehicles, heights scaled [m]."""
-    clear_m: float
-    """Smallest distance of a vehicle from a zone [m]; infinite without zones."""
+    clear_m: float | None
+    """Smallest distance of a vehicle from a zone [m]; None without zones."""
     late: int
     """Number of vehicles that have not arrived."""
     arrived_s: float | None
@@ -177,6 +176,11 @@ class MissionFlight(NamedTuple):
     """Packets a second both ways, of a vehicle."""
     plan_ms: float
     """Time that the server planned for a motion that it sent, on average [ms]."""
+
+    @property
+    def was_in_zone(self) -> bool:
+        """Whether a vehicle was in a zone."""
+        return self.clear_m is not None and self.clear_m < 0.0
 
 
 def fly_mission(
@@ -223,7 +227,7 @@ def fly_mission(
         vehicles=len(each),
         network=scenario.network.uplink.text,
         least_m=least,
-        clear_m=min(clear_m),
+        clear_m=min(clear_m) if scenario.zones else None,
         late=late,
         arrived_s=None if late else max(arrived_s),
         left=counts.get("left_tube", 0),
@@ -330,45 +334,6 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
     for_s = rng.uniform(*DOWN_S, DEATHS)
     ends = np.minimum(begins + for_s, np.append(begins[1:], np.inf) - 1.0)
     return [(b, e) for b, e in zip(begins.tolist(), ends.tolist(), strict=True) if e > b]
-
-
-def flights(
-    fly: Callable[[C], F],
-    cells: Sequence[C],
-    kind: type[F],
-    settings: Mapping[str, Any],
-    out: Path | None,
-    workers: int,
-) -> list[F]:
-    """Results of the flights of some cells, in order.
-
-    Args:
-        fly: flies one; called in a worker.
-        cells: what is to be flown.
-        kind: type of a result.
-        settings: all that the results follow from, but for the number of a cell.
-        out: folder in which they are kept; None: in none.
-        workers: number of processes.
-
-    Raises:
-        CommandError: interrupted, or the folder cannot be written.
-        ConfigError: the folder has the flights of other settings.
-    """
-    with temporary.folder() as folder:
-        place = out or folder / "flights"
-        with writing(place), closing(Journal(place, settings, tuple[int, kind])) as journal:  # type: ignore[valid-type]
-            done = {number for number, _ in journal.entries}
-            todo = [number for number in range(len(cells)) if number not in done]
-            with crew(Flags(workers), "flying", len(cells), "flights") as flyers:
-                flyers.advance(len(cells) - len(todo))
-
-                def keep(index: int, flown: F) -> None:
-                    journal.append((todo[index], flown))
-                    flyers.advance(1)
-
-                flyers.share(fly, [cells[number] for number in todo], keep)
-            found = dict(journal.entries)
-            return [found[number] for number in range(len(cells))]
 
 
 def mission_scenario(
@@ -516,8 +481,7 @@ def _fly_random(options: RandomOptions, seed: int) -> MissionFlight:
 def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]]:
     """Fly all; the table, and the flights with a fault."""
     seeds = range(options.first, options.first + options.flights)
-    work, settings = partial(fly_random, options), options.settings()
-    flown = flights(work, seeds, MissionFlight, settings, options.out, options.workers)
+    flown = options.fly(partial(fly_random, options), seeds)
     asked_m = reading.load("swap").mission.separation_m
     rows = []
     for low, high in ((2, 8), (9, 16), (17, 24), (25, 32)):
@@ -526,8 +490,8 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
                 len(those),
                 f"{min(each.least_m for each in those):.3f}",
                 sum(each.least_m < asked_m for each in those),
-                f"{min(each.clear_m for each in those):.3f}",
-                sum(each.clear_m < 0.0 for each in those),
+                f"{min(each.clear_m for each in those if each.clear_m is not None):.3f}",
+                sum(each.was_in_zone for each in those),
                 sum(each.left for each in those),
                 sum(each.landed for each in those),
                 sum(each.late > 0 for each in those),
@@ -549,7 +513,7 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
     faults = [
         each
         for each in flown
-        if each.least_m < asked_m or each.clear_m < 0.0 or (each.late and not options.harsh)
+        if each.least_m < asked_m or each.was_in_zone or (each.late and not options.harsh)
     ]
     return TextTable(headings, rows), faults
 
@@ -585,8 +549,7 @@ def swap_table(options: SwapOptions) -> TextTable:
     """Fly every cell."""
     # By seeds first, so that more flights only add to the end.
     cells = list(product(range(1, options.flights + 1), SWAP_NETWORKS))
-    work, settings = partial(fly_swap, options), options.settings()
-    done = flights(work, cells, MissionFlight, settings, options.out, options.workers)
+    done = options.fly(partial(fly_swap, options), cells)
     asked = reading.load(options.shape).mission.separation_m
     rows = []
     for i, network in enumerate(SWAP_NETWORKS):
@@ -699,8 +662,7 @@ def published_table(options: PublishedOptions) -> TextTable:
     """Fly all."""
     kinds = list(product(TASKS, PUBLISHED_NETWORKS))
     cells = list(product(range(1, options.flights + 1), kinds))
-    work, settings = partial(fly_published, options), options.settings()
-    done = flights(work, cells, MissionFlight, settings, options.out, options.workers)
+    done = options.fly(partial(fly_published, options), cells)
     rows = []
     for i, (name, network) in enumerate(kinds):
         flown = done[i :: len(kinds)]

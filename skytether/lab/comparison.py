@@ -443,6 +443,12 @@ def _weights(value: Any) -> str:
     return ", ".join(f"{part:.4g}" for part in parts)
 
 
+SPENT = {
+    PACKETS: "packets /s, both ways",
+    BYTES: "bytes /s, both ways",
+    EFFORT: "effort [m/s]",
+}
+"""Resources, and their axis labels."""
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
 """Colours of the schemes, in order."""
 MARKERS = "sovD^P<*"
@@ -462,7 +468,6 @@ def _style(contender: Contender) -> tuple[str, str]:
 def curves(compared: ComparedCase) -> Plate:
     """Figure of a case: RMSE xy over the packets that each contender sends."""
     case = compared.case
-    found = {each.name: compared.curve(each.name) for each in compared.contenders}
     rows = [
         {"contender": name, "budget": budget} | _row(runs)
         for (name, budget), runs in compared.bought.items()
@@ -473,21 +478,6 @@ def curves(compared: ComparedCase) -> Plate:
         "Bands are 95 % intervals of the mean."
     )
 
-    def point(each: ContenderRuns) -> plates.Bought:
-        rmse_m, half_m = each.estimate(RMSE)
-        return plates.Bought(
-            packets_per_s=each.mean(PACKETS),
-            bytes_per_s=each.mean(BYTES),
-            effort_mps=each.mean(EFFORT),
-            rmse_m=rmse_m,
-            rmse_half_m=half_m,
-            median_m=each.median(),
-        )
-
-    drawn = [
-        plates.Curve(one.title, *_style(one), list(map(point, found[one.name])))
-        for one in compared.contenders
-    ]
     title = f"What a packet buys: {case.title}"
     floor = [(each.packets_per_s, each.rmse_m) for each in compared.floor if each.rmse_m > 0.0]
     if floor:
@@ -496,4 +486,47 @@ def curves(compared: ComparedCase) -> Plate:
             "by a clock leave to those without feedback aboard, and to all where the target is not "
             "known ahead."
         )
-    return plates.trade(f"trade-{case.name}", title, says, drawn, floor, rows_csv(rows))
+    with plates.sized(plates.PAGE, 5.0) as figure:
+        panes = figure.subplots(1, 3, sharey=True)
+        for contender in compared.contenders:
+            _draw_curve(panes, contender, compared.curve(contender.name))
+        if floor:
+            panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
+        for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
+            plane.set_yscale("log")
+            if spent != EFFORT:
+                plane.set_xscale("log")
+                plane.xaxis.set_minor_formatter("")  # such bands would overlap
+            plane.set_xlabel(label)
+        panes[0].set_ylabel("RMSE xy [m]")
+        handles, labels = panes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=7)
+    return plates.picture(figure, f"trade-{case.name}", title, says, rows_csv(rows))
+
+
+def _draw_curve(
+    panes: Sequence[Any], contender: Contender, points: Sequence[ContenderRuns]
+) -> None:
+    """Draw the RMSE of a contender over each of SPENT, with 95 % bands.
+
+    A contender that sends no packets is a horizontal line.
+    """
+    flown = [each for each in points if each.values(RMSE)]
+    rmse, half = np.array([each.estimate(RMSE) for each in flown], np.float64).reshape(-1, 2).T
+    half = np.nan_to_num(half)
+    median = np.array([each.median() for each in flown], np.float64)
+    low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis has no 0
+    colour, marker = _style(contender)
+    if flown and not flown[0].mean(PACKETS):
+        for plane in panes:
+            plane.axhline(rmse[0], color=colour, linestyle="--", label=contender.title)
+        return
+    style: Any = {"color": colour, "linestyle": "none"}
+    for plane, spent in zip(panes, SPENT, strict=True):
+        cost = np.array([each.mean(spent) for each in flown], np.float64)
+        plane.plot(cost, rmse, **style, marker=marker, markersize=4, label=contender.title)
+        plane.plot(cost, median, **style, marker="_", markersize=7)
+        if spent == EFFORT:
+            continue  # effort may rise or fall with the threshold
+        plane.plot(cost, rmse, color=colour, linewidth=0.8)
+        plane.fill_between(cost, low, rmse + half, color=colour, alpha=0.2, linewidth=0)

@@ -59,8 +59,6 @@ class Place(NamedTuple):
 class MapPoint(msgspec.Struct, frozen=True):
     """Results of a point; an entry of a map's journal."""
 
-    number: int
-    """Number of the point, from 0 on."""
     cycles: bool
     """Whether a flight to rest ended in a limit cycle."""
     rest_m: float
@@ -129,7 +127,6 @@ class Box:
             seeded = replace(scenario, seed=seed)
             flown.append(summarise(seeded, self.name, flight.client, flight.server))
         return MapPoint(
-            number,
             cycles=any(before * SUSTAINED < last > REST_M for before, last in rests),
             rest_m=max(last for _, last in rests),
             rmse_m=_mean(each.rmse_xy for each in flown),
@@ -140,12 +137,11 @@ class Box:
 
     def csv(self, points: Iterable[MapPoint]) -> str:
         """CSV table with a row for each point: coordinates and results."""
-        places = self.places
+        each = enumerate(zip(self.places, points, strict=True))
         rows = [
-            [point.number, *places[point.number], *msgspec.structs.astuple(point)[1:]]
-            for point in points
+            [number, *place, *msgspec.structs.astuple(point)] for number, (place, point) in each
         ]
-        return to_csv(["number", *Place._fields, *MapPoint.__struct_fields__[1:]], rows)
+        return to_csv(["number", *Place._fields, *MapPoint.__struct_fields__], rows)
 
 
 def at_rest(scenario: Scenario) -> Scenario:

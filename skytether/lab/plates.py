@@ -70,7 +70,7 @@ class Plate(Picture):
 
 
 @contextmanager
-def _figure(width: float, height: float) -> "Iterator[Figure]":
+def sized(width: float, height: float) -> "Iterator[Figure]":
     """Empty figure of a size [inch]."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -79,7 +79,7 @@ def _figure(width: float, height: float) -> "Iterator[Figure]":
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def _picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
+def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
     """Figure in all written formats."""
     png, pdf = io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png", dpi=220)
@@ -105,7 +105,7 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
     cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), direction.slots_mean)
     took_cdf = np.searchsorted(np.sort(took_ms), fine_ms, side="right") / len(took_ms)
-    with _figure(PAGE, 2.4) as figure:
+    with sized(PAGE, 2.4) as figure:
         left, right = figure.subplots(1, 2)
         left.bar(lattice_ms, share, 0.7 * slot_ms, color="0.75", label="over UDP")
         left.plot(lattice_ms, pdf, "r_", markersize=10, markeredgewidth=1.5, label="(17)")
@@ -129,13 +129,13 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
         for ms, theory, real in zip(fine_ms.tolist(), cdf, took_cdf, strict=True)
     ]
     header = ("delay_ms", "probability", "probability_udp", "cumulative", "cumulative_udp")
-    return _picture(figure, "fig2", "Fig. 2: network delay", says, to_csv(header, rows))
+    return picture(figure, "fig2", "Fig. 2: network delay", says, to_csv(header, rows))
 
 
 def paths(samples: Samples) -> Plate:
     """Fig. 3: path without and with compensation, with a packet at every step."""
     rmse, positions = [], []
-    with _figure(PAGE, 3.9) as figure:
+    with sized(PAGE, 3.9) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
         for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
             scenario, flights = samples[method]
@@ -152,7 +152,7 @@ def paths(samples: Samples) -> Plate:
     header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
     rows = np.column_stack([step, wanted, *positions]).tolist()
     title = "Fig. 3: position without and with delay compensation"
-    return _picture(figure, "fig3", title, says, to_csv(header, rows))
+    return picture(figure, "fig3", title, says, to_csv(header, rows))
 
 
 def events(samples: Samples) -> Plate:
@@ -161,7 +161,7 @@ def events(samples: Samples) -> Plate:
     flight, dt = flights[0], scenario.control.dt
     step, wanted, position = _path(scenario, flight)
     sent = np.isin(step, flight.server["step"][flight.server["event"]])
-    with _figure(COLUMN, 4.4) as figure:
+    with sized(COLUMN, 4.4) as figure:
         plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
         _draw_path(plane, scenario, flight)
         plane.legend(loc="center")
@@ -178,7 +178,7 @@ def events(samples: Samples) -> Plate:
     header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
     rows = np.column_stack([step, wanted, position, sent]).tolist()
     title = "Fig. 4: position with the event trigger, and when it sent"
-    return _picture(figure, "fig4", title, says, to_csv(header, rows))
+    return picture(figure, "fig4", title, says, to_csv(header, rows))
 
 
 def _path(scenario: Scenario, flight: Record) -> tuple[Indices, Array, Array]:
@@ -209,7 +209,7 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
         here: the paper's own λ and ε, which a cross marks.
     """
     decay, epsilon, rmse, ratio = _grid(flown)
-    with _figure(PAGE, 2.8) as figure:
+    with sized(PAGE, 2.8) as figure:
         panes = figure.subplots(1, 2)
         names = ("RMSE xy [m]", "event ratio")
         for plane, values, name in zip(panes, (rmse, ratio), names, strict=True):
@@ -232,7 +232,7 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
         for (decay, epsilon), runs in flown.items()
     ]
     title = "Fig. 5: control performance and event ratio over λ and ε"
-    return _picture(figure, "fig5", title, says, rows_csv(rows))
+    return picture(figure, "fig5", title, says, rows_csv(rows))
 
 
 DRAWN = ("rmse_xy", "event_ratio")
@@ -257,7 +257,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
         np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
         for name in ("event_ratio", "rmse_xy")
     )
-    with _figure(COLUMN, 3.0) as figure:
+    with sized(COLUMN, 3.0) as figure:
         from matplotlib import colormaps
 
         plane = figure.subplots()
@@ -290,7 +290,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
     rows = [row(EVENT, (*values, None), runs) for values, runs in flown.items()]
     rows += [row("periodic", (None, None, *values), runs) for values, runs in periodic.items()]
     title = "Fig. 5 as curves: what a packet buys"
-    return _picture(figure, "fig5-pareto", title, says, rows_csv(rows))
+    return picture(figure, "fig5-pareto", title, says, rows_csv(rows))
 
 
 def curve(study: Study, cells: Cells) -> Plate:
@@ -303,7 +303,7 @@ def curve(study: Study, cells: Cells) -> Plate:
         for method in methods
     }
     places = np.array(study.axis.values)
-    with _figure(COLUMN, 3.2) as figure:
+    with sized(COLUMN, 3.2) as figure:
         plane = figure.subplots()
         for method in methods:
             means, halves = table[method].T
@@ -341,7 +341,7 @@ def curve(study: Study, cells: Cells) -> Plate:
         for (value, method), cell in cells.items()
     ]
     title = f"RMSE against {study.label.partition(' [')[0]}"
-    return _picture(figure, f"rmse-{study.name}", title, says, rows_csv(rows))
+    return picture(figure, f"rmse-{study.name}", title, says, rows_csv(rows))
 
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
@@ -360,7 +360,7 @@ def estimates(samples: Samples) -> Plate:
         for method, (_, flights) in samples.items()
     }
     quantiles = {method: np.quantile(error, shares, axis=0) for method, error in errors.items()}
-    with _figure(PAGE, 2.6) as figure:
+    with sized(PAGE, 2.6) as figure:
         panes = figure.subplots(1, 2, sharey=True)
         for part, (plane, unit) in enumerate(zip(panes, ("m", "m/s"), strict=True)):
             for method, values in quantiles.items():
@@ -377,7 +377,7 @@ def estimates(samples: Samples) -> Plate:
     parts = ("position_m", "velocity_mps")
     header = ("share", *(f"{method}: {part}" for method in quantiles for part in parts))
     rows = np.column_stack([shares, *quantiles.values()]).tolist()
-    return _picture(figure, "estimate-error", "Error of the estimate", says, to_csv(header, rows))
+    return picture(figure, "estimate-error", "Error of the estimate", says, to_csv(header, rows))
 
 
 def _estimate_error(flight: Record) -> Array:
@@ -392,96 +392,6 @@ def _estimate_error(flight: Record) -> Array:
     return norms
 
 
-@dataclass(frozen=True, slots=True)
-class Bought:
-    """Point of `trade`: resources used, and the remaining error."""
-
-    packets_per_s: float
-    """Packets per second, both ways; 0 is drawn as a horizontal line."""
-    bytes_per_s: float
-    """Bytes per second, both ways and with headers."""
-    effort_mps: float
-    """RMS change of the command from step to step [m/s]."""
-    rmse_m: float | None
-    """Mean RMSE xy [m]; None if no flight succeeded."""
-    rmse_half_m: float | None
-    """Half-width of the 95 % interval of `rmse_m` [m]."""
-    median_m: float | None
-    """Median RMSE xy [m]; None if no flight succeeded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """Curve of `trade`."""
-
-    label: str
-    """Name in the legend."""
-    colour: str
-    marker: str
-    points: Sequence[Bought]
-    """Points in the order of the line."""
-
-
-def trade(
-    name: str,
-    title: str,
-    says: str,
-    curves: Sequence[Curve],
-    floor: Sequence[tuple[float, float]],
-    csv: str,
-) -> Plate:
-    """RMSE over the resources used: packets, bytes and effort, with 95 % bands.
-
-    Args:
-        floor: points of a floor: packets up per second, and RMSE xy [m].
-        csv: the numbers, as CSV text.
-    """
-    with _figure(PAGE, 5.0) as figure:
-        panes = figure.subplots(1, 3, sharey=True)
-        for curve in curves:
-            flown = [point for point in curve.points if point.rmse_m]
-            rmse = np.array([point.rmse_m for point in flown], np.float64)
-            half = np.array([point.rmse_half_m or 0.0 for point in flown], np.float64)
-            median = np.array([point.median_m for point in flown], np.float64)
-            low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis has no 0
-            if flown and not flown[0].packets_per_s:
-                for plane in panes:
-                    plane.axhline(rmse[0], color=curve.colour, linestyle="--", label=curve.label)
-                continue
-            style: Any = {"color": curve.colour, "linestyle": "none"}
-            shape, label = curve.marker, curve.label
-            for plane, spent in zip(panes, SPENT, strict=True):
-                cost = np.array([getattr(point, spent) for point in flown], np.float64)
-                plane.plot(cost, rmse, **style, marker=shape, markersize=4, label=label)
-                plane.plot(cost, median, **style, marker="_", markersize=7)
-                if spent == "effort_mps":
-                    continue  # effort may rise or fall with the threshold
-                plane.plot(cost, rmse, color=style["color"], linewidth=0.8)
-                plane.fill_between(
-                    cost, low, rmse + half, color=style["color"], alpha=0.2, linewidth=0
-                )
-        if floor:
-            panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
-        for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
-            plane.set_yscale("log")
-            if spent != "effort_mps":
-                plane.set_xscale("log")
-                plane.xaxis.set_minor_formatter("")  # such bands would overlap
-            plane.set_xlabel(label)
-        panes[0].set_ylabel("RMSE xy [m]")
-        handles, labels = panes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=7)
-    return _picture(figure, name, title, says, csv)
-
-
-SPENT = {
-    "packets_per_s": "packets /s, both ways",
-    "bytes_per_s": "bytes /s, both ways",
-    "effort_mps": "effort [m/s]",
-}
-"""Resources, and their axis labels."""
-
-
 def intervals(samples: Samples) -> Plate:
     """Distribution of the time between two packets of the event trigger."""
     scenario, flights = samples[EVENT]
@@ -491,7 +401,7 @@ def intervals(samples: Samples) -> Plate:
     steps = np.arange(1, int(gaps.max()) + 1)
     counts = np.array([np.sum(gaps == step) for step in steps])
     regular = samples[PERIODIC][0].control.period
-    with _figure(COLUMN, 2.4) as figure:
+    with sized(COLUMN, 2.4) as figure:
         plane = figure.subplots()
         dt = scenario.control.dt
         plane.bar(steps * dt, counts / len(gaps), 0.8 * dt, color="0.4", label="event trigger (16)")
@@ -508,7 +418,7 @@ def intervals(samples: Samples) -> Plate:
     rows = list(zip(steps.tolist(), (steps * dt).tolist(), counts.tolist(), strict=True))
     title = "Time between two packets"
     csv = to_csv(("steps", "seconds", "count"), rows)
-    return _picture(figure, "intervals", title, says, csv)
+    return picture(figure, "intervals", title, says, csv)
 
 
 def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
@@ -524,7 +434,7 @@ def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
     everything = np.concatenate(list(solve_ms.values()))
     edges = np.geomspace(max(1e-3, everything.min()), everything.max() * 1.01, 40)
     counts = {name: np.histogram(values, edges)[0] for name, values in solve_ms.items()}
-    with _figure(COLUMN, 2.4) as figure:
+    with sized(COLUMN, 2.4) as figure:
         plane = figure.subplots()
         for name, values in counts.items():
             plane.stairs(values, edges, color=STYLES[name]["color"], label=name)
@@ -538,4 +448,4 @@ def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
     )
     rows = np.column_stack([edges[:-1], edges[1:], *counts.values()]).tolist()
     header = ("from_ms", "to_ms", *counts)
-    return _picture(figure, "solve-times", "Solve times over UDP", says, to_csv(header, rows))
+    return picture(figure, "solve-times", "Solve times over UDP", says, to_csv(header, rows))

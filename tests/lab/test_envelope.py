@@ -451,9 +451,9 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
-    with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
-        journal.append(EnvelopePoint(1, "astray", 1.25, 1.0, 0.0))
-        journal.append(lost)
+    with closing(Journal(tmp_path, plan.settings(), tuple[int, EnvelopePoint])) as journal:
+        journal.append((1, EnvelopePoint(1, "astray", 1.25, 1.0, 0.0)))
+        journal.append((0, lost))
     assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()
     assert f"flyaway: {lost.line}\n    {plan.command(0)}\nastray: 1.25 m from the" in said.out

@@ -1,14 +1,16 @@
 """Missions as benchmarks: reproducible, also with links that are cut and servers that die."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench import missions, motions
-from bench.missions import RandomOptions, flights
+from bench.missions import MissionFlight, RandomOptions, SwapOptions
 from bench.motions import MotionsOptions
+from skytether.lab.commands.pool import Flags, study
 from skytether.server.missions import yielding
 from skytether.server.missions.waypoints import Waypoints
 from skytether.shared.base.errors import ConfigError
@@ -56,13 +58,21 @@ def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPa
 
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
     """A command goes on where it ended, with more flights if asked; else nothing is kept."""
-    out = tmp_path / "flights"
-    assert flights(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, 1) == [2.0, 3.0]
+    out, one = tmp_path / "flights", Flags(1)
+    assert study(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, one) == [2.0, 3.0]
     # Another function shows which are flown now.
-    assert flights(math.fabs, [4.0, 9.0, 16.0], float, {"seed": 1}, out, 1) == [2.0, 3.0, 16.0]
-    assert flights(math.fabs, [4.0], float, {"seed": 1}, None, 1) == [4.0]
+    assert study(math.fabs, [4.0, 9.0, 16.0], float, {"seed": 1}, out, one) == [2.0, 3.0, 16.0]
+    assert study(math.fabs, [4.0], float, {"seed": 1}, None, one) == [4.0]
     with pytest.raises(ConfigError, match="seed: got 2, expected 1"):
-        flights(math.fabs, [4.0], float, {"seed": 2}, out, 1)
+        study(math.fabs, [4.0], float, {"seed": 2}, out, one)
+
+
+def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:
+    """Its distance from a zone is None, which JSON can hold, and no infinity."""
+    fly = partial(missions.fly_swap, SwapOptions(vehicles=2, duration=4.0))
+    again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(1)) for _ in range(2)]
+    assert again[0] == again[1]
+    assert again[1][0].clear_m is None
 
 
 def test_solvers_agree_on_the_problems_of_a_flight() -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from rich.table import Table
-from rich.text import Text
 
 from skytether.lab.adversary import (
     CLIMB,
@@ -27,12 +25,13 @@ from skytether.lab.adversary import (
     shrunk,
     spare_m,
 )
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.options import Argument
 
@@ -204,19 +203,19 @@ def _finish(
         command.write(options.json, msgspec.json.encode(Kept(found, spares_m)))
     failed, apart, clear = sum(each < 0.0 for each in spares_m), found.apart, found.clear
     asked_m = options.config.mission.separation_m
-    table = Table(title=f"adversary against {title}", title_justify="left", show_header=False)
+    rows: list[tuple[str, object]] = []
     if spares_m:
-        table.add_row("flights", f"{len(spares_m)}, {options.kinds}")
-        table.add_row("in which a distance was not kept", str(failed))
+        rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
+        rows.append(("in which a distance was not kept", failed))
     # With all digits: the same moves give the same distance.
-    table.add_row(Text("least separation, asked for [m]"), f"{apart.distance_m!r}, {asked_m:g}")
-    table.add_row(Text("  at [s], of vehicles"), f"{apart.at_s:.2f}, {apart.vehicles}")
+    rows.append(("least separation, asked for [m]", f"{apart.distance_m!r}, {asked_m:g}"))
+    rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
     if clear.vehicles:
-        table.add_row(Text("least distance from a zone [m]"), repr(clear.distance_m))
-        table.add_row(Text("  at [s], of vehicle"), f"{clear.at_s:.2f}, {clear.vehicles[0]}")
-    table.add_row("observations outside a tube", str(found.left))
-    table.add_row("moves", ", ".join(sorted({each.kind for each in found.moves})) or "none")
-    terminal.show(table)
+        rows.append(("least distance from a zone [m]", clear.distance_m))
+        rows.append(("  at [s], of vehicle", f"{clear.at_s:.2f}, {clear.vehicles[0]}"))
+    rows.append(("observations outside a tube", found.left))
+    rows.append(("moves", ", ".join(sorted({each.kind for each in found.moves})) or "none"))
+    tables.show(f"adversary against {title}", (), rows)
     if spare_m(options.config, found) < 0.0:
         if spares_m:
             fewest = shrunk(options.config, found)

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from skytether.figures.page import as_text
 from skytether.lab import calibration
 from skytether.lab.calibration import HERE, Rmse, SearchLimits, Table1
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
 from skytether.lab.journal import Journal
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
@@ -125,38 +123,34 @@ def _print_rmse(points: Sequence[SearchPoint]) -> None:
     """Print the best point of a search for the smallest error."""
     found = best(points)
     here = found.values[HERE]
-    table = Table(title=f"the best of {len(points)} points", show_header=False)
-    table.add_row("score", f"{found.score:.4f}")
-    table.add_row(Text("RMSE xy [m]"), as_text(here["rmse_xy"], ".4f"))
-    table.add_row("event ratio", as_text(here["event_ratio"], ".4f"))
-    table.add_row(Text("effort [m/s]"), as_text(here["effort_mps"], ".4f"))
-    for key, value in found.keys.items():
-        table.add_row(key, f"{value:g}")
-    Console().print(table)
+    rows = [
+        ("score", f"{found.score:.4f}"),
+        ("RMSE xy [m]", as_text(here["rmse_xy"], ".4f")),
+        ("event ratio", as_text(here["event_ratio"], ".4f")),
+        ("effort [m/s]", as_text(here["effort_mps"], ".4f")),
+    ]
+    rows += [(key, f"{value:g}") for key, value in found.keys.items()]
+    tables.show(f"the best of {len(points)} points", (), rows)
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
     """Print the best point beside Table 1, and the ranges of all points within tolerance."""
-    found, console = best(points), Console()
-    console.print(_entries(found.values))
+    found, rows = best(points), []
+    _print_entries(found.values)
     near = [point for point in points if calibration.is_admissible(point.values)]
-    table = Table(title=f"{len(near)} of {len(points)} points have every entry within tolerance")
-    for heading in ("key", "best", "least", "most", "of these"):
-        table.add_column(heading)
     for key, value in found.keys.items():
         span = [point.keys[key] for point in near]
         ends = [f"{min(span):g}", f"{max(span):g}"] if span else []
-        table.add_row(key, f"{value:g}", *ends)
-    console.print(table)
+        rows.append((key, f"{value:g}", *ends))
+    title = f"{len(near)} of {len(points)} points have every entry within tolerance"
+    tables.show(title, ("key", "best", "least of these", "most of these"), rows)
 
 
-def _entries(values: Values) -> Table:
-    """Entries of Table 1, the paper's figures beside those of a point."""
-    table = Table(title="Table 1")
-    for heading in ("", "entry", "paper", "here", "off"):
-        table.add_column(heading)
+def _print_entries(values: Values) -> None:
+    """Print the entries of Table 1, the paper's figures beside those of a point."""
+    rows = []
     for (column, name), off in calibration.deviations(values).items():
         paper, here = calibration.TABLE_1[column][name], values[column][name]
         mark = "" if calibration.within(name, off) else " !"
-        table.add_row(column, name, f"{paper:.4f}", as_text(here, ".4f"), f"{off:+.1%}{mark}")
-    return table
+        rows.append((column, name, f"{paper:.4f}", as_text(here, ".4f"), f"{off:+.1%}{mark}"))
+    tables.show("Table 1", ("", "entry", "paper", "here", "off"), rows)

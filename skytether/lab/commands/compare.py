@@ -13,7 +13,7 @@ from skytether.lab import comparison, contenders
 from skytether.lab.beside import Baselines, Work, floor_of, fly_aboard
 from skytether.lab.budgets import Plan
 from skytether.lab.calibration import HERE, Rmse, SearchLimits
-from skytether.lab.commands import report_folder
+from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
@@ -90,7 +90,7 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
     drawn = comparison.draw(results)
     report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
     for table in drawn.tables:
-        report_folder.show(table)
+        tables.show(table.title, table.heading, table.rows)
     print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import tyro
-from rich.table import Table
-from rich.text import Text
 
 from skytether.cli import processes
 from skytether.lab import figures
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Interrupted, writing
 from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
 from skytether.lab.journal import Journal
@@ -164,15 +163,9 @@ def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
     rows = [point for each in flown.values() for point in each.points]
     files.write(options.out / "crowd.csv", points_csv(rows).encode())
     figures.crowd(options.out / "crowd.png", title, flown, options.limit)
-    table = Table(title=title, title_justify="left")
     headings = ("scheme", "vehicles", "fly", "RMSE [m]", "worst [m]", "brake or end")
     way = ("up, down [B/s]", "queueing up p50, p99 [ms]", "down", "lost up, down")
-    for heading in (*headings, *way):
-        table.add_column(Text(heading), justify="left" if heading == "scheme" else "right")
-    for each in flown.values():
-        for point in each.points:
-            table.add_row(*_cells(point, options.limit))
-    terminal.show(table)
+    tables.show(title, (*headings, *way), [_cells(point, options.limit) for point in rows])
     for scheme, each in flown.items():
         if each.points:
             beyond = f"{each.too_many} do not" if each.too_many else "no more were tried"

@@ -4,21 +4,19 @@ points.
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, get_args
 
 import tyro
-from rich.table import Table
 
 from skytether.lab import figures
-from skytether.lab.commands.pool import Flags, PoolFlags, crew, writing
+from skytether.lab.commands import tables
+from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
-from skytether.lab.journal import Journal
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
@@ -60,21 +58,11 @@ def envelope(argv: Sequence[str]) -> None:
     plan = Envelope(options.scenario, options.config)
     command.claim_folder("--out", options.out, "points.csv", "envelope.png")
     title = f"flying points of {options.scenario}"
-    with (
-        writing(options.out),
-        closing(Journal(options.out, plan.settings(), EnvelopePoint)) as journal,
-    ):
-        done = {point.number for point in journal.entries if point.number < options.points}
-        todo = [number for number in range(options.points) if number not in done]
-        with crew(options.pool, title, options.points, "points") as flyers:
-            flyers.advance(len(done))
-
-            def keep(_: int, point: EnvelopePoint) -> None:
-                journal.append(point)
-                flyers.advance(1)
-
-            flyers.share(plan.fly, todo, keep)
-        points = sorted(journal.entries, key=lambda point: point.number)[: options.points]
+    numbers, settings = range(options.points), plan.settings()
+    points = study(
+        plan.fly, numbers, EnvelopePoint, settings, options.out, options.pool, title, "points"
+    )
+    with writing(options.out):
         _finish(options, plan, points)
 
 
@@ -88,12 +76,8 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
     files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)
     counts = Counter(point.outcome for point in points)
-    table = Table(title=title, title_justify="left", min_width=len(title))
-    for heading in ("outcome", "points", "share"):
-        table.add_column(heading, justify="left" if heading == "outcome" else "right")
-    for outcome in get_args(Outcome):
-        table.add_row(outcome, str(counts[outcome]), f"{counts[outcome] / len(points):.1%}")
-    terminal.show(table)
+    rows = [(each, counts[each], f"{counts[each] / len(points):.1%}") for each in get_args(Outcome)]
+    tables.show(title, ("outcome", "points", "share"), rows)
     for point in worst_first(points)[:TOLD_MAX]:
         said = f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
         print(f"{point.outcome}{said}\n    {plan.command(point.number)}")

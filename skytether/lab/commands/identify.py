@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from rich.table import Table
-from rich.text import Text
 
 from skytether.client import vehicles
 from skytether.figures import flights as figures
 from skytether.figures.tables import to_csv
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import writing
 from skytether.lab.identify import outcome, picture
 from skytether.lab.identify.fit import Fit, fit, misfit, verdict
@@ -277,12 +276,11 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         files.write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
         files.write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
         figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
-    terminal.show(_table(first))
+    _show_models(first)
     for name, axis in zip(AXES, first.axes, strict=False):
         print(f"{name}: {verdict(axis.fit) if axis.fit else outcome.describe(axis)}")
     if costs:
-        print("What a wrong size costs, as the largest difference from steps of the first row's:")
-        terminal.show(_cost_table(flown, costs))
+        _show_costs(flown, costs)
 
 
 def _all_told(flown: SizeFlown) -> list[AxisTold]:
@@ -304,20 +302,19 @@ def _measured(flight: Identifying, axes: int) -> str:
     return to_csv(header, rows)
 
 
-def _table(flown: SizeFlown) -> Table:
-    """Model of each axis, as a table."""
-    table = Table(title="first order with dead time, 95 % intervals", title_justify="left")
+def _show_models(flown: SizeFlown) -> None:
+    """Print the model of each axis."""
+    rows = []
     heading = ("axis", "step [m/s]", "steps", "gain", "time constant [s]", "dead time [s]")
-    for each in (*heading, "left over, rms", "largest"):
-        table.add_column(Text(each))
     for name, axis in zip(AXES, flown.axes, strict=False):
         row = [name, f"{axis.speed:g}", axis.steps]
         if found := axis.fit:
             keys = ("gain", "tau_s", "dead_time_s")
             row += [outcome.with_interval(key, found.numbers, found.within) for key in keys]
             row += [f"{found.misfit.rms:.1%}", f"{found.misfit.largest:.1%}"]
-        table.add_row(*map(Text, row))
-    return table
+        rows.append(row)
+    title = "first order with dead time, 95 % intervals"
+    tables.show(title, (*heading, "left over, rms", "largest"), rows)
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
@@ -338,15 +335,14 @@ def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
     ]
 
 
-def _cost_table(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -> Table:
-    """Table of the errors of models identified at other sizes of step."""
-    table = Table()
-    for each in ("model of [m/s]", *costs[0]):
-        table.add_column(Text(each))
+def _show_costs(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -> None:
+    """Print the errors of models identified at other sizes of step."""
+    rows = []
     for one, cost in zip(flown, costs, strict=True):
         of = ", ".join(f"{axis.speed:g}" for axis in one.axes)
-        table.add_row(of, *(f"{each:.1%}" for each in cost.values()))
-    return table
+        rows.append((of, *(f"{each:.1%}" for each in cost.values())))
+    title = "What a wrong size costs, as the largest difference from steps of the first row's:"
+    tables.show(title, ("model of [m/s]", *costs[0]), rows)
 
 
 def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlown) -> None:

@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,19 +10,17 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import tyro
-from rich.markup import escape
-from rich.table import Table
 
 from skytether.lab import maps
 from skytether.lab import margins as lab
-from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
-from skytether.lab.journal import Journal
+from skytether.lab.commands import tables
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
 from skytether.lab.maps import Box, MapPoint
 from skytether.lab.margins import Limit, Margin
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
@@ -101,16 +98,9 @@ def margins(argv: Sequence[str]) -> None:
             ]
             runs = min(options.runs, lab.LIMIT_RUNS)
             parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
-            found: dict[int, Margin | Limit] = {}
-
-            def keep(number: int, result: Margin | Limit) -> None:
-                found[number] = result
-                flyers.advance(1)
-
-            flyers.share(_fly, parts, keep)
+            results = flyers.map(_fly, parts, 1)
     except Interrupted as interrupted:  # nothing is kept of what was flown
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
-    results = [found[number] for number in range(len(parts))]
     flown = [each for each in results if isinstance(each, Margin)]
     limits = [each for each in results if isinstance(each, Limit)]
     if options.json is not None:
@@ -154,21 +144,13 @@ def _box(options: MarginsOptions, trigger: str) -> Box:
 def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
     """Fly the missing points of the box; write and print the results of all."""
     box = _box(options, trigger)
-    count = len(box.places)
-    title = f"flying vehicles like {options.scenario}'s"
-    with writing(folder), closing(Journal(folder, box.settings(), MapPoint)) as journal:
-        done = {point.number for point in journal.entries}
-        with crew(options.pool, title, count, "points") as flyers:
-            flyers.advance(len(done))
-
-            def keep(_: int, point: MapPoint) -> None:
-                journal.append(point)
-                flyers.advance(1)
-
-            flyers.share(box.fly, [number for number in range(count) if number not in done], keep)
-        points = sorted(journal.entries, key=lambda point: point.number)
+    numbers, title = range(len(box.places)), f"flying vehicles like {options.scenario}'s"
+    points = study(
+        box.fly, numbers, MapPoint, box.settings(), folder, options.pool, title, "points"
+    )
+    title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
+    with writing(folder):
         files.write(folder / "points.csv", box.csv(points).encode())
-        title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
         maps.draw(folder / "maps.png", title, box, points)
     _show_points(title, box, points)
     print(f"{folder}: points.csv, maps.png")
@@ -179,24 +161,23 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
     groups: dict[tuple[float, float], list[MapPoint]] = defaultdict(list)
     for place, point in zip(box.places, points, strict=True):
         groups[place.burst_s, place.dead_time_s].append(point)
-    table = Table(title=title, title_justify="left", min_width=len(title))
     headings = ("bursts [s]", "dead time [s]", "vehicles", "limit cycles", "not stable")
-    for heading in (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"):
-        table.add_column(escape(heading), justify="right")
+    rows = []
     for (burst_s, dead_time_s), group in groups.items():
         rmse = np.array([point.rmse_m or np.nan for point in group])
         saturated = max(point.saturated or 0.0 for point in group)
-        table.add_row(
+        row = (
             f"{burst_s:g}",
             f"{dead_time_s:g}",
-            str(len(group)),
-            str(sum(point.cycles for point in group)),
-            str(sum(point.growth >= 1.0 for point in group)),
+            len(group),
+            sum(point.cycles for point in group),
+            sum(point.growth >= 1.0 for point in group),
             f"{np.nanmedian(rmse):.3f}",
             f"{np.nanmax(rmse):.3f}",
             f"{saturated:.1%}",
         )
-    terminal.show(table)
+        rows.append(row)
+    tables.show(title, (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"), rows)
 
 
 def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> None:
@@ -211,24 +192,20 @@ def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> Non
             f"control.trigger: {scenario.control.trigger!r} looks at the state; pushes are flown "
             f"with {trigger!r}, which sends as often"
         )
-    table = Table(title=title, title_justify="left", min_width=len(title))
-    table.add_column("vehicle")
-    table.add_column("growth")
-    table.add_column("stable")
-    for axis in "xyz"[: scenario.model.axes]:
-        table.add_column(escape(f"RMS {axis} [m]"), justify="right")
-    table.add_column("bound", justify="right")
+    rms_headings = [f"RMS {axis} [m]" for axis in "xyz"[: scenario.model.axes]]
+    rows = []
     for each in found:
         rms: Sequence[float | None] = each.rms_m or [None] * scenario.model.axes
         halves = each.rms_ci95_m or [None] * len(rms)
-        table.add_row(
+        row = (
             each.vehicle,
             _with_interval(each.growth, each.growth_ci95),
             "yes" if each.stable else "no",
             *map(_with_interval, rms, halves),
             "-" if each.saturated is None else f"{each.saturated:.1%}",
         )
-    terminal.show(table)
+        rows.append(row)
+    tables.show(title, ("vehicle", "growth", "stable", *rms_headings, "bound"), rows)
 
 
 def _with_interval(value: float | None, half: float | None) -> str:
@@ -240,11 +217,9 @@ def _with_interval(value: float | None, half: float | None) -> str:
 
 def _show_limits(limits: Sequence[Limit]) -> None:
     """Print a row for each limit."""
-    table = Table(title="stable up to, relative to the model", title_justify="left", min_width=36)
-    table.add_column("quantity")
-    table.add_column("limit", justify="right")
+    rows = []
     for each in limits:
         beyond = "<" if each.quantity.endswith("least") else ">"
         unknown = f"{beyond} {each.searched:g}"
-        table.add_row(escape(each.quantity), unknown if each.value is None else f"{each.value:.3g}")
-    terminal.show(table)
+        rows.append((each.quantity, unknown if each.value is None else f"{each.value:.3g}"))
+    tables.show("stable up to, relative to the model", ("quantity", "limit"), rows)

@@ -1,4 +1,9 @@
-"""Workers for the flights of sweeps and searches: processes of this machine, or a Dask cluster."""
+"""Core of every study: flights in workers, kept in a journal, with a bar, Ctrl-C and resuming.
+
+A study of numbered cells is `study`: cells and a function that flies and judges one. Sweeps and
+searches (`Crew.fly`, `Crew.search`) pin their files besides. The workers are processes of this
+machine, or a Dask cluster.
+"""
 
 import multiprocessing
 import os
@@ -20,7 +25,7 @@ from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from msgspec.structs import replace
@@ -179,10 +184,19 @@ class Crew:
             self.advance(1, f"{text}best {best(points).score:.4f}")
         return points
 
-    def map(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """Results of a function for all items, in order; see `share`."""
+    def map(self, function: Callable[[T], R], items: Sequence[T], amount: float = 0.0) -> list[R]:
+        """Results of a function for all items, in order; see `share`.
+
+        Args:
+            amount: amount of work that an item is, in the unit.
+        """
         results: dict[int, R] = {}
-        self.share(function, items, results.__setitem__)
+
+        def keep(number: int, result: R) -> None:
+            results[number] = result
+            self.advance(amount)
+
+        self.share(function, items, keep)
         return [results[number] for number in range(len(items))]
 
     def share(
@@ -234,6 +248,47 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
         terminal.progress(title, total, unit) as bar,
     ):
         yield Crew(executor, bar, total, unit, interrupted)
+
+
+def study(
+    fly: Callable[[T], R],
+    cells: Sequence[T],
+    kind: type[R],
+    settings: Mapping[str, Any],
+    out: Path | None,
+    flags: Flags,
+    title: str = "flying",
+    unit: str = "flights",
+) -> list[R]:
+    """Results of all cells of a study, in order, after flying the missing ones.
+
+    Args:
+        fly: flies a cell, and judges the flight; called in a worker.
+        cells: what is flown; the same folder may be given more cells later, at the end.
+        kind: type of a result.
+        settings: all that the results follow from, but for the number of a cell.
+        out: folder of the journal; None: nothing is kept.
+        title, unit: for the bar.
+
+    Raises:
+        CommandError: interrupted, a worker has died, or the folder cannot be written.
+        ConfigError: the folder has the results of other settings.
+    """
+    with temporary.folder() as folder:
+        place = out or folder / "study"
+        with writing(place), closing(Journal(place, settings, tuple[int, kind])) as journal:  # type: ignore[valid-type]
+            done = {number for number, _ in journal.entries}
+            todo = [number for number in range(len(cells)) if number not in done]
+            with crew(flags, title, len(cells), unit) as flyers:
+                flyers.advance(len(cells) - len(todo))
+
+                def keep(index: int, result: R) -> None:
+                    journal.append((todo[index], result))
+                    flyers.advance(1)
+
+                flyers.share(fly, [cells[number] for number in todo], keep)
+            results = dict(journal.entries)
+            return [results[number] for number in range(len(cells))]
 
 
 @contextmanager

@@ -1,11 +1,9 @@
 """Folder of a report: its page, each table and figure, and the commands that made it."""
 
-import contextlib
 import json
 import os
 import platform
 import shlex
-import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,15 +12,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import rich.table
-from rich.text import Text
-
-from skytether.figures.page import Table
 from skytether.lab import report
+from skytether.lab.commands import machine
 from skytether.lab.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import terminal
 
 PAGE = "report.html"
 """File of the page."""
@@ -58,11 +52,11 @@ class CommandCall:
             "command": self.command,
             "date": self.began.isoformat(timespec="seconds"),
             "runs": runs,
-            "machine": f"{_processor()}, {len(os.sched_getaffinity(0))} cores, "
+            "machine": f"{machine.processor()}, {len(os.sched_getaffinity(0))} cores, "
             f"{platform.platform()}",
             "python": platform.python_version(),
             "versions": {name: metadata.version(name) for name in PACKAGES},
-            "commit": _commit(),
+            "commit": machine.commit(),
             "seconds": round(time.monotonic() - self.began_s, 1),
         }
 
@@ -88,38 +82,3 @@ def write(out: Path, drawn: Drawn, scenario: Scenario, call: CommandCall, runs: 
     files.write(file, "".join(f"{line}\n" for line in lines).encode())
     calls = [json.loads(line) for line in lines]
     files.write(out / PAGE, report.html(drawn, scenario, calls).encode())
-
-
-def show(table: Table) -> None:
-    """Print a table of a report."""
-    shown = rich.table.Table(title=table.title, title_justify="left")
-    for heading in table.heading:
-        shown.add_column(Text(heading), no_wrap=True)
-    for row in table.rows:
-        shown.add_row(*map(Text, row))
-    terminal.show(shown)
-
-
-def _processor() -> str:
-    """Name of this machine's processor."""
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        if names:
-            return names[0]
-    return platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    """Commit of the checkout that this code runs from; None without a checkout."""
-    with contextlib.suppress(OSError):
-        run = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if run.returncode == 0:
-            return run.stdout.strip()
-    return None

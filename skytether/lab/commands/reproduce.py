@@ -13,7 +13,7 @@ import tyro
 
 from skytether.cli import processes
 from skytether.lab import report, studies
-from skytether.lab.commands import delays, report_folder
+from skytether.lab.commands import delays, report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.journal import Journal
@@ -66,7 +66,8 @@ def reproduce(argv: Sequence[str]) -> None:
         measured, runs = _measure(options, scenario, scale)
         drawn = report.draw(measured)
         report_folder.write(options.out, drawn, scenario, call, runs)
-    report_folder.show(drawn.tables[0])
+    table = drawn.tables[0]
+    tables.show(table.title, table.heading, table.rows)
     print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 

@@ -8,16 +8,15 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.table import Table
-from rich.text import Text
 
 from skytether.lab import figures
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, PoolFlags, Spent, crew, writing
 from skytether.lab.journal import Journal
 from skytether.lab.sweep import Done, Sweep, estimate, parse_axis, results
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
@@ -98,16 +97,15 @@ def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: S
             case _:
                 continue
         written.append(path.name)
-    table = Table(title=title, title_justify="left")
-    for heading in [axis.key for axis in plan.axes] + [name for name, _ in SHOWN.values()]:
-        table.add_column(Text(heading), justify="right", no_wrap=True)
+    rows = []
     for values, runs in zip(plan.cells, cells, strict=True):
         row = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
         for figure, (_, spec) in SHOWN.items():
             mean, half = estimate(runs, figure)
             row.append(_interval(mean, half, spec))
-        table.add_row(*map(Text, row))
-    terminal.show(table)
+        rows.append(row)
+    headings = [axis.key for axis in plan.axes] + [name for name, _ in SHOWN.values()]
+    tables.show(title, headings, rows)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
         print(f"{failed} runs found no server and count in no mean of the error")

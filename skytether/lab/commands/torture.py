@@ -11,14 +11,14 @@ from typing import Annotated
 
 import msgspec
 import tyro
-from rich.table import Table
 
+from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
-from skytether.shell import command, terminal
+from skytether.shell import command
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
@@ -159,11 +159,8 @@ def _finish(
             "failures": failed,
         }
         command.write(options.json, msgspec.json.encode(figures))
-    table = Table(title=title, title_justify="left", show_header=False)
-    table.add_row("flights", f"{len(done)}, {flown_s / 3600:.2f} h in virtual time")
-    for name, amount in sorted(counts.items()):
-        table.add_row(name, str(amount))
-    terminal.show(table)
+    rows = [("flights", f"{len(done)}, {flown_s / 3600:.2f} h in virtual time")]
+    tables.show(title, (), [*rows, *sorted(counts.items())])
     for outcome in failed[:TOLD_MAX]:
         print(f"seed {outcome.trial.seed}: {outcome.failure}")
         print(f"    skytether torture --schedule {shlex.quote(dumps(outcome.trial))}")

@@ -1,0 +1,28 @@
+"""Tables that commands print."""
+
+from collections.abc import Iterable, Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from skytether.shell import terminal
+
+
+def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print a table: the first column flush left, the others right, and nothing cut off.
+
+    Args:
+        headings: heading of each column; none for a table of names and values.
+    """
+    table = Table(
+        title=Text(title, style="table.title"),
+        title_justify="left",
+        min_width=len(title),
+        show_header=bool(headings),
+    )
+    for number, heading in enumerate(headings or ("", "")):
+        is_right = headings and number
+        table.add_column(Text(heading), justify="right" if is_right else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    terminal.show(table)
