@@ -122,7 +122,7 @@ class Compensator:
         self.follower = SplineFollower(self._constants, knots, spacing, length)
 
     def _put_in_force(self, made_for: int, observed: int) -> None:
-        """Let a horizon be in force from the step on that is chosen next."""
+        """Make a horizon the one in force, from the step on whose input is chosen next."""
         self.in_force = self.newest = self.begins = made_for
         self._new = True
         self.observed = observed

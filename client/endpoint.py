@@ -210,8 +210,8 @@ class Client(Endpoint):
     def _begin(self, now_ns: int) -> None:
         """Begin the flight once its first session is open and the vehicle can be flown.
 
-        '        A flight of an earlier life goes on at once, and the server is asked for a session
-                meanwhile: along the motion that was in force, or it hovers.
+        A flight of an earlier life goes on at once, and the server is asked for a session
+        meanwhile: along the motion that was in force, or it hovers.
         """
         before, flies = self._memory.before, self._flies
         if self._session.number is not None:

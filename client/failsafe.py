@@ -117,7 +117,8 @@ TABLE: Table = MappingProxyType(
     | _YIELDS
     | _FAULTS
 )
-"""Next mode by mode and cause; a mode may stay and its reason change."""
+"""Transition table of the failsafe: next mode by present mode and cause. Where the mode stays, only
+its reason changes."""
 
 HOLD: Table = MappingProxyType(
     {

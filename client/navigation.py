@@ -244,7 +244,8 @@ def has_leapt(
     noise_m: float,
     noise_mps: float,
 ) -> bool:
-    """Whether no vehicle can have come to what is measured; what is NaN has not leapt.
+    """Whether a measurement has jumped further than any vehicle could have moved; NaN has not
+    jumped.
 
     Args:
         position, velocity: of each axis, as they were measured last [m], [m/s].

@@ -41,8 +41,9 @@ TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 TRIGGER = keys_of(InFlight.TRIGGER)
 """Keys of when horizons are sent."""
 ZONES = keys_of(InFlight.ZONES)
-GOALS = keys_of(InFlight.GOALS)
 """Keys of where vehicles of a mission must not be."""
+GOALS = keys_of(InFlight.GOALS)
+"""Keys of where they are to fly."""
 POINT = keys_of(InFlight.POINT)
 """Keys of a point that is led by hand."""
 

@@ -199,7 +199,7 @@ class Sessions:
         return session
 
     def _number(self) -> int:
-        """Number of a new session, which nobody can guess, and as long on the wire as any other."""
+        """Random number for a new session, always of the same length on the wire."""
         # The highest bit is set, so that msgpack takes five bytes for every number.
         return int.from_bytes(self._entropy(4)) | 2**31
 

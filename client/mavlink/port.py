@@ -246,7 +246,7 @@ class Port(Endpoint):
 
     @property
     def took_off(self) -> bool:
-        """Whether it was armed in this life of the client."""
+        """Whether this run of the client has armed the autopilot."""
         return self._launch is not None and self._launch.took_off
 
     def recall(self, frame: Frame) -> None:

@@ -89,7 +89,7 @@ class Positions:
         self._boot_ms = 0
         """Time since the autopilot's boot of the newest measurement [ms]."""
         self.position: Vector | None = None
-        """Newest position in that frame, in our axes [m]."""
+        """Newest position in the autopilot's local frame, in our axes [m]."""
         self.velocity: Vector = (0.0, 0.0, 0.0)
         """Newest velocity, in our axes [m/s]."""
         self.came_ns: int | None = None

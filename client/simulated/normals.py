@@ -37,7 +37,7 @@ class Normals:
         return self._block[self._used - 1]
 
     def give_back(self) -> None:
-        """Leave the stream as if only the numbers of the steps that have passed were drawn."""
+        """Rewind the stream to just behind the numbers of the steps that were taken."""
         if self._used < len(self._block):
             self._rng.bit_generator.state = self._before
             self._rng.standard_normal((self._used, *self._shape))

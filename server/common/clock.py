@@ -63,7 +63,7 @@ class Contradiction(IntEnum):
     CLOCK = 1
     """The bounds by delays: a clock was set, or runs wrong."""
     ASYMMETRY = 2
-    """The operator's word on the difference of the delays."""
+    """The operator's bound `link.asymmetry_s` on the difference of the delays each way."""
     TIME_OF_DAY = 3
     """The time of day of one end."""
 

@@ -37,7 +37,8 @@ EMPTY = -1
 FOUND = -1
 """Result of a search in which no vehicle's page is missing."""
 TRAJECTORY = 2**40
-"""Number of pages that a trajectory may have, by which those of the next are told from them."""
+"""Distance between the keys of two trajectories: page p of trajectory t has the key t TRAJECTORY +
+p."""
 SPREAD = 31
 """Number of places from the first page of a trajectory to that of the next; odd, so that no two
 have the same."""

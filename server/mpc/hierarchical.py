@@ -176,7 +176,7 @@ class Planner:
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _batch_of(self, window: Window, found: Foresight) -> Batch:
-        """Batch of these arrays, which are the same ones from step to step."""
+        """Arguments of the planning kernels in one tuple, of the same arrays at every step."""
         return Batch(
             mpc=self._mpc,
             terminal_weight=self._terminal_weight,

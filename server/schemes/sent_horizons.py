@@ -154,7 +154,7 @@ def remember(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
-            # Just as `Compensator._hold` does it aboard: both ends have to brake from the same
+            # Just as `HorizonFollower` does it aboard: both ends have to brake from the same
             # speed.
             last = bounded(float(found.horizons[i, axis, length - 1]), settings.laws[axis].bound)
             squares += last * last

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-"""Flags of every file that is written: somebody may put a link or a pipe there just now."""
+"""Flags for files that are written: they guard against a link or a pipe in the file's place."""
 MODE = 0o666
 """Permissions of a new file, less the user's mask."""
 

@@ -61,7 +61,7 @@ CODES = {int: "i8", float: "f8", bool: "?"}
 
 
 def record(kind: type) -> np.dtype[np.void]:
-    """Dtype of records: numbers that travel together, as the annotations of a class name them."""
+    """Numpy dtype of a record, with a field for each annotation of a class."""
     fields = [(name, CODES[hint]) for name, hint in get_type_hints(kind).items()]
     return np.dtype(fields, align=True)
 

@@ -124,7 +124,7 @@ class Endpoint(ABC):
 
     @abstractmethod
     def wake(self, *, now_ns: int) -> None:
-        """Do what is due now (drivers may be late, and may be early)."""
+        """Do what is due now; the driver may call it early or late."""
 
     @abstractmethod
     def next_wake_ns(self) -> int | None:

@@ -109,7 +109,7 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process is told to fly a vehicle that goes on for ever once it hears nothing any more."""
+    """A vehicle is flown without a failsafe: with a lost link it keeps its last input for ever."""
 
     def __str__(self) -> str:
         flown = "without a packet it holds its last input for ever"
@@ -318,7 +318,7 @@ class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
     """Host that the refused vehicle's HELLO came from."""
     port: int
     holder: str
-    """HOST:PORT that the other vehicle is heard from."""
+    """HOST:PORT of the vehicle that uses this number already."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -363,7 +363,7 @@ class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
 
 
 class Unanswered(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has not heard the server so far, and goes on asking."""
+    """No answer from the server yet; the vehicle keeps asking."""
 
     host: str
     """Host that it says HELLO to."""

@@ -16,7 +16,7 @@ SPACING = 10
 INTERVALS = 12
 """Number of intervals that are planned."""
 JOIN_MAX = 3
-"""Largest number of intervals before these, in which a motion is the one that is flown already."""
+"""Largest number of intervals that a new motion takes over from the one that is flown."""
 SAMPLES = 4
 """Number of straight pieces that an interval of a motion is taken for."""
 MARGIN_M = 0.03

@@ -32,7 +32,7 @@ Figures = NDArray[np.void]
 
 
 class KnownArrays(NamedTuple):
-    """Arrays that situations are cut from, with room for a whole block of vehicles.
+    """Arrays of a block of vehicles, from which the `Situation` of a trigger takes its rows.
 
     Those of the situation come first; `sent_step` has a row for each vehicle there may be.
     """
@@ -211,7 +211,7 @@ def _each(n: int, number: float) -> Array:
 
 @lru_cache(maxsize=256)
 def _all_of(n: int) -> Flags:
-    """Flags that are set for each of n vehicles; read only, made once; shape (n,)."""
+    """Constant read-only array of n flags that are all True; shape (n,)."""
     flags = np.ones(n, dtype=np.bool_)
     flags.flags.writeable = False
     return flags

@@ -373,7 +373,7 @@ class Record:
     server: Rows
     netem: Rows
     failure: Failure | None = None
-    """Event after which a vehicle could not fly, the first vehicle's that has one."""
+    """Event that ended the flight of a vehicle, of the first vehicle that has one."""
     figures: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); of a flight in a
     batch, those at the end of the batch."""

@@ -127,8 +127,7 @@ class PilotedVehicle(ABC):
         self.estimates = True
         """Whether its position estimate is valid, once it is ready."""
         self.drift: Vector = REST
-        """Velocity at which it moves beside the one that it estimates, as with accelerometers that
-        have failed [m/s]."""
+        """True velocity minus the one it estimates, as where accelerometers have failed [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
         """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST

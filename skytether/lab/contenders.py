@@ -385,7 +385,7 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
 
 
 def _told(found: Found) -> dict[str, Any]:
-    """Keys of a result: the contender's own, and those that differ from the plant."""
+    """Keys for a result's file: the contender's, and those that differ from the plant."""
     here = dict(flat(reading.to_table(found.scenario)))
     own = {f"control.{key}": here[f"control.{key}"] for key in found.contender.control}
     return own | differences(found.scenario, found.case.plant)

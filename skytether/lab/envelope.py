@@ -333,8 +333,9 @@ def _faults(
 
 
 def _begun(covered: Flags, led: Flags) -> Any:
-    """Row at which the present stretch began, with planned inputs, led on, or without; shape
-    (steps,).
+    """Row at which the present stretch of one kind began; shape (steps,).
+
+    Kinds are: covered by planned inputs, following the feedback alone, and neither.
     """
     rows, kind = np.arange(len(covered)), covered + 2 * led
     changed = np.concatenate([[True], kind[1:] != kind[:-1]])

@@ -49,7 +49,7 @@ WIND_S, WIND_BUILDS_S = 60.0, 10.0
 SMALL = 0.05
 """Share of an input's bound up to which its answer to a push counts: no bound acts there."""
 STEPS_MIN = 10
-"""Least number of steps until then from which a growth can be read."""
+"""Fewest steps from the push to the end from which a rate of growth can be estimated."""
 WIND_ALONE = 0.1
 """Wind in which a vehicle is flown if its scenario has neither wind nor noise."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")

@@ -76,7 +76,7 @@ class Clocks:
 
 @dataclass(frozen=True, slots=True)
 class BottleneckRate:
-    """Rate of the narrowest part of a path."""
+    """Rate of a path's bottleneck; None if its packet trains give no finite rate."""
 
     bytes_per_s: float
     """Rate, headers of IP and UDP included [B/s]."""

@@ -21,7 +21,7 @@ RESOLUTION_S = 50e-6
 CONSTANT_S = 0.5e-3
 """Largest standard deviation of delays that are called constant [s]."""
 LEASTS = 60
-"""Number of lower bounds that are tried for a law that has one."""
+"""Number of candidates for the lower bound of a delay distribution that has one."""
 SLOTS = 4000
 """Number of slot lengths that are tried for the paper's law."""
 PAIRS_MIN = 20

@@ -269,10 +269,14 @@ def _clocks() -> tuple[int, int]:
     A process may lose its core between the two clocks: on a busy machine that moved stamps by 20
     ms. So they are read again unless they were read within NEAR_NS of each other.
     """
+    nearest: tuple[int, int, int] | None = None
     for _ in range(READINGS):
         before_ns = time.monotonic_ns()
         day_ns = time.time_ns()
         now_ns = time.monotonic_ns()
-        if now_ns - before_ns < NEAR_NS:
+        reading = now_ns - before_ns, day_ns - now_ns, now_ns
+        nearest = min(nearest or reading, reading)
+        if nearest[0] < NEAR_NS:
             break
-    return day_ns - now_ns, now_ns
+    assert nearest is not None
+    return nearest[1:]

@@ -522,7 +522,7 @@ def run(
 
 
 def _fault(context: dict[str, Any]) -> Fault:
-    """Exception that the loop has caught, as an event."""
+    """Event that reports an exception caught in the event loop."""
     error = context.get("exception")
     trace = traceback.format_exception(error) if error else [context["message"]]
     return Fault(traceback="".join(trace))

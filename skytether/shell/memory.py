@@ -168,7 +168,7 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Why nothing can be written, where it was not told before."""
+        """Event that says why the file cannot be written; None if it can, or it was said before."""
         failure, told = self._failure, self._told
         self._told = failure
         return NotKept(reason=failure) if failure and failure != told else None

@@ -95,7 +95,7 @@ def loaded() -> tuple[Plugin, ...]:
 
 
 def flags() -> list[str]:
-    """Arguments with which a process imports the same files."""
+    """Command-line arguments with which a child process loads the same plug-ins."""
     return [word for path in _loaded for word in (FLAG, path)]
 
 

@@ -111,8 +111,8 @@ class Host:
 
 
 ACTION, ARRIVAL = -1, 0
-"""Ranks of an action and of a datagram within an instant: actions come first, and arrivals are
-received before any host is woken."""
+"""Priorities at one instant: actions run before datagrams arrive, and these before any host is
+woken."""
 
 
 class Act(Protocol):
@@ -325,7 +325,7 @@ class World:
         self._after(host, self.now_ns)
 
     def _after(self, host: Host, leaves_ns: int) -> None:
-        """Let a host's datagrams leave, report its events, and arm its next wake."""
+        """Send the datagrams that a host has queued, report its events, and set its next wake."""
         endpoint = host.endpoint
         if endpoint.keeps:
             now_ns = host.clock.local(self.now_ns)

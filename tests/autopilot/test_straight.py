@@ -318,13 +318,13 @@ def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> au
 
 def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
     flights = [
-        flight("led", "wind", 0, rmse_xy=0.1, uplink_packets=80),
-        flight("led", "wind", 1, rmse_xy=0.2, uplink_packets=120),
+        flight("velocity", "wind", 0, rmse_xy=0.1, uplink_packets=80),
+        flight("velocity", "wind", 1, rmse_xy=0.2, uplink_packets=120),
     ]
     ((name, table),) = autopilots.tables(flights).items()
     assert name == "px4 wind"
     ((*row,),) = table.rows
-    assert row[:4] == ["led", "0.150", "0.100 to 0.200", "1.00"]
+    assert row[:4] == ["velocity", "0.150", "0.100 to 0.200", "1.00"]
     assert (row[4], *row[-2:]) == ("25.0", "1.00", "1 of 2")
 
 

@@ -158,7 +158,7 @@ def _value(word: str) -> float | str:
 
 
 def _text(parts: tuple[Part, ...], change: Callable[[str], str] = str) -> str:
-    """Parts as a text again, every argument written."""
+    """Parts as a text, with every argument written out."""
     texts = []
     for name, values in parts:
         shown = [

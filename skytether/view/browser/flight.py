@@ -38,7 +38,7 @@ class PageFlight:
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
-        """Take a frame; a frame that makes no sense is dropped."""
+        """Process a frame; a malformed one is dropped."""
         with self.lock, contextlib.suppress(ValueError):
             self.state.take(process, frame)
         changed = (
