@@ -229,8 +229,14 @@ class Reception:
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
         session.hearing.hear(observation.number, observation.step)
         self.observations += 1
-        heard = observation.heard
-        found = self._clock.observe(row, forward_ns, backward_ns, heard=heard, now_ns=now_ns)
+        found = self._clock.observe(
+            row,
+            forward_ns,
+            backward_ns,
+            heard=observation.heard,
+            now_ns=now_ns,
+            is_newest=observation.step > self._controller.observed_step[row],
+        )
         self._tell_of_clock(session.vehicle, found)
         if not self._controller.observe(row, observation):
             session.stale += 1

@@ -186,14 +186,23 @@ class ClockMap:
         self._lives[row] = life
 
     def observe(
-        self, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
+        self,
+        row: int,
+        forward_ns: int,
+        backward_ns: int,
+        *,
+        heard: int,
+        now_ns: int,
+        is_newest: bool = True,
     ) -> Contradiction:
         """Take one F and one G of a vehicle, received at `now_ns`; what they contradict.
 
         Args:
             heard: another number for each packet of ours that G is of.
+            is_newest: whether they are of a newer observation than all before: of the echo of an
+                older one it is not known when it was had.
         """
-        sample = forward_ns, backward_ns, heard, self._asymmetry_ns, now_ns
+        sample = forward_ns, backward_ns, heard, is_newest, self._asymmetry_ns, now_ns
         return Contradiction(_observe(self.seen, row, *sample))
 
     def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
@@ -363,7 +372,7 @@ def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now:
     """Narrow the bounds of a vehicle's clock offset by F and G [ns]; what these contradict.
 
     Args:
-        is_new: whether G is of another echo than the one before.
+        is_new: whether G is of an echo that no observation before has told of.
         now: our time [ns].
     """
     vehicle = seen.vehicles[row]
@@ -389,13 +398,21 @@ def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now:
 
 @kernel
 def _observe(
-    seen: Seen, row: int, forward: int, backward: int, heard: int, asymmetry: int, now: int
+    seen: Seen,
+    row: int,
+    forward: int,
+    backward: int,
+    heard: int,
+    is_newest: bool,
+    asymmetry: int,
+    now: int,
 ) -> int:
     """Take F and G [ns] of a vehicle, received at a time of our clock [ns]; what they
     contradict.
     """
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
-    found = _bound(seen, row, forward, backward, heard != vehicle.heard, now)
+    is_new = is_newest and heard != vehicle.heard
+    found = _bound(seen, row, forward, backward, is_new, now)
     # The same echo told once more is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard

@@ -229,7 +229,9 @@ class MissionPlanner(Scheme):
             return f"zones before it is known where vehicle {number} is"
         for row, vehicle in self._state.vehicles.items():
             clearance_m = (
-                self._clearances.tube_m + self._clearances.bend_m + self._state.brakes_m(vehicle)
+                self._clearances.tube_m
+                + self._clearances.bend_m
+                + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
                 # The earliest step that the vehicle may be at.

@@ -227,20 +227,27 @@ class MissionState:
         if observation.in_force == NO_HORIZON:
             # It hovers, or comes to rest, where it is: nothing else was ever taken, or all ended.
             vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
+            vehicle.is_foreign = False
             # Nor is anything taken that was sent in an earlier session.
             if not observation.takes or not self.rows.heard[row]:
                 vehicle.sent.clear()
         elif vehicle.in_force is None or vehicle.in_force.step != observation.in_force:
             taken = next((each for each in vehicle.sent if each.step == observation.in_force), None)
+            vehicle.is_foreign = taken is None
             if taken is None:  # of another server, or of a vehicle that was in this row before
                 self.rows.unknown_until[row] = observation.in_force + LONGEST
                 taken = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
             vehicle.in_force = taken
-        if k <= self.rows.unknown_until[row]:
+        flies_on = k <= self.rows.unknown_until[row]
+        if flies_on:
             self.foreign = row
+        if flies_on or vehicle.is_foreign:
+            # Also at the first observation after that motion has ended: it rests there, and not
+            # where it was observed before, on its way.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
+            vehicle.is_foreign = flies_on
         self._expect_landing(row, observation)
         newest, motion = vehicle.in_force
         self._measure(row, vehicle, motion.at(np.array([float(k)]), self._dt_s)[0][0])
@@ -266,7 +273,8 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            case Mode.HOVER if lands[row] < NEVER:
+            # In its first observation it may be another life, which counts steps of its own.
+            case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
                 # It may have hovered in silence for long, but not since before an earlier step.
                 lands[row] = max(lands[row], k)
             case Mode.HOVER | Mode.LAND | Mode.MANUAL | Mode.FAULT:

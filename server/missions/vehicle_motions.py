@@ -43,6 +43,9 @@ class VehicleMotions:
     def __init__(self) -> None:
         self.in_force: SentMotion | None = None
         """Motion that it flies, with its packet's step; None before the first observation."""
+        self.is_foreign = False
+        """Whether `in_force` stands for a motion of another server: the vehicle rests where it was
+        observed last, or is still on its way."""
         self.sent: deque[SentMotion] = deque(maxlen=64)
         """Motions sent after that, oldest first, that may still be taken."""
         self.next: Motion | None = None

@@ -133,6 +133,11 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     most_s = JOIN_MAX * SPACING * control.dt
     if not 0.0 < link.join_s <= most_s + TINY:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
+    mission = scenario.mission
+    if 0.0 < mission.height_m < mission.separation_m - TINY:
+        # Tubes are as high as wide: in a metric that is stretched upwards they would not fit.
+        expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
+        yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
         expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected

@@ -308,7 +308,8 @@ class MissionConfig(Section, frozen=True):
     separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance of two that are one above the other [m], for downwash; 0: the same."""
+    """Smallest distance of two that are one above the other [m], for downwash: 0, for the same, or
+    at least `separation_m`."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking."""
     speed_mps: OfServer[Strength] = 0.0

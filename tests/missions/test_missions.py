@@ -515,13 +515,18 @@ def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
 
 
 def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
-    """Up to there the vehicle may be anywhere; it is taken for where it was seen last."""
-    made, until = alone(), 70 + LONGEST
-    for step, x, taken_x in ((100, -4.0, -4.0), (until, -3.5, -3.5), (until + 1, -3.0, -3.5)):
-        made.observe(1, observation(step, 70, (x, 0.0)))
-        vehicle = made._state.vehicles[1].in_force
-        assert vehicle is not None
-        assert vehicle.motion.position[-1].tolist() == [taken_x, 0.0]
+    """Up to there the vehicle may be anywhere; from the first observation after it, it rests."""
+    until = 70 + LONGEST
+    for steps in ((100, until, until + 1, until + 2), (100, until + 100, until + 101)):
+        made, x = alone(), -4.0
+        for step in steps:
+            x += 0.5
+            made.observe(1, observation(step, 70, (x, 0.0)))
+            vehicle = made._state.vehicles[1]
+            assert vehicle.in_force is not None
+            rests_x = x if step != steps[-1] else x - 0.5
+            assert vehicle.in_force.motion.position[-1].tolist() == [rests_x, 0.0]
+            assert vehicle.is_foreign == (step <= until)
 
 
 def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
@@ -1095,6 +1100,11 @@ def test_when_a_vehicle_may_begin_to_land(
     assert mission.lands(0) == lands
     mission.rows.ahead[0] = 40
     assert mission.lands(0) == lands - 40
+    # Another life counts steps of its own: of one that hovers nothing is known but that.
+    mission.forget(0)
+    hovers = Observation(1, 2, 60, NO_HORIZON, 0, 0, 0, Mode.HOVER, 1, state, NO_INPUT)
+    assert mission.observe(0, hovers)
+    assert mission.lands(0) == 60 - 40
 
 
 @pytest.mark.parametrize(
@@ -1251,6 +1261,12 @@ def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
     ("section", "key", "value", "said"),
     [
         ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0, and at most 1.5 s"),
+        (
+            "mission",
+            "height_m",
+            0.4,
+            "mission.height_m: got 0.4, expected 0, or at least mission.separation_m (0.5)",
+        ),
         ("link", "join_s", 2.0, "link.join_s: got 2.0, expected more than 0, and at most 1.5 s"),
         ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s on a mission"),
         ("control", "trigger", "always", "control.trigger: got 'always', expected 'expected_gap'"),

@@ -291,6 +291,17 @@ def test_a_word_of_ours_that_is_echoed_again_is_no_new_echo() -> None:
     assert shortest_ms(clock) == -1.0
 
 
+def test_an_echo_that_is_overtaken_bounds_nothing() -> None:
+    """It may be as old as the silence before it, in which the clocks drift."""
+    clocks = [ClockMap(1, DT_NS) for _ in range(2)]
+    for clock, in_order in zip(clocks, (True, False), strict=True):
+        clock.observe(0, 400 * MS, 400 * MS, heard=1, now_ns=10 * S)
+        clock.observe(0, 400 * MS, 400 * MS, heard=3, now_ns=40 * S)
+        high_ns = int(clock.seen.vehicles["high"][0])
+        clock.observe(0, 400 * MS, 380 * MS, heard=2, now_ns=41 * S, is_newest=in_order)
+        assert (int(clock.seen.vehicles["high"][0]) < high_ns) == in_order
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_offset_is_right_to_half_a_step_on_the_papers_network(seed: int) -> None:
     """(17) each way, one packet in ten lost, for a minute: below 25 ms once a second has passed."""
