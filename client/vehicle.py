@@ -37,7 +37,8 @@ class Measurement(NamedTuple):
         if position is None or velocity is None:
             missing = [math.nan] * len(position or velocity or ())
             position, velocity = position or missing, velocity or missing
-        return np.array((position, velocity))
+        # Of this type whatever a vehicle measures in: machine code takes it for that unasked.
+        return np.array((position, velocity), dtype=np.float64)
 
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]

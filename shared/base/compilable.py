@@ -17,7 +17,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 Numbers = Annotated[NDArray[np.float64], 1]
 """Numbers one after the other; the 1 tells the compiler the number of dimensions."""
 Table = Annotated[NDArray[np.float64], 2]
-"""Rows of numbers, contiguous."""
+"""Numbers in rows of equal length, one row after the other in memory."""
 
 COMPILABLE: list[Any] = []
 """All functions marked so far."""

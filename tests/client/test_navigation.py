@@ -534,6 +534,17 @@ def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
     np.testing.assert_allclose(known.predicted, known.estimate, atol=1e-9)
 
 
+def test_what_is_measured_in_whole_numbers_is_a_number_like_any_other() -> None:
+    """A vehicle of one's own may tell [3, 0]: kernels read floats where integers would be."""
+    whole: list[float] = [3, 0]
+    known = Navigation(scenario(sensor=NOISE))
+    for step in range(2):
+        now_ns = step * DT_NS
+        known.advance([Measurement(now_ns, whole, [0, 0])], np.zeros(2), now_ns=now_ns)
+    assert known.measured.dtype == np.float64
+    np.testing.assert_allclose(known.estimate, [[3.0, 0.0], [0.0, 0.0]], atol=1e-9)
+
+
 def test_a_vehicle_without_a_position_is_not_known() -> None:
     known = Navigation(scenario())
     known.advance([Measurement(0, None, [1.0, 0.0])], np.zeros(2), now_ns=0)
