@@ -199,10 +199,8 @@ def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ablation: what every packet takes just now is not known: no `at_least`, no `Idle.DELAY`."""
     observe = ClockMap.observe
 
-    def deaf(
-        self: ClockMap, row: int, forward_ns: int, backward_ns: int, *, heard: int, now_ns: int
-    ) -> Contradiction:
-        return observe(self, row, forward_ns, backward_ns, heard=0 * heard, now_ns=now_ns)
+    def deaf(self: ClockMap, row: int, *ways_ns: int, heard: int, **told: Any) -> Contradiction:
+        return observe(self, row, *ways_ns, heard=0 * heard, **told)
 
     monkeypatch.setattr(ClockMap, "observe", deaf)
 
