@@ -112,7 +112,11 @@ class Airspace:
 
     def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch | None = None) -> None:
         self.server = Server(
-            scenario, boot_id=1, entropy=stream(1, "entropy").bytes, room=count, stopwatch=stopwatch
+            scenario,
+            boot_id=1,
+            entropy=stream(1, "entropy").bytes,
+            capacity=count,
+            stopwatch=stopwatch,
         )
         self._vehicles = Vehicles(scenario, count)
         self._dt_ns = scenario.dt_ns

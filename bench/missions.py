@@ -278,7 +278,7 @@ class MortalServer(Endpoint):
     def _begin(self) -> Server:
         self._lives += 1
         entropy = stream(self._scenario.seed, "mortal", self._lives).bytes
-        return Server(self._scenario, boot_id=self._lives, entropy=entropy, room=self._room)
+        return Server(self._scenario, boot_id=self._lives, entropy=entropy, capacity=self._room)
 
     def _alive(self, now_ns: int) -> Server | None:
         """The server that lives now; None while there is none."""

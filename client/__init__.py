@@ -1,1 +1,3 @@
-"""The vehicle's side: choose an input from the horizons that arrived, fly it, report the state."""
+"""The client: receives horizons, chooses the input of each step, flies it, and reports the
+state.
+"""

@@ -22,8 +22,8 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.client.fleet import Fleet, apart_ns
 from skytether.client.link import ClientLink, PlainLink
-from skytether.client.memory import Kept, recall
-from skytether.client.vehicle import Frame, Vehicle
+from skytether.client.memory import SavedState, recall
+from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.core.aboard import ParametersUnsafe
 from skytether.shared.core.events import (
     Event,
@@ -55,35 +55,34 @@ class ClientOptions(ProcessOptions):
     server: str = "127.0.0.1:47000"
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
     number: Annotated[int, Argument(name="id")] = 1
-    """Number of this vehicle (0 to 65535); no two vehicles of a server may have the same."""
+    """Number of this vehicle (0 to 65535), unique among the vehicles of a server."""
     vehicles: Annotated[int, Argument(metavar="N")] = 1
     """Number of vehicles to fly in this process, numbered from --id on."""
     keys: Path | None = None
     """File with the vehicle's key, made by `skytether keygen`. Without it the link is plaintext,
-    which is refused where another machine is the server."""
+    which is refused unless the server is on this machine."""
     key_id: Annotated[int | None, Argument(metavar="N")] = None
-    """Number of the key to use, of a vehicle that has two; the highest unless given."""
+    """Number of the key to use if the vehicle has two; by default the highest."""
     set_parameters: bool = False
-    """Set the autopilot's parameters for the case that set-points stop, where their values are
-    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
-    armed."""
+    """If the autopilot reacts unsafely to set-points that stop, set its parameters to safe values.
+    Without --set-parameters, unsafe values are only reported, and the vehicle is not armed."""
     insecure: bool = False
-    """Do without keys even where the server is another machine: anybody on the way can fly the
+    """Accept a plaintext link to another machine: anybody on the network between can fly the
     vehicle."""
     json: Path | None = None
-    """File for the summary of the flight, as far as the vehicle knows it; of several vehicles, for
-    what was counted, and the CPU time it took."""
+    """File for the client's summary of the flight; for several vehicles, for counters and CPU
+    time."""
     new_flight: bool = False
-    """Begin a new flight: what an earlier run has kept in `vehicle.memory`, and what was set in
-    flight, does not count. A person says so; the command of a service must not."""
+    """Begin a new flight: ignore what an earlier run saved in `vehicle.memory` and what was set in
+    flight. Give it by hand only, never in the command of a service."""
 
 
 def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
 
-    SIGUSR1 prints what was counted so far. The exit code is 1 where no server answers, where there
-    was never a plan to fly, or none at the end, and where the record is incomplete; 2 where the
-    server flies another scenario, is full, or has another client under this number.
+    SIGUSR1 prints the counters so far. The exit code is 1 if no server answers, if there was no
+    plan to fly at any time or at the end, or if the record is incomplete; 2 if the server flies
+    another scenario, is full, or has another client with this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
     server = command.address("--server", options.server)
@@ -119,7 +118,9 @@ def fly(argv: Sequence[str]) -> None:
         flying = [vehicles.make(scenario, number) for number in numbers]
         memory = stack.enter_context(_memory(options, flying, keyring))
         before = _before(memory, scenario, numbers[0], running.warnings) if memory else None
-        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # what flies has some
+        if kernel := sys.modules.get(
+            "skytether.shared.base.kernel"
+        ):  # a vehicle with compiled functions is used
             terminal.prepare(kernel.missing())
             kernel.load()
         line = None
@@ -177,13 +178,13 @@ def fly(argv: Sequence[str]) -> None:
 def _memory(
     options: ClientOptions, flying: Sequence[Vehicle], keyring: Keyring | None
 ) -> Iterator[MemoryFile | None]:
-    """Memory of the vehicle; None where its scenario wants none.
+    """File that keeps the client's state for its next run; None if the scenario wants none.
 
     Raises:
-        CommandError: it cannot be kept, or another process keeps it.
+        CommandError: the file cannot be written, or another process uses it.
     """
-    given, number = options.config.vehicle.memory, options.number
-    if given == "none" or (given == "auto" and flying[0].port is None):
+    setting, number = options.config.vehicle.memory, options.number
+    if setting == "none" or (setting == "auto" and flying[0].port is None):
         yield None
         return
     if len(flying) > 1:
@@ -195,7 +196,7 @@ def _memory(
         "autopilot": options.config.vehicle.address,
         "terms": blake2b(repr(options.config.terms()).encode(), digest_size=8).hexdigest(),
     }
-    path = folder(given) / f"client-{number}"
+    path = folder(setting) / f"client-{number}"
     try:
         memory = MemoryFile(path, identity, key.mac if key else b"")
         if options.new_flight:
@@ -209,16 +210,16 @@ def _memory(
 
 def _before(
     memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
-) -> Kept | None:
-    """What an earlier life has kept, and what there is to say of it."""
+) -> SavedState | None:
+    """State saved by an earlier run; whether it was usable is added to `warnings`."""
     try:
-        found = memory.read()
-        if found is None:
+        saved = memory.read()
+        if saved is None:
             return None
-        before = recall(*found, time.monotonic_ns(), scenario.terms())
+        before = recall(*saved, time.monotonic_ns(), scenario.terms())
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
-        # It may have been armed: nothing is, before a person says so.
-        return Kept(frame=Frame(armed=True))
+        # The vehicle may have been armed, so nothing arms it before an operator does.
+        return SavedState(frame=VehicleMemory(armed=True))
     warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
     return before

@@ -1,13 +1,14 @@
-"""Last clamp before the plant: bounds any input, whichever part of the client chose it.
+"""Last clamp before the plant: bounds every input, whichever part of the client chose it.
 
-It shares no code with what reads a packet or chooses an input, so that a mistake there ends here.
+It shares no code with packet decoding or the choice of the input, so that a mistake there stops
+here.
 """
 
 import math
 from collections.abc import Sequence
 
 ROUNDING = 1e-9
-"""Excess of speed that is rounding alone [m/s]."""
+"""Excess of speed that is put down to rounding [m/s]."""
 
 
 def clamped(
@@ -16,30 +17,30 @@ def clamped(
     u_max: Sequence[float],
     change_max: float,
     *,
-    told: Sequence[float],
+    without_feedback: Sequence[float],
     speed_max: float = math.inf,
 ) -> list[float] | None:
-    """The input that may be flown [m/s], or None where it is not finite on some axis.
+    """The input that may be flown [m/s], or None if it is not finite on some axis.
 
     Args:
-        wanted: input that was chosen, of each axis [m/s].
-        before: input that was flown until now, of each axis, within `u_max` [m/s].
+        wanted: chosen input of each axis [m/s].
+        before: input flown at the previous step, of each axis, within `u_max` [m/s].
         u_max: bound of each axis [m/s].
         change_max: largest change from `before` on an axis [m/s]; may be infinite.
-        told: part of it that is no feedback, of each axis [m/s].
-        speed_max: bound of the magnitude of this part over all axes, within `ROUNDING` [m/s].
+        without_feedback: part of `wanted` that is not feedback, of each axis [m/s].
+        speed_max: bound of the magnitude of that part over all axes, within `ROUNDING` [m/s].
     """
-    # Before any min and max: with a NaN their result depends on the order of their arguments.
-    if not all(map(math.isfinite, (*wanted, *told))):
+    # Before any min and max, whose results depend on the order of arguments if one is NaN.
+    if not all(map(math.isfinite, (*wanted, *without_feedback))):
         return None
     excess = 0.0
     if speed_max < math.inf:
-        speed = math.hypot(*told)
+        speed = math.hypot(*without_feedback)
         excess = 1.0 - speed_max / speed if speed > speed_max + ROUNDING else 0.0
     flown = []
-    for u, part, last, most in zip(wanted, told, before, u_max, strict=True):
+    for u, part, last, most in zip(wanted, without_feedback, before, u_max, strict=True):
         near = min(max(u - excess * part, last - change_max), last + change_max)
-        # The bound comes last and so always holds; `before` is within it, so that the largest
-        # change holds too.
+        # The bound comes last and so always holds. `before` is within it, so the largest change
+        # holds too.
         flown.append(min(max(near, -most), most))
     return flown

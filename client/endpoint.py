@@ -1,8 +1,8 @@
-"""The client as an endpoint: one vehicle, which at every step flies, tells its state, and listens.
+"""The client as an endpoint: one vehicle that flies, reports its state and receives at every step.
 
-`session` is its conversation with the server, `pilot` flies it, and `failsafe` decides what it does
-at all, by what either of them meets. Here they are put together. A lost server changes nothing in
-the flight's clock, which is the client's own.
+It combines `session` (the conversation with the server), `pilot` (which flies the vehicle) and
+`failsafe` (which decides what the vehicle may do). The flight runs on the client's own clock, so
+losing the server does not change its steps.
 """
 
 from collections import Counter
@@ -14,7 +14,7 @@ import msgspec
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
 from skytether.client.link import ClientLink, PlainLink
-from skytether.client.memory import FlownMotion, Kept, Memory
+from skytether.client.memory import ClientMemory, FlownMotion, SavedState
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
@@ -47,40 +47,41 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
 
 VEHICLE_SOCKET = 1
-"""Number of the socket through which the vehicle's own port talks; the server's is 0."""
+"""Socket used by the vehicle's own port; the server's is 0."""
 ARMED = keys_of(InFlight.ARMED)
-"""Key with which a person says that plans may be flown."""
+"""Key with which an operator allows plans to be flown."""
 WAITED_NS = 2 * SECOND_NS
-"""Time after which it is said what a vehicle waits for that cannot be flown yet [ns]."""
+"""Delay before the log says what a vehicle waits for that cannot be flown yet [ns]."""
 SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent [ns].
 
-It answers two HELLOs a second: of eight, one comes through a network that loses a fifth each way.
-"""
+The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
+of the packets each way."""
 HELD_AGAIN_NS = 5 * SECOND_NS
-"""Time after which it is said again that the fence holds the vehicle back [ns]."""
+"""Time after which the log repeats that the fence limits the vehicle [ns]."""
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
-"""Key with which an operator says which frame counts after a leap."""
+"""Key with which an operator says which frame to use after a leap."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
-"""Time after which the time of day is told again [ns], and the largest error that can be [µs]."""
+"""Interval between two reports of the time of day [ns], and the largest error that fits in one
+[µs]."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
-"""Reasons that do not say why there is no newer horizon."""
+"""Reasons for a mode that do not explain why there is no newer horizon."""
 
 
 class Client(Endpoint):
     """Endpoint of one vehicle.
 
     Args:
-        scenario: the server's, as far as it makes the terms of a flight.
-        flies: what flies.
-        server: address of the server, or of the netem before it.
-        vehicle: number of the vehicle, unlike that of any other vehicle of the server.
-        boot_id: number that no other life of this vehicle has had.
-        link: how messages become datagrams.
-        recorder: takes one row a step.
-        keeps: whether what the next life must know is kept, see `client.memory`.
-        before: what the life before has kept; None of none.
+        scenario: scenario of the vehicle; its terms must equal the server's.
+        flies: the vehicle, simulated or real.
+        server: address of the server, or of the netem in front of it.
+        vehicle: number of the vehicle, unique among the vehicles of the server.
+        boot_id: number unique to this run of the client.
+        link: converts messages to datagrams.
+        recorder: receives one row per step.
+        keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
+        before: state saved by the previous run of the client; None if there was none.
     """
 
     def __init__(
@@ -94,12 +95,12 @@ class Client(Endpoint):
         link: ClientLink | None = None,
         recorder: Recorder | None = None,
         keeps: bool = False,
-        before: Kept | None = None,
+        before: SavedState | None = None,
     ) -> None:
         super().__init__()
         terms = scenario.terms()
         self.keeps = keeps or before is not None
-        self._memory = Memory(terms, boot_id, before)
+        self._memory = ClientMemory(terms, boot_id, before)
         self._is_mission, self._axes = bool(terms.join), terms.axes
         self.vehicle, self._server = vehicle, server
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
@@ -108,9 +109,9 @@ class Client(Endpoint):
             flies.recall(before.frame)
         self.changeable = flies.changeable | ARMED | LEAP
         if scenario.vehicle.after_leap != "ask":
-            given = scenario.vehicle.after_leap
+            setting = scenario.vehicle.after_leap
             expected = "expected 'ask': it is chosen in flight"
-            raise ConfigError(f"{AFTER_LEAP}: got {given!r}, {expected}")
+            raise ConfigError(f"{AFTER_LEAP}: got {setting!r}, {expected}")
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
@@ -134,34 +135,34 @@ class Client(Endpoint):
         )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
-        """Event with which a flight ends that has had no plan."""
+        """Event at the end of a flight that had no plan."""
         self._land_after_s = scenario.vehicle.land_after_s
-        self._leap_told: tuple[float, ...] | None = None
-        """Leap that was told."""
-        self._waits_for, self._waits_ns, self._told_wait = "", 0, ""
-        """What is missing before it can be flown, since when, and what of that was said last."""
+        self._reported_leap: tuple[float, ...] | None = None
+        """Latest leap that was reported."""
+        self._waits_for, self._waits_ns, self._reported_wait = "", 0, ""
+        """What is missing before the vehicle can be flown, since when, and what of that was
+        logged."""
         self._welcomed: int | None = None
-        """Number of the session that was told, of a vehicle that is not flown yet."""
+        """Number of the session that was reported while the vehicle is on the ground."""
         self._silent_ns: int | None = None
-        """Time of the newest packet of a server that was said to be silent."""
-        self._held_ns = 0
-        """Time before which it is not said again that the fence holds the vehicle."""
+        """Time of the newest packet before the server was reported as silent; None if it is not."""
+        self._fence_report_ns = 0
+        """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
-        """Time of day; None where the host does not know it."""
+        """Time of day; None if the host does not know it."""
         self._is_mission, self._time_due_ns = scenario.is_mission, 0
         self.horizons = 0
-        """Number of horizons received."""
         self.dropped: Counter[Drop] = Counter()
-        """Number of datagrams dropped, by reason."""
+        """Number of dropped datagrams by reason."""
 
     @property
     def failure(self) -> Failure | None:
-        """Event after which there can be no flight, or that has ended it."""
+        """Event that ended the flight or prevents it."""
         return self._flies.failure or self._session.failure or self._not_flown
 
     @property
     def finished(self) -> bool:
-        """Whether the flight has ended and the vehicle is down, or cannot begin."""
+        """Whether the flight has ended, or cannot begin, and the vehicle is down."""
         pilot = self._pilot
         if pilot.next_ns is not None:
             return pilot.step >= pilot.steps and self._flies.is_down
@@ -169,29 +170,29 @@ class Client(Endpoint):
 
     @property
     def missed(self) -> int:
-        """Steps slept through."""
+        """Number of steps missed because the process was delayed."""
         return self._pilot.missed
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns], or 0 before any."""
+        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._pilot.began_ns
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
+        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._pilot.disturbance
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Take what is said in this session; drop and count anything else.
+        """Process a datagram of this session; drop and count any other.
 
-        What comes to the socket of the vehicle's own port is for that.
+        Datagrams on the socket of the vehicle's own port are passed on to that port.
         """
         if datagram.socket == VEHICLE_SOCKET and self._port is not None:
             self._port.receive(datagram, now_ns=now_ns)
             self._attend(self._port, now_ns)
             return
-        # Before anything is opened: a stranger's packet costs one comparison.
+        # Before decryption: a packet from another address costs one comparison.
         if datagram.peer != self._server:
             self.dropped[Drop.ELSEWHERE] += 1
             return
@@ -199,7 +200,7 @@ class Client(Endpoint):
             horizon = self._session.hear(datagram.payload, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
-            elif self._failsafe.mode is Mode.INIT:  # it has gone on before there was a session
+            elif self._failsafe.mode is Mode.INIT:  # the flight went on before there was a session
                 self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)
@@ -208,10 +209,10 @@ class Client(Endpoint):
             self.dropped[error.reason] += 1
 
     def _begin(self, now_ns: int) -> None:
-        """Begin the flight once its first session is open and the vehicle can be flown.
+        """Begin the flight once the first session is open and the vehicle can be flown.
 
-        A flight of an earlier life goes on at once, and the server is asked for a session
-        meanwhile: along the motion that was in force, or it hovers.
+        The flight of an earlier run continues at once, while the client asks for a session: the
+        vehicle follows the motion that was in force, or hovers.
         """
         before, flies = self._memory.before, self._flies
         if self._session.number is not None:
@@ -232,10 +233,10 @@ class Client(Endpoint):
 
     # -- what is kept ------------------------------------------------------------------------
 
-    def _to_keep(self) -> Kept:
-        """What the next life needs to know now."""
+    def _to_keep(self) -> SavedState:
+        """State that the next run of the client would need."""
         pilot, compensator = self._pilot, self._pilot.compensator
-        if pilot.next_ns is None:  # the flight of the life before may still go on
+        if pilot.next_ns is None:  # the flight of the previous run may still continue
             return msgspec.structs.replace(self._memory.before, frame=self._flies.frame)
         motion = None
         flown = compensator.follower
@@ -247,7 +248,7 @@ class Client(Endpoint):
                 spacing=flown.spacing,
                 numbers=flown.sent.tobytes(),
             )
-        return Kept(
+        return SavedState(
             boot_id=self._memory.boot_id,
             began_ns=pilot.began_ns,
             heard_ns=self._failsafe.heard_ns or pilot.began_ns,
@@ -264,7 +265,9 @@ class Client(Endpoint):
         self._memory.kept()
 
     def next_wake_ns(self) -> int | None:
-        """Start of the next step, before the first the time of the next HELLO, or the port's."""
+        """Start of the next step, time of the next HELLO before the flight, or the wake of the
+        port.
+        """
         due_ns = self._due_ns()
         if self._port is None or self.finished:
             return due_ns
@@ -272,7 +275,6 @@ class Client(Endpoint):
         return port_ns if due_ns is None else min(due_ns, port_ns or due_ns)
 
     def _due_ns(self) -> int | None:
-        """Time at which the flight itself needs to be woken."""
         pilot = self._pilot
         if pilot.next_ns is not None:
             return pilot.next_ns if pilot.step < pilot.steps else None
@@ -281,7 +283,7 @@ class Client(Endpoint):
         return self._session.hello_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """Fly the step that is due, and say HELLO where nobody is heard."""
+        """Fly the step that is due, and send a HELLO if the server is not heard."""
         if self._port is not None:
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
@@ -301,16 +303,18 @@ class Client(Endpoint):
             self._attend(self._port, now_ns)
 
     def _attend(self, port: Endpoint, now_ns: int) -> None:
-        """Hand on what the vehicle's port wants sent and said; its vehicle may be up now."""
+        """Pass on datagrams and events of the vehicle's port; begin the flight if the vehicle is
+        up.
+        """
         if self._pilot.next_ns is None:
             self._begin(now_ns)
         if self._pilot.next_ns is None and not self.failure:
             self._watch_ground(now_ns)
-        self._out += [Datagram(said, peer, VEHICLE_SOCKET) for said, peer, _ in port.outbox()]
+        self._out += [Datagram(payload, peer, VEHICLE_SOCKET) for payload, peer, _ in port.outbox()]
         self._events += port.events()
 
     def _watch_ground(self, now_ns: int) -> None:
-        """Say what a vehicle waits for that is not flown yet, and how its link is meanwhile."""
+        """Report what a vehicle on the ground waits for, and the state of its link."""
         session, (host, port) = self._session, self._server
         waits_for = self._flies.waits_for
         if session.number is None:
@@ -323,13 +327,13 @@ class Client(Endpoint):
             self._watch_link(now_ns)
         if waits_for != self._waits_for:
             self._waits_for, self._waits_ns = waits_for, now_ns
-        if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._told_wait:
-            self._told_wait = waits_for
+        if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._reported_wait:
+            self._reported_wait = waits_for
             if waits_for:
                 self._events.append(AutopilotWaits(vehicle=self.vehicle, waits_for=waits_for))
 
     def _watch_link(self, now_ns: int) -> None:
-        """Say that the server is silent, and that it is heard again."""
+        """Report when the server falls silent, and when it is heard again."""
         newest_ns = self._session.echo.received_ns
         if self._silent_ns is not None:
             if newest_ns > self._silent_ns:
@@ -342,18 +346,18 @@ class Client(Endpoint):
             self._events.append(ServerSilent(vehicle=self.vehicle, silent_s=silent_s))
 
     def _fly(self, now_ns: int) -> None:
-        """Fly the step that is due, and tell the server."""
+        """Fly the step that is due, and report to the server."""
         session, pilot = self._session, self._pilot
         pilot.fly(now_ns=now_ns)
-        if pilot.is_held and now_ns >= self._held_ns:
-            self._held_ns = now_ns + HELD_AGAIN_NS
+        if pilot.is_held and now_ns >= self._fence_report_ns:
+            self._fence_report_ns = now_ns + HELD_AGAIN_NS
             self._events.append(FenceHolds(vehicle=self.vehicle))
-        if pilot.leap_m != self._leap_told:
+        if pilot.leap_m != self._reported_leap:
             self._tell_leap(pilot.leap_m)
         if pilot.step >= pilot.steps:
             self._end(now_ns)
-        # Nothing is told before it is kept: the server would forget a motion that the next life
-        # flies.
+        # Nothing is sent before the state is saved: otherwise the server would forget a motion that
+        # the next run flies.
         if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
             return
         observation = pilot.observation(session)
@@ -362,14 +366,14 @@ class Client(Endpoint):
             self._tell_time(now_ns)
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
-        self._leap_told = leap_m
+        self._reported_leap = leap_m
         if leap_m is not None and self._failsafe.has_leapt:
-            # One second more than after a loss: positions have to be good again first.
+            # One second more than after a lost link: positions have to be good again first.
             after_s = self._land_after_s + GOOD_NS / SECOND_NS if self._land_after_s else 0.0
             self._events.append(StateLeapt(vehicle=self.vehicle, by_m=leap_m, land_after_s=after_s))
 
     def _end(self, now_ns: int) -> None:
-        """Report how the flight ended, and let the vehicle land."""
+        """Report how the flight ended, and land the vehicle."""
         self._flies.land()
         pilot, vehicle = self._pilot, self.vehicle
         if pilot.covered and pilot.without_ns <= self._timeout_ns:
@@ -381,7 +385,7 @@ class Client(Endpoint):
             self._events.append(self._not_flown)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`; after a leap nobody arms it without saying where it is."""
+        """See `Endpoint`; after a leap, arming requires saying where the vehicle is."""
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
             return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
@@ -394,11 +398,11 @@ class Client(Endpoint):
         return self._flies.objection(scenario, keys)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; the server of a mission is told."""
+        """See `Endpoint`; on a mission the server is told."""
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def _tell_time(self, now_ns: int) -> None:
-        """Tell the server the time of day at which step 0 began, now and then."""
+        """Tell the server, at intervals, the time of day at which step 0 began."""
         if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
             return
         error_ns = self._time.error_at(now_ns)
@@ -424,19 +428,19 @@ class Client(Endpoint):
             self._flies.change(scenario)
 
     def close(self, *, now_ns: int) -> None:
-        """Tell the server that the vehicle ends, and let it land by itself where it can."""
+        """Tell the server that the vehicle leaves, and let it land by itself if it can."""
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend(self._port, now_ns)
         if self._session.number is not None:
-            # Nobody acknowledges a CLOSE, so it is said more than once.
+            # A CLOSE is not acknowledged, so it is sent several times.
             for _ in range(CLOSES):
                 self._session.send(Close(self.vehicle, self._session.number))
 
     def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
-        """Act on another mode or reason, and tell the operator.
+        """Act on a change of mode or reason, and report it.
 
-        That it coasts for a while is not said: where an event sends a horizon, that is as usual.
+        Short coasting is not reported: with event-triggered horizons it is normal.
         """
         self._pilot.mode_changed(cause)
         if self._failsafe.mode is Mode.LAND:
@@ -463,10 +467,10 @@ class Client(Endpoint):
         """See `Endpoint`."""
         return figures([self])
 
-    def told(self) -> dict[str, Any]:
-        """Figures of the vehicle; ages are there while a horizon is in force."""
+    def vehicle_figures(self) -> dict[str, Any]:
+        """Figures of the vehicle; ages are included while a horizon is in force."""
         pilot = self._pilot
-        told = {
+        vehicle_figures = {
             "mode": str(self._failsafe.mode),
             "step": pilot.step,
             "steps": pilot.steps,
@@ -480,19 +484,19 @@ class Client(Endpoint):
             now_ns = pilot.starts_ns(pilot.flown)
             planned_ns = pilot.starts_ns(compensator.in_force)
             observed_ns = pilot.starts_ns(compensator.observed)
-            told["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
-            told["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+            vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
+            vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
         if self._port is not None:
-            told["autopilot"] = self._port.figures()
-        return told
+            vehicle_figures["autopilot"] = self._port.figures()
+        return vehicle_figures
 
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:
-    """Figures of some clients in one process, as in `Endpoint.figures`."""
+    """Figures of several clients in one process, see `Endpoint.figures`."""
     return {
         "vehicles": len(clients),
         "missed": sum(client.missed for client in clients),
         "by_vehicle": {
-            str(client.vehicle): client.told() for client in clients[:VEHICLES_TOLD_MAX]
+            str(client.vehicle): client.vehicle_figures() for client in clients[:VEHICLES_TOLD_MAX]
         },
     }

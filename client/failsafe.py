@@ -1,11 +1,11 @@
-"""Failsafe: the vehicle's mode, decided aboard by a table and a few timers.
+"""Failsafe: the vehicle's mode, decided aboard by a transition table and a few timers.
 
     INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, for good
 
-`TABLE` is the machine: mode and cause give the next mode, and what is not in it changes nothing.
-`HOLD` is that of a vehicle which holds its last input for ever, as the paper's does: no failsafe.
-`Failsafe` finds the causes that take time: a good link, silence, late horizons, repeated mistakes.
-Time is an argument. What is flown in each mode is chosen in `client.pilot`.
+`TABLE` maps mode and cause to the next mode; a pair that is missing changes nothing. `HOLD` is the
+table without a failsafe, for a vehicle that repeats its last input for ever, as the paper's does.
+`Failsafe` detects the causes that take time: a good link, silence, late horizons, repeated errors.
+Time is an argument. `client.pilot` chooses the input in each mode.
 """
 
 import math
@@ -19,26 +19,28 @@ from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 GOOD_NS = SECOND_NS
-"""Time for which the link has to be good before horizons are taken [ns]."""
+"""Time for which the link has to be good before horizons are accepted [ns]."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which what is flown is too old, whatever kept the vehicle [ns]."""
+"""Lateness of a step above which the present plan counts as too old, whatever the cause [ns]."""
 LATE_NS = 500 * MILLISECOND_NS
-"""Time for which all horizons have to come late before the vehicle brakes [ns]."""
+"""Time for which all horizons have to arrive late before the vehicle brakes [ns]."""
 LATE_SHARE = 0.75
-"""Share of a horizon that has passed when it comes, after its committed steps, if it is late."""
+"""Share of a horizon's planned inputs that must have passed at its arrival for it to count as
+late."""
 WINDOW_NS = SECOND_NS
-"""Time within which mistakes of the server are counted [ns]."""
+"""Window in which errors of the server are counted [ns]."""
 MALFORMED_MAX = 5
-"""Malformed messages within `WINDOW_NS` that make the vehicle brake."""
+"""Number of malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
-"""Horizons for impossible times within `WINDOW_NS` that make it ask for its session anew."""
+"""Number of horizons for impossible times within `WINDOW_NS` that make the client ask for a new
+session."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
-"""Time beyond that of the braking curve itself for which a vehicle may brake [ns]."""
+"""Time added to that of the braking curve for the longest time of braking [ns]."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
 """Causes for which somebody else flies the vehicle, or nobody."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
-"""Causes for which the vehicle brakes, and lands."""
+"""Causes that make the vehicle brake and land."""
 BROKEN = frozenset(
     {
         Reason.LOST,
@@ -50,21 +52,22 @@ BROKEN = frozenset(
         Reason.UNUSABLE,
     }
 )
-"""Causes after which the link has to be good for `GOOD_NS` anew, in every mode."""
+"""Causes after which the link has to be good for `GOOD_NS` again, in every mode."""
 LOCKING = BROKEN | GROUNDING | YIELDING | {Reason.LATE, Reason.RETURNED}
-"""Causes of braking after which no horizon is taken before the vehicle hovers on a good link."""
+"""Causes of braking after which no horizon is accepted until the vehicle hovers and the link is
+good."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
-"""Causes that end the session: another WELCOME is needed."""
+"""Causes that end the session, so that another WELCOME is needed."""
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
-"""Causes for which the horizon held is dropped."""
+"""Causes that drop the horizon in force."""
 
 HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
-"""Modes in which it stands still until something comes."""
+"""Modes in which the vehicle stands still and waits."""
 KEPT = frozenset({Reason.BRAKED, Reason.WAITED})
-"""Causes that are no reason of their own: what it brakes or hovers for stays the reason."""
+"""Causes that keep the previous reason: why the vehicle brakes or hovers stays the reason."""
 
 CALM = frozenset({Mode.TRACK, Mode.COAST, Mode.HOVER})
-"""Modes in which a vehicle may fly for many steps without a cause for another one."""
+"""Modes in which a vehicle may fly for many steps without a cause for another mode."""
 
 Table = Mapping[tuple[Mode, Reason], Mode]
 
@@ -73,7 +76,7 @@ _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
 # Not in INIT, where nothing is flown yet, nor in LAND, RETURN and FAULT, which last until somebody
-# has seen to the vehicle.
+# has attended to the vehicle.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
@@ -107,7 +110,7 @@ TABLE: Table = MappingProxyType(
     }
     | {(mode, cause): Mode.LAND for mode in HANGING for cause in (Reason.ALONE, Reason.WAITED)}
     | {(mode, Reason.HOMEWARD): Mode.RETURN for mode in HANGING}
-    # LOST is left out: in SYNC the vehicle waits for a link in any case.
+    # Without LOST: in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
@@ -117,8 +120,8 @@ TABLE: Table = MappingProxyType(
     | _YIELDS
     | _FAULTS
 )
-"""Transition table of the failsafe: next mode by present mode and cause. Where the mode stays, only
-its reason changes."""
+"""Transition table of the failsafe: next mode by current mode and cause. If the mode stays the
+same, only the reason changes."""
 
 HOLD: Table = MappingProxyType(
     {
@@ -135,29 +138,31 @@ HOLD: Table = MappingProxyType(
     | _YIELDS
     | _FAULTS
 )
-"""Next mode with `vehicle.exhausted = "hold"`: never does the vehicle brake or land by itself."""
+"""Transition table for `vehicle.exhausted = "hold"`: the vehicle never brakes or lands by
+itself."""
 
 
 def brake_ns(terms: Terms) -> int:
-    """Longest time of braking [ns]: from u_max on all axes at once, and BRAKE_SPARE_NS."""
+    """Longest time of braking [ns]: from u_max on all axes at once, plus BRAKE_SPARE_NS."""
     steps = math.ceil(math.hypot(*terms.u_max) / terms.brake) if terms.brake else 0
     return steps * terms.dt_ns + BRAKE_SPARE_NS
 
 
 class Failsafe:
-    """Mode of one vehicle, and why it is in it.
+    """Mode of one vehicle, and the reason for it.
 
     Args:
         table: `TABLE` or `HOLD`.
-        armed: whether horizons may be flown at all, see `armed`.
-        timeout_ns: time of silence after which the link is lost, and without a newer horizon after
-            which the vehicle coasts [ns].
-        brake_ns: longest time of braking [ns]: then it hovers, whatever still pushes it.
-        land_after_ns: time of hovering after which it lands, if nothing that it needs to fly on has
-            come: a good link, say [ns]; 0: never.
-        returns: whether it returns home with a silent server, in place of landing.
-        changed: called whenever mode or reason have changed, with those before, the cause, and the
-            time.
+        armed: whether horizons may be flown at all.
+        timeout_ns: time of silence after which the link counts as lost, and time without a newer
+            horizon after which the vehicle coasts [ns].
+        brake_ns: longest time of braking, after which the vehicle hovers even if it is still pushed
+            [ns].
+        land_after_ns: time of hovering after which the vehicle lands if what it needs to fly on,
+            such as a good link, does not return [ns]; 0: never.
+        returns: whether the vehicle returns home instead of landing if the server is silent.
+        changed: called when mode or reason have changed, with the previous mode and reason, the
+            cause, and the time.
     """
 
     def __init__(
@@ -173,34 +178,33 @@ class Failsafe:
     ) -> None:
         self._table = table
         self.armed = armed
-        """Whether horizons may be flown at all; it may change in flight."""
+        """Whether horizons may be flown at all; may change in flight."""
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
         self._alone = Reason.HOMEWARD if returns else Reason.ALONE
-        """Cause of a server that has been silent for long."""
+        """Cause that follows a long silence of the server."""
         self._changed = changed
         self.mode = Mode.INIT
-        """Present mode."""
         self.reason = Reason.BEGUN
-        """Newest cause that it met; what it braked for, while it hovers."""
+        """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
         self._heard_ns: int | None = None
-        """Time of the newest packet of the session; None without a session."""
         self._good_ns = 0
-        """Time since which the link has been good, as far as it is."""
+        """Time since which the link has been good; only meaningful while it is."""
         self._horizon_ns = 0
-        """Time at which the newest horizon was taken."""
+        """Time at which the newest horizon was accepted."""
         self._late_ns: int | None = None
-        """Time since which all horizons have come late; None where the newest has not."""
+        """Time since which all horizons have been late; None if the newest was not."""
         self._began_ns = 0
-        """Time at which the present mode began."""
+        """Time at which the current mode began."""
         self._waits_ns = 0
-        """Time since which it has hovered without what it needs to fly on, as far as it has."""
+        """Time since which the vehicle has waited for what it needs to fly on."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         """Times of the newest malformed messages."""
         self.has_leapt = False
-        """Whether its state has leapt, and nobody has said which frame counts."""
+        """Whether the measured state has leapt and the operator has not yet chosen a frame."""
         self.stays = False
-        """Whether it hovers on after a leap, and does not land: an operator's choice."""
+        """Whether the vehicle hovers on after a leap instead of landing, as chosen by the
+        operator."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
         """Times of the newest horizons for impossible times."""
 
@@ -211,53 +215,55 @@ class Failsafe:
 
     @property
     def takes(self) -> bool:
-        """Whether a horizon that comes now is flown."""
+        """Whether a horizon that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
     @property
     def brakes(self) -> bool:
-        """Whether the vehicle brakes where it has no plan, and does not hold its last input."""
+        """Whether the vehicle brakes without a plan, rather than repeating its last input."""
         return self._table is TABLE
 
     def is_lost(self, now_ns: int) -> bool:
-        """Whether nothing of the session has come for the time-out, or there is no session."""
+        """Whether no packet of the session has arrived within the time-out, or there is no
+        session.
+        """
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
 
     def _is_good(self, now_ns: int) -> bool:
-        """Whether something of the session has come within two thirds of the time-out.
+        """Whether a packet of the session has arrived within two thirds of the time-out.
 
-        A heartbeat comes at least in each third, see `heartbeat.FEWEST`: so one may be lost. And
-        the first one comes a round trip after WELCOME, which may take a second.
+        A heartbeat comes at least every third of it (`heartbeat.FEWEST`), so one may be lost. The
+        first comes a round trip after WELCOME, which may take a second.
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
     # -- what arrives ------------------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:
-        """Note a packet of the session, authenticated where the link is."""
-        # After a gap of more than two thirds of the time-out the link has to prove itself anew.
+        """Note a packet of the session; on a secured link, an authenticated one."""
+        # After a gap of more than two thirds of the time-out, the time of a good link starts again.
         if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns
 
     def resume(self, cause: Reason, *, heard_ns: int, now_ns: int) -> None:
-        """Go on with the flight of an earlier life.
+        """Continue the flight of an earlier run.
 
         Args:
-            cause: RESUMED along its motion, LOST without one.
-            heard_ns: time at which that life has heard the server.
+            cause: RESUMED if its motion is flown on, LOST if there is none.
+            heard_ns: time at which that run last heard the server.
             now_ns: time now.
         """
         self._heard_ns = self._good_ns = self._horizon_ns = heard_ns
         self.meet(cause, now_ns=now_ns)
 
     def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
-        """Note a horizon newer than those before, whether or not it is taken.
+        """Note a horizon newer than those before, accepted or not.
 
         Args:
             late: whether more than LATE_SHARE of it has passed.
-            now_ns: time at which it came.
+            now_ns: time of arrival.
         """
         if not late:
             self._late_ns = None
@@ -267,17 +273,19 @@ class Failsafe:
             self.meet(Reason.LATE, now_ns=now_ns)
 
     def horizon_taken(self, *, now_ns: int) -> None:
-        """Note a horizon that is held from now on."""
+        """Note that a horizon was put in force."""
         self._horizon_ns = now_ns
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
-        """Note a malformed message that the server itself has sent."""
+        """Note a malformed message from the server itself."""
         if _full(self._malformed, now_ns):
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
     def future(self, *, now_ns: int) -> None:
-        """Note a horizon for a time, or from an observation, that there cannot be."""
+        """Note a horizon that was made for an impossible step, or from an impossible
+        observation.
+        """
         if _full(self._future, now_ns):
             self.meet(Reason.RESYNC, now_ns=now_ns)
 
@@ -287,11 +295,11 @@ class Failsafe:
         """Handle the causes that hold at the start of a step.
 
         Args:
-            late_ns: time by which the vehicle was woken late for it [ns].
-            hindrance: cause on the vehicle's side for which it must not follow a plan.
+            late_ns: delay with which the step was started [ns].
+            hindrance: cause on the vehicle's side that forbids following a plan.
             now_ns: time now.
         """
-        # First of all: a pilot who takes over must not wait for anything that is found below.
+        # First: when a pilot takes over, none of the checks below may come before that.
         if hindrance is not None:
             self.meet(hindrance, now_ns=now_ns)
         elif self.mode is Mode.MANUAL:
@@ -316,11 +324,11 @@ class Failsafe:
         self._wait(lost=lost, good=good, now_ns=now_ns)
 
     def _wait(self, *, lost: bool, good: bool, now_ns: int) -> None:
-        """Land where what the vehicle needs to fly on does not come."""
-        # A link that is never good, or an autopilot that is silent, locks it as a lost link does.
+        """Land if what the vehicle needs to fly on does not return."""
+        # A link that is never good, or a silent autopilot, counts like a lost link.
         locked = self.reason in LOCKING or self.mode is Mode.SYNC
         waits = lost or (locked and not good) or (self.has_leapt and not self.stays)
-        # A link that has just come back has its second to be good.
+        # A link that has just returned gets one second to become good.
         patience_ns = self._land_after_ns + (0 if lost else GOOD_NS)
         if self.mode not in HANGING or not waits:
             self._waits_ns = now_ns
@@ -328,23 +336,25 @@ class Failsafe:
             self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
-        """Note that its state has leapt: no horizon is taken until an operator has chosen."""
+        """Note a leap of the state: no horizon is accepted until an operator has chosen the
+        frame.
+        """
         # With HOLD there is no failsafe, and a leap stops nothing.
         self.has_leapt = self.brakes
         if self.reason not in LOCKING:
             self.meet(Reason.LEAPT, now_ns=now_ns)
 
     def decide(self) -> None:
-        """Note that an operator has said which frame counts."""
+        """Note that an operator has chosen the frame."""
         self.has_leapt = self.stays = False
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Change mode and reason for a cause, where the table says so."""
+        """Change mode and reason as the table says for a cause."""
         after = self._table.get((self.mode, cause))
         if after is None:
             return
         if cause in LOCKING or cause is Reason.OPENED:
-            # The second for which the link has to be good begins now, whatever it was before.
+            # The second for which the link has to be good begins now.
             self._good_ns = now_ns
         if cause in CLOSING:
             self._heard_ns = None
@@ -358,10 +368,10 @@ class Failsafe:
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:
-    """Whether so many lie within the window, with one more now; if so, all are forgotten."""
+    """Add a time; True if the queue is now full of times within WINDOW_NS, and then empty it."""
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:
-        # Else each further mistake within the window would make the vehicle brake again.
+        # Otherwise each further error within the window would make the vehicle brake again.
         times_ns.clear()
     return full

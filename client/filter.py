@@ -1,23 +1,21 @@
-"""A Kalman filter aboard: where the vehicle is and how fast, from measurements with noise.
+"""Kalman filter aboard: position and velocity from noisy measurements.
 
-Each axis has the state x = [p, v, w]: position [m], velocity [m/s], and what acts on the vehicle
-like an input of its own [m/s], as steady wind and a wrong gain do. The inputs u are known, for the
-vehicle flies them itself:
+Each axis has the state x = [p, v, w]: position [m], velocity [m/s], and a disturbance that acts
+like an additional input [m/s], as steady wind or a wrong gain does. The inputs u are known exactly:
 
     p, v follow eq. (4) with the input u + w              w(k+1) = w(k)
     P(k+1) = F P(k) Fᵀ + Q                                F: eq. (4) of [p, v, w]
 
-Q is that of white acceleration of the strength q = `sensor.process_noise` over a step, and of a
-slow walk of w. Measurements are taken one number after the other, z = h x + noise of the variance
-r:
+Q is that of white acceleration of strength q = `sensor.process_noise` over a step, and of a slow
+random walk of w. Measurements are processed one number at a time, z = h x + noise of variance r:
 
     K = P hᵀ / (h P hᵀ + r)        x ← x + K (z - h x)        P ← P - K h P
 
-so that one that is missing is simply left out. A measurement that is had late tells of the step it
-was made at. There the filter stands; the estimate is its state, rolled on to the present with the
-inputs that have acted since. A constant error of a sensor it cannot tell from the truth.
+so a missing number is simply skipped. A delayed measurement describes the step at which it was
+made: the filter's state is kept at that step, and the estimate is this state predicted to the
+present with the inputs since. A constant sensor error cannot be told from the truth.
 
-The covariance P does not depend on what is measured.
+The covariance P does not depend on the measured values.
 """
 
 from collections import deque
@@ -31,16 +29,16 @@ from skytether.shared.law.model import Array, Axis, advance, white_acceleration
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
-"""Strength of the random walk of w as a share of q [1]: w moves by DRIFT q √t in the time t."""
+"""Strength of the random walk of w as a share of q: w moves by DRIFT q √t in the time t."""
 BEGIN_MPS = 1.0, 0.5
-"""Standard deviation of the velocity at the begin, where it was not measured, and of w [m/s]."""
-# With a variance of 0 the covariance would become singular.
+"""Initial standard deviation of a velocity that was not measured, and of w [m/s]."""
+# A variance of 0 would make the covariance singular.
 LEAST = 1e-6
-"""Smallest standard deviation that a measurement is taken to have [m], [m/s]."""
+"""Smallest standard deviation assumed for a measurement [m], [m/s]."""
 
 
 class Spread(NamedTuple):
-    """Covariance P of an axis' [p, v, w]; it is symmetric, and half of it is enough."""
+    """Covariance P of the [p, v, w] of an axis; half of it, since it is symmetric."""
 
     pp: float
     pv: float
@@ -55,7 +53,7 @@ Gain = tuple[float, float, float]
 
 
 def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
-    """P a step later, F P Fᵀ + Q."""
+    """P one step later, F P Fᵀ + Q."""
     pv = P.pv + axis.a01 * P.vv + axis.b0 * P.vw  # of the next p and this v
     pw = P.pw + axis.a01 * P.vw + axis.b0 * P.ww
     vw = axis.a11 * P.vw + axis.b1 * P.ww
@@ -70,11 +68,11 @@ def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
 
 
 def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
-    """Gain and P of a measured position."""
+    """Gain and P after a measured position."""
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
-    # (1 - K) P as variance / total · P, for 1 - K loses its digits where the sensor is good.
+    # (1 - K) P as variance / total · P: 1 - K loses its digits if the sensor is good.
     left = variance / total
     return (kp, kv, kw), Spread(
         left * pp, left * pv, left * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
@@ -82,7 +80,7 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
 
 
 def by_velocity(P: Spread, variance: float) -> tuple[Gain, Spread]:
-    """Gain and P of a measured velocity."""
+    """Gain and P after a measured velocity."""
     pp, pv, pw, vv, vw, ww = P
     total = vv + variance
     kp, kv, kw = pv / total, vv / total, vw / total
@@ -125,7 +123,7 @@ def corrected(
         x, P: see `advanced`.
         measured: positions [m] and velocities [m/s]; shape (2, axes).
         has_position, has_velocity: whether they were measured.
-        variance_p, variance_v: their variances [m²], [m²/s²].
+        variance_p, variance_v: variances of position [m²] and velocity [m²/s²].
     """
     for i in range(len(x)):
         spread = _spread(P, i)
@@ -150,11 +148,11 @@ def _write(table: Table, i: int, spread: Spread) -> None:
 
 
 class Kalman:
-    """Filter of a scenario's vehicle.
+    """Kalman filter of a scenario's vehicle.
 
     Args:
-        scenario: its model, and what it is told of its sensor.
-        delay: how old a measurement is when it is had [steps].
+        scenario: model, and the properties of the sensor.
+        delay: age of a measurement when it becomes available [steps].
     """
 
     def __init__(self, scenario: Scenario, delay: int) -> None:
@@ -178,11 +176,11 @@ class Kalman:
         self._acted: deque[tuple[Array, Array | None]] = deque(
             [(np.zeros(axes), None)] * delay, delay + 1
         )
-        """Inputs that have acted since, see `advance` [m/s]."""
-        self._late = np.array([each.late for each in terms.dead_times])
+        """Inputs that have acted since then, see `advance` [m/s]."""
+        self._late = np.array([dead_time.late for dead_time in terms.dead_times])
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
-        """Take the first measurement, which has a position; the vehicle stands.
+        """Start from the first measurement, which has a position; the vehicle stands still.
 
         Args:
             measured: the measurement.
@@ -197,11 +195,11 @@ class Kalman:
         self.P[:] = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
 
     def advance(self, due: Array, swing: Array | None = None) -> None:
-        """Advance by a step, over which these inputs act, see `shared.law.dead_time`.
+        """Advance by a step over which these inputs act, see `shared.law.dead_time`.
 
         Args:
-            due: the input that acts at its end, of each axis [m/s].
-            swing: by how much more acts at its begin [m/s]; None without.
+            due: input acting at the end of the step, of each axis [m/s].
+            swing: difference of the input acting at its begin [m/s]; None if there is none.
         """
         self._acted.append((due, swing))
         inputs, more = self._acted.popleft()
@@ -210,7 +208,7 @@ class Kalman:
             self.x[:, :2] += self._late * more[:, None]
 
     def take(self, measured: Measurement, numbers: Array) -> None:
-        """Take what was measured at the step the filter stands at, see `begin`."""
+        """Correct by a measurement of the step that the filter's state belongs to, see `begin`."""
         _, position, velocity = measured
         has_position, has_velocity = position is not None, velocity is not None
         corrected(self.x, self.P, numbers, has_position, has_velocity, *self._variances)
@@ -218,7 +216,7 @@ class Kalman:
     def estimate(self) -> Array:
         """Position [m] and velocity [m/s] of each axis at the present step; shape (axes, 2)."""
         present = self.x[:, :2].copy()
-        # From the step of the newest measurement to the present, by what has acted since.
+        # Predict from that step to the present, with the inputs that have acted since.
         for inputs, more in self._acted:
             present = self._model.step(present, inputs + self.x[:, 2])
             if more is not None:
@@ -226,5 +224,5 @@ class Kalman:
         return present
 
     def disturbance(self) -> Array:
-        """Disturbance w that acts on each axis like an input [m/s]; shape (axes,)."""
+        """Estimated disturbance w of each axis, which acts like an input [m/s]; shape (axes,)."""
         return self.x[:, 2].copy()

@@ -1,4 +1,4 @@
-"""A fleet: many vehicles in one process, each a client of its own with a socket of its own."""
+"""Fleet: many vehicles in one process, each with a client and a socket of its own."""
 
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
@@ -15,31 +15,30 @@ START_NS = 5 * SECOND_NS
 
 
 def apart_ns(vehicles: int, dt_ns: int) -> int:
-    """Time from one vehicle's start to the next's [ns]: a step, less in a large fleet.
+    """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
 
-    Vehicles that start at one instant say all that they say at one instant, and queue.
+    Vehicles that start together send all their packets together, which then queue.
     """
     return min(dt_ns, START_NS // vehicles)
 
 
 class Fleet(Endpoint):
-    """Clients driven as one endpoint; the n-th uses socket n.
+    """Clients driven as one endpoint; client n uses socket n.
 
     Args:
-        clients: vehicles; none has been woken yet.
-        apart_ns: time from one's start to the next's [ns].
+        clients: clients, none of which has been woken yet.
+        apart_ns: time from one start to the next [ns].
     """
 
     def __init__(self, clients: Sequence[Client], apart_ns: int = 0) -> None:
         super().__init__()
         self._clients = clients
         self._apart_ns = apart_ns
-        """Time from one start to the next [ns]; 0 once these are planned."""
+        """Time from one start to the next [ns]; 0 once the starts are scheduled."""
         self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
-        """Wakes that clients have asked for: time and client; one that is no longer wanted stays
-        until its time."""
+        """Wakes requested by clients: time and client. An outdated entry stays until its time."""
         heapify(self._heap)
         self._flying = set(range(len(clients)))
 
@@ -50,25 +49,25 @@ class Fleet(Endpoint):
 
     @property
     def failure(self) -> Failure | None:
-        """Event after which the first of the vehicles that failed could not fly."""
+        """Event of the first failed vehicle."""
         return next((client.failure for client in self._clients if client.failure), None)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Give the datagram to the client whose socket it came to."""
+        """Pass a datagram to the client whose socket it came to."""
         self._clients[datagram.socket].receive(datagram, now_ns=now_ns)
         self._after(datagram.socket)
 
     def next_wake_ns(self) -> int | None:
-        """Earliest time at which a client wants to be woken."""
+        """Earliest wake requested by a client."""
         heap, due_ns = self._heap, self._due_ns
-        # Wakes that a client no longer wants stay in the heap until their time: to take one out of
-        # the middle would mean to search it.
+        # Outdated wakes stay in the heap until their time: removing one earlier would need a
+        # search.
         while heap and due_ns[heap[0][1]] != heap[0][0]:
             heappop(heap)
         return heap[0][0] if heap else None
 
     def wake(self, *, now_ns: int) -> None:
-        """Wake all clients whose time has come; at first, plan when each starts."""
+        """Wake all clients that are due; the first call schedules when each starts."""
         if self._apart_ns:
             self._heap = [(now_ns + n * self._apart_ns, n) for n in range(len(self._clients))]
             self._due_ns = [due_ns for due_ns, _ in self._heap]
@@ -85,7 +84,7 @@ class Fleet(Endpoint):
             client.learn_time(utc_ns, error_ns, now_ns=now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`; that of the first vehicle that has one."""
+        """See `Endpoint`; the objection of the first vehicle that has one."""
         said = (client.objection(scenario, keys) for client in self._clients)
         return next(filter(None, said), "")
 
@@ -101,7 +100,7 @@ class Fleet(Endpoint):
             self._after(n)
 
     def _after(self, n: int) -> None:
-        """Take over what a client that was driven wants sent and said, and its next wake."""
+        """Collect a client's datagrams and events, and note its next wake."""
         client = self._clients[n]
         for payload, peer, _ in client.outbox():
             self._out.append(Datagram(payload, peer, n))

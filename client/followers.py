@@ -1,8 +1,8 @@
-"""What a vehicle flies by between two packets: a horizon of inputs, or a spline, eq. (11).
+"""Followers: inputs from a horizon of inputs or from a spline, eq. (11).
 
-The rules themselves are `shared.law.rule` and `shared.law.spline`, which the server flies by as
-well; here is what they need aboard, for all axes of one vehicle. Stages count steps from the first
-of a horizon.
+The rules themselves are in `shared.law.rule` and `shared.law.spline`, which the server uses as
+well; here they are applied aboard, to all axes of one vehicle. Stages count steps from the first
+step of a horizon.
 """
 
 import math
@@ -19,59 +19,58 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, LED
 
 TOLD = [GAIN_P, GAIN_V, DISTURBANCE]
-"""Columns of a horizon's feedback on the wire,"""
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
-"""and those of the table that they go to."""
+"""Columns of a horizon's feedback on the wire (TOLD), and the columns of the table that they
+fill."""
 
 
 class Follower(Protocol):
-    """What is flown by."""
+    """Source of inputs: a horizon or a spline."""
 
     length: int
-    """Number of stages for which there are inputs."""
+    """Number of stages with an input."""
     feeds_back: bool
-    """Whether what is flown is told and feedback on top of that."""
+    """Whether the input includes feedback."""
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
-        """Input u*, and what of it is told, without the feedback [m/s]; shape (2, axes).
+        """Input u*, and the same without feedback [m/s]; shape (2, axes).
 
         Args:
-            stage: stage that the vehicle is at.
+            stage: present stage.
             state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-            disturbance: ŵ that the vehicle itself has found on each axis; counts only along a
-                spline [m/s].
-            before: input flown until now, of each axis; counts only along a spline [m/s].
+            disturbance: ŵ estimated aboard, of each axis; used along a spline only [m/s].
+            before: input flown until now, of each axis; used along a spline only [m/s].
 
         Source: eq. (11).
         """
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
-        """State of each axis a step later, as the server foresees it [m, m/s]; shape (axes, 2).
+        """State of each axis one step later, as the server predicts it [m, m/s]; shape (axes, 2).
 
         Args:
-            stage: that of the newest `input_at`.
+            stage: stage of the newest `input_at`.
             state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-            flown: input flown from there [m/s]; None for what the rule makes of the state.
+            flown: input flown from there [m/s]; None for the input that follows from the state.
         """
 
 
 class Constants(NamedTuple):
-    """What all horizons and splines of a vehicle are flown with."""
+    """Constants that all horizons and splines of a vehicle share."""
 
     terms: Terms
     model: Model
     """Model of the terms, eq. (4)."""
     held: Array
-    """Columns of `Held` that are the same for all horizons; shape (axes, n)."""
+    """Columns of a horizon's table that are the same for all horizons; shape (axes, n)."""
     guide: Array
-    """Columns of `Guide` that are the same for all splines; shape (axes, n)."""
+    """Columns of a spline's table that are the same for all splines; shape (axes, n)."""
 
     @classmethod
     def of(cls, terms: Terms, regulator: Array) -> Self:
         """Constants of a flight.
 
         Args:
-            terms: the rule of flight.
+            terms: terms of the flight.
             regulator: K and λ along a spline, see `shared.scenario.gain.regulator`; shape (axes,
                 3).
         """
@@ -89,13 +88,14 @@ class Constants(NamedTuple):
 
 
 class HorizonFollower:
-    """Flies by a horizon of inputs.
+    """Follows a horizon of inputs.
 
     Args:
-        constants: those of the vehicle.
-        inputs: its inputs [m/s]; shape (axes, n).
-        length: number of them that are flown.
-        feedback: its feedback, see `wire.protocol.Horizon`; shape (axes, 5), None without.
+        constants: constants of the vehicle.
+        inputs: inputs [m/s]; shape (axes, n).
+        length: number of inputs that may be flown.
+        feedback: feedback of the horizon, see `wire.protocol.Horizon`; shape (axes, 5); None
+            without.
     """
 
     def __init__(
@@ -112,11 +112,11 @@ class HorizonFollower:
         last = self._inputs[:, length - 1 if terms.indexed else 0].tolist()
         within = [bounded(u, bound) for u, bound in zip(last, terms.u_max, strict=True)]
         self._table[:, rule.LENGTH], self._table[:, rule.FEEDS_BACK] = length, self.feeds_back
-        # No math.hypot: it rounds otherwise in 17 % of cases, and the server's replay has a plain
-        # root.
+        # Not math.hypot: its rounding differs in 17 % of cases from the square root in the server's
+        # replay.
         self._table[:, rule.SPEED] = math.sqrt(sum(u * u for u in within))
         self.lead = np.zeros((terms.axes, 2))
-        """State x̄ that it leads to, of each axis at the newest stage [m, m/s]; shape (axes, 2)."""
+        """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""
         if feedback is not None:
             self._table[:, TABLED] = feedback[:, TOLD]
             self.lead[:] = feedback[:, LED]
@@ -126,8 +126,8 @@ class HorizonFollower:
         self,
         stage: int,
         state: Array,
-        disturbance: Array,  # noqa: ARG002 - it has one of its own
-        before: Array,  # noqa: ARG002 - it does not matter
+        disturbance: Array,  # noqa: ARG002 - a horizon contains its own
+        before: Array,  # noqa: ARG002 - used along a spline only
     ) -> Array:
         """See `Follower`."""
         flown = np.empty((2, len(state)))
@@ -147,13 +147,13 @@ class HorizonFollower:
 
 
 class SplineFollower:
-    """Flies along a spline.
+    """Follows a spline.
 
     Args:
-        constants: those of the vehicle.
-        knots: position [m] and velocity [m/s] of each; shape (axes, n, 2).
+        constants: constants of the vehicle.
+        knots: position [m] and velocity [m/s] of each knot; shape (axes, n, 2).
         spacing: steps from one knot to the next.
-        length: number of stages for which it is flown.
+        length: number of stages for which it may be flown.
     """
 
     feeds_back = True
@@ -164,7 +164,7 @@ class SplineFollower:
         terms = constants.terms
         self.length = length
         self.spacing, self.sent = spacing, knots
-        """Steps from knot to knot, and the knots as they were sent."""
+        """Steps from knot to knot, and the knots as received."""
         self._knots = np.array(knots, np.float64, order="C").reshape(len(knots), -1)
         axes = zip(constants.model.axes(), self._knots, terms.u_max, strict=True)
         last = [
@@ -175,7 +175,7 @@ class SplineFollower:
         table[:, spline.SPACING], table[:, spline.LENGTH] = spacing, length
         table[:, spline.LAST], table[:, spline.SPEED] = last, math.hypot(*last)
         self.lead = self._knots[:, :2].copy()
-        """State x̄ on the spline, of each axis at the newest stage [m, m/s]; shape (axes, 2)."""
+        """Reference state x̄ on the spline at the newest stage [m, m/s]; shape (axes, 2)."""
         self._lead_stage = 0
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
@@ -196,7 +196,7 @@ class SplineFollower:
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:  # noqa: ARG002
-        """See `Follower`; what is flown besides the spline is flown off."""
+        """See `Follower`; the input flown is not used."""
         ahead = np.empty_like(state)
         spline.foresee_spline(self._table, self._knots, self.lead, stage, state, ahead)
         return ahead

@@ -1,6 +1,6 @@
-"""The vehicle's side of the link: how messages become datagrams, and the other way round.
+"""The vehicle's side of the link: messages to datagrams, and back.
 
-`PlainLink` sends them as they are. `client.secure` seals them with the vehicle's key.
+`PlainLink` sends them unencrypted. `client.secure` encrypts them with the vehicle's key.
 """
 
 from typing import Protocol
@@ -8,19 +8,19 @@ from typing import Protocol
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 HELLO_NS = SECOND_NS
-"""Time between two HELLOs in plaintext while nobody has ever answered [ns]."""
+"""Time between two HELLOs in plaintext until the server first answers [ns]."""
 AGAIN_NS = 400 * MILLISECOND_NS
 """Time between two HELLOs otherwise [ns]: fewer than the five handshakes a second that a server
 grants."""
 
 
 class ClientLink(Protocol):
-    """Turns messages into datagrams for the server, and its datagrams into messages."""
+    """Converts messages to datagrams for the server, and its datagrams to messages."""
 
     secure: bool
-    """Whether what comes out of `open` is known to come from the server."""
+    """Whether messages returned by `open` are authenticated."""
     hello_ns: int
-    """Time between two HELLOs while nobody has ever answered [ns]."""
+    """Time between two HELLOs until the server first answers [ns]."""
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
         """Datagram that carries a HELLO."""
@@ -29,29 +29,30 @@ class ClientLink(Protocol):
         """Datagram that carries any other message."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """Message in a datagram; None of a step towards one, whose answer is in the outbox.
+        """Message in a datagram; None if it was part of the handshake, whose answer is in the
+        outbox.
 
         Raises:
-            ProtocolError: it is not the server's.
+            ProtocolError: it is not from the server.
         """
 
     def outbox(self) -> list[bytes]:
-        """Datagrams of the link's own for the server; each is handed out once."""
+        """Datagrams of the link itself for the server; each is returned once."""
 
     def adopt(self, *, now_ns: int) -> None:
-        """Seal from now on as the WELCOME that was opened last agrees to."""
+        """Use the keys of the latest WELCOME from now on."""
 
     def wants_hello(self, now_ns: int) -> bool:
-        """Whether new keys are due, which a HELLO gets."""
+        """Whether a HELLO is needed to get new keys."""
 
 
 class PlainLink:
-    """Link without keys: anybody may read and write what passes."""
+    """Link without keys: anybody on the path can read and write."""
 
     secure = False
     hello_ns = HELLO_NS
 
-    def hello(self, payload: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002 - as of any `ClientLink`
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002 - same signature as in any `ClientLink`
         """See `ClientLink`."""
         return payload
 

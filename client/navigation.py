@@ -1,9 +1,9 @@
-"""State of a vehicle as it knows it: its measurements, and its filter's estimate.
+"""Navigation: the vehicle's knowledge of its state, from measurements and the filter's estimate.
 
-What is known is what the vehicle flies by and reports: with a dead time not its state now, but the
-one in which its next input will meet it (`shared.law.dead_time`). With a sensor that measures the
-whole state as it is, at every step, nothing is filtered, unless the filter's disturbance is needed:
-to predict over a dead time, and to fly along a spline.
+What is flown by and reported is not the state now but, with a dead time, the predicted state in
+which the next input will take effect (`shared.law.dead_time`). A sensor that measures the exact
+state at every step needs no filter, unless the filter's disturbance is needed: to predict over a
+dead time, and to follow a spline.
 """
 
 import math
@@ -30,28 +30,29 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
-"""Longest time for which a measurement is carried on [ns]; an older one is as if from then."""
+"""Longest time over which a measurement is extrapolated [ns]; an older one is extrapolated by this
+time."""
 SIGMAS = 10.0
-"""Standard deviations of its sensor's noise by which a change may be off."""
+"""Number of standard deviations of sensor noise allowed in a change."""
 
 
 class Sensing(NamedTuple):
     """Properties of a scenario's sensor."""
 
     delay: int
-    """Time from measuring to having the measurement, D [steps]."""
+    """Delay of a measurement, D [steps]."""
     every_ns: tuple[int, int]
-    """Time from one position, and one velocity, to the next [ns]; 0: never."""
+    """Interval between positions, and between velocities [ns]; 0: never measured."""
     prompt: bool
-    """Whether it measures the whole state at every step, and tells it at once."""
+    """Whether it measures the whole state at every step without delay."""
     exact: bool
-    """Whether it measures the whole state as it is, at every step."""
+    """Whether, moreover, it has no noise and no bias."""
 
 
 def sensing(scenario: Scenario) -> Sensing:
     """Properties of a scenario's sensor."""
     sensor, dt_ns = scenario.sensor, scenario.dt_ns
-    # Rounded up: a measurement is taken at the first step at which it is there.
+    # Rounded up: a measurement is used at the first step at which it is available.
     delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
     position_ns, velocity_ns = (
         0 if every_s == "never" else max(seconds_to_ns(every_s), dt_ns)
@@ -71,54 +72,58 @@ def filters(scenario: Scenario) -> bool:
 
 
 class Navigation:
-    """Filter that a scenario's vehicle has for its measurements."""
+    """Filter of a scenario's vehicle and its measurements."""
 
     def __init__(self, scenario: Scenario) -> None:
-        known, axes = sensing(scenario), scenario.model.axes
+        sensor, axes = sensing(scenario), scenario.model.axes
         self._scenario, terms = scenario, scenario.terms()
-        self.filter = Kalman(scenario, known.delay) if filters(scenario) else Newest(axes)
-        """Filter that makes an estimate of the measurements."""
+        self.filter = Kalman(scenario, sensor.delay) if filters(scenario) else Newest(axes)
+        """Filter that turns measurements into an estimate."""
         late = any(terms.dead_time_s)
         self._inputs = OnTheirWay(terms.model.axes(), terms.dead_times) if late else None
-        """Inputs on their way; None where the model has each act at once."""
-        self._delay_ns = known.delay * scenario.dt_ns
-        """Time from measuring to having it that the filter itself reckons with [ns]."""
+        """Inputs that are not acting yet; None if the model has no dead time."""
+        self._delay_ns = sensor.delay * scenario.dt_ns
+        """Delay of measurements that the filter allows for [ns]."""
         self._tau_s, self._gain = np.array(terms.tau_s), np.array(terms.gain)
         self._begun = False
         self.leaps = Leaps(scenario)
-        """Check of each measurement against the one before."""
+        """Check of each measurement against the previous one."""
         self.leapt = False
-        """Whether what was measured since the last step is what no vehicle can have come to."""
+        """Whether a measurement since the last step is further away than any vehicle could have
+        moved."""
         self._nothing = np.full((2, axes), math.nan)
         self.measured: Array = np.full((axes, 2), math.nan)
-        """Measurements that came since the last step, position [m] and velocity [m/s] of each
-        axis; NaN where nothing is. Shape (axes, 2)."""
+        """Measurements since the last step, position [m] and velocity [m/s] of each axis, NaN if
+        missing; shape (axes, 2)."""
         self.estimate = self.measured
-        """State now, position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
+        """Estimated present state, position [m] and velocity [m/s] of each axis; shape (axes,
+        2)."""
         self.predicted = self.estimate
-        """State in which the next input will meet the vehicle, which is flown by and reported;
-        without a dead time the estimate."""
+        """State in which the next input will take effect; it is flown by and reported. Without a
+        dead time it is the estimate."""
         self.is_known = False
-        """Whether the estimate is finite, also when it is told, and can be flown by."""
+        """Whether the estimate is finite, also as float32, and so can be flown by and reported."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
         """Advance to a step; before the first the vehicle stands still.
 
         Args:
-            measurements: what has been measured and is had since the step before.
-            command: the input flown since then [m/s]; shape (axes,).
-            now_ns: begin of the step [ns; the client's clock].
+            measurements: measurements that became available since the previous step.
+            command: input flown since then [m/s]; shape (axes,).
+            now_ns: start of the step [ns; the client's clock].
         """
         due, swing = command, None
         if self._inputs is not None:
             due, swing = self._inputs.issue(command)
         if self._begun:
             self.filter.advance(due, swing)
-        self.leapt, told = False, self._nothing
+        self.leapt, newest = False, self._nothing
         for measured in measurements if self._begun else _newest(measurements):
             numbers = measured.numbers()
             self.leapt |= self.leaps.leaps(measured, numbers)
-            told = numbers if told is self._nothing else np.where(np.isnan(numbers), told, numbers)
+            newest = (
+                numbers if newest is self._nothing else np.where(np.isnan(numbers), newest, numbers)
+            )
             if self._begun:
                 carried = self._carried(measured, now_ns - self._delay_ns, due)
                 if carried is not measured:
@@ -127,33 +132,33 @@ class Navigation:
             else:
                 self.filter.begin(measured, numbers)
                 self._begun = True
-        self.measured = told.T
+        self.measured = newest.T
         if self._begun:
             self.estimate = self.predicted = self.filter.estimate()
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
-            # Told as float32, a larger number would reach the server as infinity.
+            # It is sent as float32: a larger number would reach the server as infinity.
             self.is_known = all_within(self.predicted, FLOAT_MAX)
 
     def begin_anew(self) -> None:
-        """Begin with the next measurement: the frame has changed, and with it the position."""
+        """Start again from the next measurement: the frame, and so the position, has changed."""
         self._begun, self.leaps = False, Leaps(self._scenario)
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ that the filter has found on each axis [m/s]; 0 without a filter."""
+        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
-        """A measurement carried to a later time by the model; an earlier time changes nothing.
+        """Measurement extrapolated to a later time by the model; an earlier time changes nothing.
 
-        A real vehicle measures when it likes. For a time in which an input acted that is another
-        than that of the last step, the difference is left to the filter.
+        A real vehicle measures at times of its own. If an older input than `due` acted during part
+        of that time, the filter has to correct the difference.
 
         Args:
-            measured: what was measured.
-            to_ns: the time [ns; the client's clock].
-            due: the input that has acted in the last step, of each axis [m/s].
+            measured: the measurement.
+            to_ns: time to extrapolate to [ns; the client's clock].
+            due: input that acted during the last step, of each axis [m/s].
 
         Source: eq. (1).
         """
@@ -161,62 +166,61 @@ class Navigation:
         if age <= 0.0:
             return measured
         _, position, velocity = measured
-        known = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
-        # Eq. (1) in closed form: the input is constant over the time that is bridged.
+        velocity_now = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
+        # Eq. (1) in closed form: the input is constant over this time.
         left, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
         if position is not None:
-            bridged = steady * age + (known - steady) * self._tau_s * (1.0 - left)
+            bridged = steady * age + (velocity_now - steady) * self._tau_s * (1.0 - left)
             position = (position + bridged).tolist()
         if velocity is not None:
-            velocity = (steady + (known - steady) * left).tolist()
+            velocity = (steady + (velocity_now - steady) * left).tolist()
         return Measurement(to_ns, position, velocity)
 
 
 def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
-    """Measurements from the newest position on: a vehicle is known from there.
+    """Measurements from the newest position on: the filter starts there.
 
-    What was measured before the first step is of a vehicle that others flew: in its climb, the
-    autopilot. With the inputs that we know, the filter would make a disturbance of that.
+    Before the first step somebody else flew the vehicle, such as the autopilot during its climb.
+    With our inputs the filter would mistake that for a disturbance.
     """
-    placed = [i for i, each in enumerate(measurements) if each.position is not None]
+    placed = [i for i, measurement in enumerate(measurements) if measurement.position is not None]
     return measurements[placed[-1] :] if placed else ()
 
 
 class Leaps:
-    """Watch over what is measured: each is held against what was measured before."""
+    """Leap detection: each measurement is compared with the previous one."""
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         self.off_m: list[float] = []
-        """Displacement of the newest position from where the vehicle can have come to, on each axis
+        """Displacement of the newest position from where the vehicle could have moved, on each axis
         [m]; empty unless it has leapt."""
         self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position = self._velocity = np.full(scenario.model.axes, math.nan)
-        """Newest position [m] and velocity [m/s] of each axis; NaN before any."""
+        """Newest position [m] and velocity [m/s] of each axis; NaN before the first."""
         self._position_ns = self._velocity_ns = 0
-        """Their stamps."""
 
     def leaps(self, measured: Measurement, numbers: Array) -> bool:
-        """Remember a measurement; whether no vehicle can have come so far since the last one.
+        """Store a measurement; True if it is further away than any vehicle could have moved.
 
         Args:
             measured: the measurement.
-            numbers: its positions and velocities, NaN for what is not measured; shape (2, axes).
+            numbers: its positions and velocities, NaN if missing; shape (2, axes).
         """
         stamp_ns, position, velocity = measured
         p, v = self._position, self._velocity
         time_p, time_v = (
-            (stamp_ns - each) / SECOND_NS for each in (self._position_ns, self._velocity_ns)
+            (stamp_ns - last_ns) / SECOND_NS for last_ns in (self._position_ns, self._velocity_ns)
         )
         leaps = has_leapt(p, v, numbers, time_p, time_v, self._noise_m, self._noise_mps)
         self.off_m = []
         if leaps and position is not None:
             moves = zip(p.tolist(), v.tolist(), position, velocity or v.tolist(), strict=True)
-            off_m = [displacement(*each, time_p) for each in moves]
+            off_m = [displacement(*last_ns, time_p) for last_ns in moves]
             if any(abs(off) > most_m(time_p, self._noise_m) for off in off_m):
                 self.off_m = off_m
-        # Also after a leap: else whatever is measured after it would be one, too.
+        # Stored even after a leap: otherwise every later measurement would count as one, too.
         if position is not None:
             self._position, self._position_ns = numbers[0], stamp_ns
         if velocity is not None:
@@ -226,7 +230,7 @@ class Leaps:
 
 @compilable
 def all_within(table: Table, most: float) -> bool:
-    """Whether all numbers have at most this magnitude; a NaN has not."""
+    """Whether all numbers have at most this magnitude; False for NaN."""
     within = True
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
@@ -244,14 +248,13 @@ def has_leapt(
     noise_m: float,
     noise_mps: float,
 ) -> bool:
-    """Whether a measurement has jumped further than any vehicle could have moved; NaN has not
-    jumped.
+    """Whether a measurement is further away than any vehicle could have moved; False for NaN.
 
     Args:
-        position, velocity: of each axis, as they were measured last [m], [m/s].
-        measured: positions and velocities now; shape (2, axes).
-        time_p, time_v: times since then [s].
-        noise_m, noise_mps: what noise may add to a change [m], [m/s].
+        position, velocity: previous measurement of each axis [m], [m/s].
+        measured: new positions and velocities; shape (2, axes).
+        time_p, time_v: time since the previous position and velocity [s].
+        noise_m, noise_mps: change that noise alone may cause [m], [m/s].
     """
     leaps = False
     for i in range(len(position)):
@@ -264,7 +267,7 @@ def has_leapt(
 
 
 class Newest:
-    """Stand-in for a filter: each number as it was measured last."""
+    """Stand-in for a filter: the newest measured value of each number."""
 
     def __init__(self, axes: int) -> None:
         self._zero = np.zeros(axes)
@@ -275,14 +278,14 @@ class Newest:
         self.take(measured, numbers)
 
     def advance(self, due: Array, swing: Array | None = None) -> None:
-        """Advance by a step, in which no number changes by itself."""
+        """Advance by a step; the values stay as they are."""
 
     def disturbance(self) -> Array:
-        """Disturbance of each axis, of which nothing is known: 0 [m/s]."""
+        """Disturbance of each axis: unknown, so 0 [m/s]."""
         return self._zero
 
     def take(self, measured: Measurement, numbers: Array) -> None:
-        """Keep a measurement, in place of the one before."""
+        """Replace the previous measurement."""
         if measured.position is not None:
             self._state[:, 0] = numbers[0]
         if measured.velocity is not None:

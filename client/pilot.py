@@ -1,9 +1,9 @@
 """Pilot: flies the chosen input at every step, and records the step.
 
 The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
-at epoch + k Δt, and every stamp that control uses is read here. What the vehicle does at all,
-`client.failsafe` decides; which input of a horizon it flies, `client.compensator`; and
-`client.clamp` lets nothing pass that the vehicle must never do.
+at epoch + k Δt, and every time stamp used for control is taken here. `client.failsafe` decides what
+the vehicle may do, `client.compensator` which input of a horizon it flies, and `client.clamp`
+rejects what the vehicle must never do.
 """
 
 import math
@@ -36,24 +36,24 @@ from skytether.shared.wire.protocol import (
 )
 
 LAND_MPS = 0.5
-"""Speed at which the vehicle descends to land [m/s]."""
+"""Speed of descent when landing [m/s]."""
 STOPPED = (Mode.FAULT, Mode.MANUAL)
-"""Modes in which nothing but zero is flown, at once."""
+"""Modes in which the input is zero at once."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
-"""Modes in which a vehicle stays where it is, or above that place."""
+"""Modes in which a vehicle holds its position, or descends on it."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
-"""Reasons for which a horizon is dropped that is made for an impossible time."""
+"""Reasons for dropping a horizon that was made for an impossible time."""
 
 
 class Pilot:
-    """Flies one vehicle by the horizons that come, and without them.
+    """Flies one vehicle, with a horizon or without.
 
     Args:
-        scenario: what is flown.
+        scenario: scenario of the flight.
         number: number of the vehicle.
-        vehicle: what flies.
-        failsafe: what the vehicle does at all.
-        recorder: takes one row a step.
+        vehicle: the vehicle, simulated or real.
+        failsafe: decides what the vehicle may do.
+        recorder: receives one row per step.
     """
 
     def __init__(
@@ -67,18 +67,16 @@ class Pilot:
         self._terms = scenario.terms()
         self._dt_ns, self._is_mission = self._terms.dt_ns, bool(self._terms.join)
         self.steps = scenario.steps
-        """Steps of the flight."""
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
         along = regulator(scenario) if self._terms.splines else None
         self.compensator = Compensator(self._terms, along)
-        """Compensator, which chooses the input."""
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
-        # The paper's vehicle bounds no change: with `exhausted = "hold"` the clamp keeps the input
-        # finite and bounded, and no more.
+        # The paper's vehicle bounds no change: with `exhausted = "hold"` the clamp only keeps the
+        # input finite and bounded.
         self._change_max = (
             math.inf
             if self._terms.exhausted == "hold"
@@ -89,41 +87,40 @@ class Pilot:
         self.next_ns: int | None = None
         """Time at which the next step begins; None before the flight."""
         self.step = 0
-        """Step that comes next."""
         self.flown = 0
-        """Step that is flown; up to its begin measurements were taken."""
+        """Present step; measurements up to its start are included."""
         self._flown_ns = 0
         """Time at which it began."""
         self._takes_from: int | None = None
-        """Step of the first observation that said that horizons are flown; None while they are
-        not."""
+        """Step of the first observation that announced that horizons are accepted; None while they
+        are not."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
-        """Magnitude of the part of it that is no feedback [m/s]."""
+        """Magnitude of the part of it that is not feedback [m/s]."""
         self.covered = 0
-        """Number of steps for which there was an input planned."""
+        """Number of steps with a planned input."""
         self._covered_last = 0
-        """Step after the last of these."""
+        """Step after the last one with a planned input."""
         self.missed = 0
-        """Steps slept through."""
+        """Number of steps missed because the process was delayed."""
         self.leap_m: tuple[float, ...] | None = None
-        """Leap that nobody has decided about: displacement on each axis [m], or empty where the
-        velocity alone has leapt. None without one."""
+        """Leap that the operator has not decided about: displacement on each axis [m], or empty if
+        only the velocity has leapt. None without one."""
 
     @property
     def without_ns(self) -> int:
-        """Time for which there has been no input planned [ns]."""
+        """Time without a planned input [ns]."""
         return (self.step - self._covered_last) * self._dt_ns
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ that its filter has found on each axis [m/s]; 0 without a filter."""
+        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._navigation.disturbance
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns], or 0 before any."""
+        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._epoch_ns or 0
 
     def starts_ns(self, step: int) -> int:
@@ -132,11 +129,11 @@ class Pilot:
         return self._epoch_ns + step * self._dt_ns
 
     def begin(self, *, now_ns: int, began_ns: int | None = None) -> None:
-        """Begin the flight, or go on with that of an earlier life.
+        """Begin the flight, or continue that of an earlier run.
 
         Args:
             now_ns: time now.
-            began_ns: begin of step 0; None for now.
+            began_ns: start of step 0; None for now.
         """
         if began_ns is None:
             self._epoch_ns = self.next_ns = now_ns
@@ -149,25 +146,23 @@ class Pilot:
     # -- horizons ----------------------------------------------------------------------------
 
     def offer(self, horizon: Horizon | Trajectory, *, now_ns: int) -> None:
-        """Hold a horizon from now on, if it is the newest and may be flown.
+        """Put a horizon in force if it is the newest and may be flown.
 
-        One that was planned when the vehicle had not yet said that it would fly it begins where the
-        vehicle is not: the server reckoned with none.
+        A horizon that was planned before the server knew that horizons are accepted is dropped: it
+        starts where the vehicle is not.
 
         Raises:
             ProtocolError: it is dropped.
         """
         terms = self._terms
-        # One that was overtaken is late anyway, and says nothing of the newest.
+        # A horizon that was overtaken is late anyway, and says nothing about the newest.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
-                # Its committed inputs were meant to pass before it comes.
+                # Its committed inputs are meant to have passed when it arrives.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = horizon.step - horizon.age
-        # Planned before the server knew that horizons are flown: it begins where the vehicle would
-        # be without any.
         if self._takes_from is None or 0 <= observed < self._takes_from:
             raise ProtocolError(Drop.NOT_TAKEN)
         try:
@@ -180,7 +175,7 @@ class Pilot:
             self._failsafe.horizon_taken(now_ns=now_ns)
 
     def mode_changed(self, cause: Reason) -> None:
-        """Drop the horizon, or the readiness for one, as another mode or reason asks for."""
+        """Drop the horizon, or stop accepting any, as the new mode or reason requires."""
         if not self._failsafe.takes:
             self._takes_from = None
         if cause in DROPPING:
@@ -190,15 +185,13 @@ class Pilot:
     # -- steps -------------------------------------------------------------------------------
 
     def fly(self, *, now_ns: int) -> None:
-        """Advance to the present step; one that was slept through was flown with the old input."""
+        """Advance to the present step; during missed steps the old input was flown."""
         assert self._epoch_ns is not None
         assert self.next_ns is not None
-        # A client that sleeps past the end of its flight still flies the last step, and ends as
-        # usual.
+        # A client delayed beyond the end of its flight still flies the last step.
         present = min((now_ns - self._epoch_ns) // self._dt_ns, self.steps - 1)
         self.missed += present - self.step
-        # Steps that were slept through are navigated one by one, for the filter predicts a step at
-        # a time.
+        # Missed steps are navigated one by one: the filter predicts one step at a time.
         for step in range(self.flown, present):
             self._navigate(step + 1)
         late_ns = now_ns - self.next_ns
@@ -219,15 +212,17 @@ class Pilot:
         self._record()
 
     def _navigate(self, step: int) -> None:
-        """Take what was measured up to the begin of a step."""
+        """Process the measurements up to the start of a step."""
         now_ns = self.starts_ns(step)
         measurements = self._vehicle.measurements(now_ns=now_ns)
         self._navigation.advance(measurements, self._input, now_ns=now_ns)
 
     def _choose(self, now_ns: int) -> Array:
-        """Input of the present step [m/s], shape (axes,), and what follows from it."""
+        """Choose the input of the present step [m/s], and note what follows from it; shape
+        (axes,).
+        """
         failsafe, compensator = self._failsafe, self.compensator
-        known = self._navigation
+        navigation = self._navigation
         if not self._navigation.is_known:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         if self._vehicle.leap_m is not None:
@@ -236,36 +231,40 @@ class Pilot:
         elif self._navigation.leapt:
             self.leap_m = tuple(self._navigation.leaps.off_m)
             failsafe.leapt(now_ns=now_ns)
-        # Asked first: `choose` goes on to this step.
+        # Before `choose`, which advances the compensator to this step.
         had_plan = compensator.covered
         self._rest()
-        wanted, told = compensator.choose(
-            self.step, known.predicted, known.disturbance, self._input
+        wanted, without_feedback = compensator.choose(
+            self.step, navigation.predicted, navigation.disturbance, self._input
         )
         if failsafe.mode is Mode.LAND:
             wanted = wanted if compensator.rests else [0.0] * self._terms.axes
-            if self._terms.axes > ALTITUDE and known.estimate[ALTITUDE, 0] > 0.0:
+            if self._terms.axes > ALTITUDE and navigation.estimate[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
-        told = told if compensator.follower.feeds_back else wanted
+        without_feedback = without_feedback if compensator.follower.feeds_back else wanted
         speed_max = self._speed_max(had_plan, compensator.covered)
         flown = clamped(
             wanted,
             self._input.tolist(),
             self._terms.u_max,
             self._change_max,
-            told=told,
+            without_feedback=without_feedback,
             speed_max=speed_max,
         )
-        return self._settled(flown, told, speed_max, now_ns)
+        return self._settled(flown, without_feedback, speed_max, now_ns)
 
     def _settled(
-        self, flown: list[float] | None, told: Sequence[float], speed_max: float, now_ns: int
+        self,
+        flown: list[float] | None,
+        without_feedback: Sequence[float],
+        speed_max: float,
+        now_ns: int,
     ) -> Array:
-        """Input that is flown at last, and what follows from it.
+        """Input finally flown, after mode and fence.
 
         Args:
-            flown: input of each axis that may be flown [m/s]; None where it is not finite.
-            told: part of it that is no feedback, of each axis [m/s].
+            flown: input of each axis that may be flown [m/s]; None if it is not finite.
+            without_feedback: part of it that is not feedback, of each axis [m/s].
             speed_max: bound of the magnitude of that part [m/s].
             now_ns: time now.
         """
@@ -276,11 +275,12 @@ class Pilot:
             failsafe.meet(Reason.ENDED, now_ns=now_ns)
         stops = flown is None or failsafe.mode in STOPPED
         if flown is None or stops:
-            flown = told = [0.0] * self._terms.axes
-        # The braking curve is for what is told; feedback is bounded by u_max alone
-        # (docs/failsafe.md). What the fence adds is no part of it either: it may push for ever.
+            flown = without_feedback = [0.0] * self._terms.axes
+        # The braking curve applies to the input without feedback; feedback is bounded by u_max
+        # alone (docs/failsafe.md). The fence's correction does not count either: it may last for
+        # ever.
         if compensator.follower.feeds_back:
-            self._speed = min(math.hypot(*told), speed_max)
+            self._speed = min(math.hypot(*without_feedback), speed_max)
         else:
             self._speed = math.hypot(*flown)
         if not self._speed:
@@ -290,25 +290,25 @@ class Pilot:
         return np.array(flown)
 
     def _rest(self) -> None:
-        """Hold the place where a vehicle on a mission hovers: others keep away from there."""
+        """Hold the position of a vehicle that hovers on a mission: the others keep clear of it."""
         if self._is_to_rest() and self._navigation.is_known:
             self.compensator.rest(self.step, self._navigation.predicted)
 
     def _is_to_rest(self) -> bool:
-        """Whether the vehicle hovers on a mission, and holds no place yet."""
+        """Whether the vehicle hovers on a mission and does not yet hold a position."""
         hovers = self._is_mission and self._failsafe.mode in HOVERING
         compensator = self.compensator
         return hovers and compensator.in_force == NO_HORIZON and not compensator.rests
 
     def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
-        """Input that the fence lets pass; down to the ground it lets a vehicle that lands."""
+        """Input limited by the fence, which does not stop a landing vehicle from descending."""
         within = fence.limited(flown, self._navigation.predicted.tolist(), self._terms.u_max)
         if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:
             within[ALTITUDE] = flown[ALTITUDE]
         return within
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """Fly on after a leap, see `Vehicle.decide`."""
+        """Continue after a leap, see `Vehicle.decide`."""
         self._vehicle.decide(keeps_frame=keeps_frame)
         if not keeps_frame:
             self._navigation.begin_anew()
@@ -317,16 +317,16 @@ class Pilot:
 
     @property
     def is_held(self) -> bool:
-        """Whether the fence holds the vehicle back; it does not where it lands or is not ours."""
+        """Whether the fence limits the vehicle; False while it lands or somebody else flies it."""
         holds = self._fence is not None and self._fence.holds
         return holds and self._failsafe.mode not in (*STOPPED, Mode.LAND, Mode.RETURN)
 
     def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
-        """Largest speed of what is told [m/s]: without a plan what was flown is braked along.
+        """Largest speed of the input without feedback [m/s]: without a plan the vehicle brakes.
 
         Args:
-            had_plan: whether there was a plan for the step before.
-            has_plan: whether there is one for this step.
+            had_plan: whether the previous step had a plan.
+            has_plan: whether this step has one.
         """
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
         if has_plan or not brakes:
@@ -336,7 +336,7 @@ class Pilot:
     # -- what is told of a step --------------------------------------------------------------
 
     def observation(self, session: ServerSession) -> Observation | None:
-        """Observation of the step that has just begun; None where none is due, or no state known.
+        """Observation of the step that has just begun; None if none is due or the state is unknown.
 
         Args:
             session: session that it is sent in.
@@ -351,7 +351,7 @@ class Pilot:
             failsafe.mode,
             states,
             self._input,
-            session.asked,
+            session.silence_asked,
         ):
             return None
         echo = session.echo
@@ -362,13 +362,15 @@ class Pilot:
             self.flown,
             compensator.in_force,
             compensator.since,
-            stamp_us(backward_ns + MICROSECOND_NS - 1),  # a delay is told no shorter than it is
+            stamp_us(
+                backward_ns + MICROSECOND_NS - 1
+            ),  # rounded up, so that no delay is reported too short
             echo.heard,
             failsafe.mode,
             int(failsafe.takes),
             states,
             NO_INPUT if self._terms.splines else self._input,
-            session.said,
+            session.sent,
             session.hearing.silence,
         )
 
@@ -380,7 +382,7 @@ class Pilot:
         self._recorder.append_row(
             self._number,
             self.flown,
-            *self._known(),
+            *self._recorded_states(),
             compensator.covered,
             compensator.in_force,
             -1 if observed < 0 else (self.flown - observed) * self._dt_ns,
@@ -390,9 +392,11 @@ class Pilot:
             failsafe.reason,
         )
 
-    def _known(self) -> Sequence[float]:
-        """State, measured and reported state, and input, number by number, for the record."""
-        known, truth = self._navigation, self._vehicle.truth()
-        states = known.estimate if truth is None else truth
-        told = (states, known.measured, known.predicted, self._input)
-        return [number for each in told for number in each.ravel().tolist()]
+    def _recorded_states(self) -> Sequence[float]:
+        """Estimated or true, measured and predicted state, and input, number by number, for the
+        record.
+        """
+        navigation, truth = self._navigation, self._vehicle.truth()
+        states = navigation.estimate if truth is None else truth
+        recorded = (states, navigation.measured, navigation.predicted, self._input)
+        return [number for array in recorded for number in array.ravel().tolist()]

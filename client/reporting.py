@@ -1,8 +1,8 @@
-"""Reports of the vehicle's state: what the server believes, and when an observation is sent.
+"""Reports of the vehicle's state: what the server predicts, and when an observation is sent.
 
-The server rolls the newest observation on by the rule of flight (`shared.law.rule`). So does the
-vehicle, from the observation that it sent last and by the horizon that it holds. While the two lead
-to about the same, the server knows what it needs, and the vehicle may be silent.
+The server predicts the state from the newest observation by the rule of flight (`shared.law.rule`).
+The vehicle does the same from the observation that it sent last and the horizon in force. While
+this prediction is close to the real state, the server needs no observation.
 """
 
 import math
@@ -17,13 +17,13 @@ from skytether.shared.scenario.observing import Unreported, is_always, make_repo
 from skytether.shared.wire.protocol import Mode
 
 RETRY_STEPS = 4
-"""Number of steps after which a vehicle that waits for its first horizon reports once more. Later
-it waits as long again as it has waited, so that a long wait costs few packets."""
+"""Number of steps after which a vehicle that waits for its first horizon reports again. Later the
+interval doubles, so that a long wait costs few packets."""
 
 
 @compilable
 def distance_m(tau_s: Numbers, believed: Table, states: Table) -> float:
-    """Distance of two states [m]; a velocity that is off by Δv counts for τ Δv.
+    """Distance between two states [m]; a velocity error Δv counts as τ Δv.
 
     Args:
         tau_s: time constant of each axis [s].
@@ -37,11 +37,11 @@ def distance_m(tau_s: Numbers, believed: Table, states: Table) -> float:
 
 
 class BelievedState:
-    """State that the server must take the vehicle to be in, as long as nothing is lost.
+    """State that the server predicts for the vehicle, if no packet is lost.
 
     Args:
-        terms: the rule of flight.
-        compensator: holds the horizon.
+        terms: terms of the flight.
+        compensator: has the horizon in force.
     """
 
     def __init__(self, terms: Terms, compensator: Compensator) -> None:
@@ -49,15 +49,17 @@ class BelievedState:
         self._states = np.zeros((terms.axes, 2))
 
     def off_m(self, states: Array) -> float:
-        """Distance of the vehicle from it [m], see `distance_m`; states of shape (axes, 2)."""
+        """Distance of the vehicle from the predicted state [m], see `distance_m`; states of
+        shape (axes, 2).
+        """
         return distance_m(self._tau_s, self._states, states)
 
     def told(self, states: Array, flown: Array) -> None:
-        """Advance from an observation to the next step.
+        """Advance from a step with an observation to the next.
 
         Args:
-            states: what it says; shape (axes, 2).
-            flown: input that is flown from there on, of each axis [m/s].
+            states: state in the observation; shape (axes, 2).
+            flown: input flown from there on, of each axis [m/s].
         """
         self._states = self._compensator.foresee(states, flown)
 
@@ -67,28 +69,28 @@ class BelievedState:
 
 
 class Reporter:
-    """Says at each step whether an observation is sent.
+    """Decides at each step whether to send an observation.
 
     Args:
-        terms: the rule of flight.
+        terms: terms of the flight.
         report: `vehicle.report`.
-        compensator: holds the horizon; at each step the input has been chosen from it.
+        compensator: has the horizon in force; the input of the step has been chosen from it.
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
         self._dt_s = terms.dt_s
         self._compensator = compensator
         self.always = is_always(report)
-        """Whether there is an observation of every step."""
+        """Whether every step is reported."""
         self._wants = make_report(report)
         self.belief = BelievedState(terms, compensator)
-        """State that the server must take the vehicle to be in."""
+        """State that the server predicts for the vehicle."""
         self._session: int | None = None
-        """Session in which an observation was sent last; None before the first."""
-        self._known: tuple[int, Mode, int] | None = None
-        """Horizon in force, mode, and how often a horizon had come once more, as they were told."""
-        self._told, self._step = 0, 0
-        """Step that was told last, and the one that was asked about last."""
+        """Session of the newest observation; None before the first."""
+        self._reported: tuple[int, Mode, int] | None = None
+        """Horizon in force, mode and number of repeated horizons, as in the newest observation."""
+        self._reported_step, self._step = 0, 0
+        """Step of the newest observation, and latest step asked about."""
         self._ready: int | None = None
         """Step since which the vehicle waits for a horizon; None while it does not."""
 
@@ -101,39 +103,39 @@ class Reporter:
         flown: Array,
         silence: int,
     ) -> bool:
-        """Whether an observation of this step is sent; asked once, and taken for sent where it is.
+        """Whether to send an observation of this step; asked once a step, and True counts as sent.
 
         Args:
             session: number of the session.
             step: k; it has just begun.
-            mode: what the vehicle does.
-            states: what is known of its state; shape (axes, 2).
-            flown: input that is flown from here on, of each axis [m/s].
-            silence: longest silence that the server asks for [half steps]; 0 for none.
+            mode: mode of the vehicle.
+            states: known state; shape (axes, 2).
+            flown: input flown from here on, of each axis [m/s].
+            silence: longest silence that the server asks for [half steps]; 0 for no bound.
         """
-        if self.always:  # nothing need be known of what the server believes
+        if self.always:  # the server's prediction need not be known
             return True
-        known = self._compensator.in_force, mode, self._compensator.repeated
+        situation = self._compensator.in_force, mode, self._compensator.repeated
         slept = step > self._step + 1
         due = self._waits(step, mode) or session != self._session
         if not due:
-            is_news, steps = slept or known != self._known, step - self._told
+            is_news, steps = slept or situation != self._reported, step - self._reported_step
             off_m = self.belief.off_m(states)
             due = 0 < silence <= 2 * steps
             due |= self._wants(Unreported(off_m, is_news, steps, self._dt_s))
         self._step = step
         if due:
-            self._session, self._known, self._told = session, known, step
+            self._session, self._reported, self._reported_step = session, situation, step
             self.belief.told(states, flown)
         else:
             self.belief.silent()
         return due
 
     def _waits(self, step: int, mode: Mode) -> bool:
-        """Whether a vehicle that waits for a horizon says so, at once or once more.
+        """Whether a vehicle that waits for a horizon reports, at once or again.
 
         The server plans only for a vehicle that it knows to be ready. Without this, a vehicle that
-        reports every 4 s began to fly up to 4 s late, and 8 s where one packet was lost.
+        reports every 4 s began to fly up to 4 s late, and 8 s if one packet was lost.
         """
         if mode is not Mode.READY:
             self._ready = None
@@ -141,4 +143,4 @@ class Reporter:
         if self._ready is None:
             self._ready = step
             return True
-        return step - self._told >= max(RETRY_STEPS, self._told - self._ready)
+        return step - self._reported_step >= max(RETRY_STEPS, self._reported_step - self._ready)

@@ -1,12 +1,13 @@
-"""The vehicle's side of a secured link: handshakes with the server, and the channels they give.
+"""The vehicle's side of a secured link: handshakes with the server, and the channels they create.
 
-A handshake is one attempt, with one ephemeral key: it is said again, with the newest cookie, until
-the WELCOME that it brings is adopted, or for ATTEMPT_NS. What answers no open attempt is dropped,
-so that nobody can open a channel a second time, whose counters would begin anew.
+A handshake is one attempt with one ephemeral key. Its INITIATION is repeated with the newest cookie
+until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer to no open attempt is dropped,
+so that nobody can open a channel a second time, which would reset its counters.
 
-Who copies an INITIATION to the server from an address of his own is given a cookie as well, good
-for that address alone, and may hand it on: the vehicle cannot tell it from its own. So each cookie
-that comes is tried at once, and none is ever the last word; but none more often than HELLO is said.
+An attacker who copies an INITIATION to the server from another address receives a cookie valid for
+that address only, and may forward it to the vehicle, which cannot tell it from its own. So the
+vehicle tries each cookie at once and settles on none, but tries each no more often than it sends
+HELLOs.
 """
 
 from collections.abc import Callable
@@ -29,21 +30,21 @@ from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, NoiseError
 
 ATTEMPT_NS = 60 * SECOND_NS
-"""Time for which an attempt is said again before another one is begun [ns]."""
+"""Time for which an attempt is repeated before another one begins [ns]."""
 COOKIES_MAX = 64
-"""Number of cookies of an attempt that are remembered; the one tried longest ago gives way."""
+"""Number of cookies remembered per attempt; the one tried longest ago is replaced."""
 
 
 class _Attempt:
-    """A handshake that was not adopted yet."""
+    """Handshake that has not been adopted yet."""
 
     def __init__(self, noise: Initiator, hello: bytes, began_ns: int) -> None:
         self.noise = noise
         self.hello = hello
-        """Message that it carries."""
+        """HELLO message that it carries."""
         self.began_ns = began_ns
         self.tried_ns: dict[bytes, int] = {}
-        """Time at which each cookie was tried last, the longest ago first [ns]."""
+        """Time at which each cookie was last tried, oldest first [ns]."""
 
 
 class SecureLink:
@@ -51,7 +52,7 @@ class SecureLink:
 
     Args:
         key: key of the vehicle.
-        entropy: gives so many bytes that nobody else can know.
+        entropy: returns this many unpredictable bytes.
     """
 
     secure = True
@@ -63,37 +64,37 @@ class SecureLink:
         self._cookie = NO_COOKIE
         """Newest cookie, also from earlier attempts."""
         self._answers: list[bytes] = []
-        """INITIATIONs that CHALLENGEs have drawn, to be sent."""
+        """INITIATIONs to be sent in answer to CHALLENGEs."""
         self._attempt: _Attempt | None = None
         self._candidate: Channel | None = None
-        """Channel of the WELCOME that was opened last."""
+        """Channel of the newest WELCOME."""
         self._current: Channel | None = None
         self._previous: Channel | None = None
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
-        """Datagram that carries a HELLO; one of a new attempt where the message is another."""
+        """Datagram that carries a HELLO; a different message starts a new attempt."""
         attempt = self._attempt
-        # Noise seals one message per ephemeral key: another HELLO under the same key would use a
-        # nonce twice.
+        # Noise encrypts one message per ephemeral key: a second HELLO with the same key would reuse
+        # a nonce.
         if attempt is None or attempt.hello != payload or now_ns - attempt.began_ns > ATTEMPT_NS:
             key, private = self._key, self._entropy(KEY_BYTES)
-            # Padded to the length of the longest answer, so that nobody can use the server to
-            # amplify.
+            # Padded to the length of the longest answer, so that the server cannot be used for
+            # amplification.
             noise = Initiator(key.psk, prologue(key), private, pad(payload))
             self._attempt = attempt = _Attempt(noise, payload, now_ns)
             self._candidate = None
         return self._initiation(attempt, now_ns)
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any other message; a WELCOME must have been adopted."""
+        """Datagram that carries any other message; needs an adopted WELCOME."""
         assert self._current is not None
         return self._current.seal(payload)
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """Message in a datagram; None of a CHALLENGE, whose answer is in the outbox.
+        """Message in a datagram; None for a CHALLENGE, whose answer is in the outbox.
 
         Raises:
-            ProtocolError: it is not the server's, has come before, or answers nothing.
+            ProtocolError: it is not from the server, is a repeat, or answers no open attempt.
         """
         match kind(datagram):
             case channel.DATA:
@@ -111,30 +112,30 @@ class SecureLink:
         return answers
 
     def adopt(self, *, now_ns: int) -> None:
-        """Seal in the channel of the WELCOME that was opened last, and close the attempt."""
+        """Use the channel of the newest WELCOME, and close the attempt."""
         assert self._candidate is not None
         if self._current is not None:
             self._current.retire(now_ns=now_ns)
-        # Packets that the server sealed before it heard of the new channel are still under way.
+        # Packets that the server sent before it learnt of the new channel are still on their way.
         self._previous, self._current = self._current, self._candidate
         self._attempt = self._candidate = None
 
     def wants_hello(self, now_ns: int) -> bool:
-        """Whether the channel is to be replaced; not where there is none."""
+        """Whether the channel is due for replacement; False if there is none."""
         return self._current is not None and self._current.wants_successor(now_ns)
 
     def _data(self, packet: bytes, now_ns: int) -> bytes:
         _, number = channel.address(packet)
-        for each in (self._current, self._previous):
-            if each is not None and each.number == number:
-                payload = each.open(packet, now_ns=now_ns).payload
+        for open_channel in (self._current, self._previous):
+            if open_channel is not None and open_channel.number == number:
+                payload = open_channel.open(packet, now_ns=now_ns).payload
                 check_place(payload, in_handshake=False)
                 return payload
         raise ProtocolError(Drop.UNKNOWN_CHANNEL)
 
     def _challenge(self, packet: bytes, now_ns: int) -> None:
-        """Try the cookie of a CHALLENGE; one that was tried just now must draw no INITIATION."""
-        attempt = self._asked()
+        """Try the cookie of a CHALLENGE, unless it was tried just now."""
+        attempt = self._open_attempt()
         cookie = read_challenge(self._key, packet, attempt.noise.public)
         tried_ns = attempt.tried_ns.get(cookie)
         if tried_ns is not None and now_ns - tried_ns < AGAIN_NS:
@@ -145,7 +146,7 @@ class SecureLink:
     def _initiation(self, attempt: _Attempt, now_ns: int) -> bytes:
         """INITIATION of an attempt, with the newest cookie."""
         tried_ns = attempt.tried_ns
-        # Taken out and put in again: the dictionary is ordered by time.
+        # Removed and inserted again: the dictionary is ordered by time.
         tried_ns.pop(self._cookie, None)
         tried_ns[self._cookie] = now_ns
         if len(tried_ns) > COOKIES_MAX:
@@ -153,8 +154,8 @@ class SecureLink:
         return write_initiation(self._key, self._cookie, attempt.noise.message)
 
     def _response(self, packet: bytes, now_ns: int) -> bytes:
-        """WELCOME of a RESPONSE, whose channel may be adopted."""
-        attempt = self._asked()
+        """WELCOME in a RESPONSE, whose channel may be adopted."""
+        attempt = self._open_attempt()
         number, message = read_response(self._key, packet, attempt.noise.public)
         try:
             welcome, keys = attempt.noise.open(message)
@@ -166,7 +167,7 @@ class SecureLink:
         )
         return welcome
 
-    def _asked(self) -> _Attempt:
+    def _open_attempt(self) -> _Attempt:
         if self._attempt is None:
             raise ProtocolError(Drop.UNASKED)
         return self._attempt

@@ -1,9 +1,10 @@
-"""The client's side of the conversation: a session with the server, and what the server says in it.
+"""The client's side of the conversation: a session with the server, and the server's messages in
+it.
 
     HELLO → WELCOME, or a refusal → HORIZON, HEARTBEAT … → CLOSE, silence or another WELCOME
 
-Every packet of the session is echoed by its stamp, so that the server learns of the delays. What
-follows for the vehicle from what is heard, and from silence, `client.failsafe` decides.
+The client echoes the time stamp of every packet of the session, from which the server estimates the
+delays. `client.failsafe` decides what packets and silence mean for the vehicle.
 """
 
 from typing import Literal, NamedTuple
@@ -37,49 +38,49 @@ from skytether.shared.wire.protocol import (
 )
 
 SLEPT_NS = JUMP_NS // 2
-"""Time by which the server's clock goes on further than ours while we sleep [ns]; far more than
-what delays that change make of it."""
+"""Advance of the server's clock over ours that shows that this machine was suspended [ns]; far more
+than changing delays cause."""
 UNANSWERED_NS = 5 * SECOND_NS
-"""Time without a first answer after which this is said [ns]."""
+"""Time without a first answer after which this is reported [ns]."""
 REFUSED = {
     Refusal.OTHER_TERMS: Drop.OTHER_TERMS,
     Refusal.FULL: Drop.FULL,
     Refusal.TAKEN: Drop.TAKEN,
 }
-"""Why a WELCOME is dropped that refuses the vehicle."""
+"""Why a WELCOME that refuses the vehicle is dropped."""
 DEGRADED = "the server misses its deadlines"
-"""Why no newer horizon comes, as it seems, of a server that plans and says that it is degraded."""
+"""Why there is no newer horizon if the server plans and reports that it is degraded."""
 
 
 class Echo(NamedTuple):
-    """The newest packet of the server, as the vehicle tells of it."""
+    """Newest packet of the server, as the vehicle echoes it."""
 
     server_ns: int
-    """The server's clock when it was sent [ns]."""
+    """Server time at which it was sent [ns]."""
     received_ns: int
-    """Time at which it came [ns; our clock]."""
+    """Time of arrival [ns; our clock]."""
     heard: int
-    """Number of packets that have come with it, modulo NUMBERS."""
+    """Number of packets received including it, modulo NUMBERS."""
 
 
 NEVER = Echo(0, 0, 0)
-"""Echo of a server that was not heard yet."""
+"""Echo before the first packet of the server."""
 
 
 class ServerSession:
-    """Agreement of one vehicle and its server, over all sessions of the vehicle's life.
+    """Conversation between one vehicle and its server, over all sessions.
 
     Args:
-        terms: what the server has to agree to.
+        terms: terms that the server has to agree to.
         vehicle: number of the vehicle.
-        boot_id: number that no other life of this vehicle has had.
-        server: address of the server, or of the netem before it.
+        boot_id: number unique to this run of the client.
+        server: address of the server, or of the netem in front of it.
         connect_s: time after which a vehicle that was never answered gives up [s].
-        link: how messages become datagrams.
-        hearing: finds what silence to ask of the server.
-        failsafe: is told what is heard.
-        out: takes what is sent.
-        events: takes what the operator is told.
+        link: converts messages to datagrams.
+        hearing: measures losses, and decides what silence to ask of the server.
+        failsafe: is told what was received.
+        out: list to which datagrams are appended.
+        events: list to which events for the operator are appended.
     """
 
     def __init__(
@@ -102,45 +103,44 @@ class ServerSession:
         self._server = server
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
-        """Link, which turns messages into datagrams."""
         self.hearing = hearing
-        """Longest silence that is asked of the server."""
-        self.asked = hearing.silence
-        """Longest silence that the server asks of us [half steps]; 0 for none."""
-        self.said = 0
-        """Number of packets said in the session, modulo NUMBERS."""
+        """Longest silence to ask of the server."""
+        self.silence_asked = hearing.silence
+        """Longest silence that the server asks of us [half steps]; 0 for no bound."""
+        self.sent = 0
+        """Number of packets sent in the session, modulo NUMBERS."""
         self._failsafe = failsafe
         self._out = out
         self._events = events
         self.hello_ns = 0
-        """Time before which no HELLO is said again."""
+        """Time before which no further HELLO is sent."""
         self._began_ns: int | None = None
         self._is_unanswered = False
-        """Whether it has been said that nobody has answered yet."""
+        """Whether the lack of a first answer was reported."""
         self.number: int | None = None
         """Number of the session; None before the first."""
         self._is_open = False
-        """Whether that session may go on; else nothing but a WELCOME is heard."""
+        """Whether the session may continue; otherwise only a WELCOME is accepted."""
         self._server_boot_id: int | None = None
         self.echo = NEVER
         """Newest packet of the server."""
         self.idle = str(Idle.PLANS)
-        """Why no newer horizon comes, as far as the server has said."""
+        """Why no newer horizon comes, as the server last reported."""
         self._refusal: NoSession | None = None
-        """Why the server opens no session, as far as it has said so since the last one."""
+        """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
-        """Event after which there can be no session."""
+        """Event that rules out a session."""
 
     # -- what is heard -----------------------------------------------------------------------
 
     def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | Trajectory | None:
-        """Take what is said in this session.
+        """Process a datagram of this session.
 
         Returns:
-            The horizon or trajectory, where it is one.
+            The horizon or trajectory, if it contains one.
 
         Raises:
-            ProtocolError: it is to be dropped.
+            ProtocolError: it must be dropped.
         """
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
@@ -168,15 +168,11 @@ class ServerSession:
         return None
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
-        """Message in a payload; a malformed one is a mistake of the server, if it is its own.
-
-        In plaintext anybody could make the vehicle brake by such mistakes: there they count for
-        nothing.
-        """
+        """Message in a payload; the failsafe counts a malformed one if it is authenticated."""
         try:
             return decode(payload, self._terms)
         except ProtocolError:
-            # In plaintext a stranger could make the vehicle brake by five packets.
+            # In plaintext anybody could make the vehicle brake with five packets.
             if self.link.secure:
                 self._failsafe.malformed(now_ns=now_ns)
             raise
@@ -185,7 +181,7 @@ class ServerSession:
         if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if welcome.terms != self._terms:
-            # Only before the first session: in flight the vehicle keeps its horizon, and its
+            # Only before the first session: in flight the vehicle keeps its horizon, and the
             # failsafe decides.
             if self.number is None and self.failure is None:
                 differing = differences(self._terms, welcome.terms)
@@ -198,10 +194,10 @@ class ServerSession:
         self._refusal = None
         restarted = self._server_boot_id not in (None, welcome.server_boot_id)
         if restarted:
-            # Another life of the server has another clock: stamps of the two cannot be compared.
+            # A restarted server has another clock: its time stamps cannot be compared.
             self.echo = NEVER
         if self.number != welcome.session:
-            self.said = 0
+            self.sent = 0
             self.hearing.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
@@ -211,15 +207,15 @@ class ServerSession:
             self._failsafe.meet(Reason.RESTARTED, now_ns=now_ns)
 
     def _note_refusal(self, refusal: Refusal, now_ns: int) -> None:
-        """Note why there is no session, and say it once; a refusal that comes late is none."""
+        """Report why there is no session, once per reason; a late refusal is ignored."""
         if not self._failsafe.is_lost(now_ns) or refusal not in (Refusal.FULL, Refusal.TAKEN):
             return
         host, port = self._server
         reason: Literal["full", "taken"] = "full" if refusal is Refusal.FULL else "taken"
-        said = NoSession(vehicle=self._vehicle, host=host, port=port, reason=reason)
-        if said != self._refusal:
-            self._refusal = said
-            self._events.append(said)
+        sent = NoSession(vehicle=self._vehicle, host=host, port=port, reason=reason)
+        if sent != self._refusal:
+            self._refusal = sent
+            self._events.append(sent)
 
     def _check(self, message: Welcome | Horizon | Trajectory | Heartbeat | Close) -> None:
         named = message.vehicle, message.session
@@ -227,11 +223,12 @@ class ServerSession:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
 
     def _heard(self, message: Welcome | Horizon | Trajectory | Heartbeat, now_ns: int) -> None:
-        """Note a packet of the session, and a sleep that our own clock has not told of.
+        """Note a packet of the session, and detect that this machine was suspended.
 
-        A leap of it may be a clock that was set, or real time that was slept through
-        (`shared.core.steady`): the server's clock has gone on as well then. Who sleeps for longer
-        than stamps are good for is forgotten by the server, whose WELCOME tells the whole time.
+        Our clock may have stood still, or its jump was mistaken for a clock that was set
+        (`shared.core.steady`); the server's clock has gone on in both cases. After a suspension
+        longer than time stamps can express, the server has forgotten the session, and its WELCOME
+        contains the full time.
         """
         self._check(message)
         expected_ns = self.echo.server_ns + now_ns - self.echo.received_ns
@@ -244,14 +241,14 @@ class ServerSession:
         self._failsafe.heard(now_ns=now_ns)
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
         if not isinstance(message, Welcome):
-            self.asked = message.silence
+            self.silence_asked = message.silence
             self.hearing.hear(message.number, server_ns)
 
     # -- what is said ------------------------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> None:
-        """Say HELLO where nobody is heard, or where the link needs new keys."""
-        # A motion of an earlier life is flown before there is a session.
+        """Send HELLO if the server is not heard, or the link needs new keys."""
+        # The motion of an earlier run is flown before there is a session.
         silent = self.number is None or self._failsafe.is_lost(now_ns)
         wanted = silent or self.link.wants_hello(now_ns)
         if wanted and now_ns >= self.hello_ns:
@@ -261,28 +258,28 @@ class ServerSession:
             self._out.append(Datagram(self.link.hello(hello, now_ns=now_ns), self._server))
 
     def rest(self, *, now_ns: int) -> None:
-        """Look later whether a HELLO is wanted, in a session that waits for its vehicle."""
+        """Delay the next HELLO of a session that waits for its vehicle to take off."""
         if self.number is not None:
             self.hello_ns = max(self.hello_ns, now_ns + AGAIN_NS)
 
     def send(self, message: Observation | Close) -> None:
         """Send a message in the session."""
-        self.said = (self.said + 1) % NUMBERS
+        self.sent = (self.sent + 1) % NUMBERS
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
 
     def tell_time(self, step: int, epoch_us: int, error_us: int) -> None:
-        """Tell the time of day of step 0; it is no packet by which losses are counted."""
+        """Send the time of day of step 0; this packet does not count in the loss statistics."""
         assert self.number is not None
-        said = Time(self._vehicle, self.number, step, epoch_us, error_us)
-        self._out.append(Datagram(self.link.seal(encode(said)), self._server))
+        sent = Time(self._vehicle, self.number, step, epoch_us, error_us)
+        self._out.append(Datagram(self.link.seal(encode(sent)), self._server))
 
     def close(self) -> None:
-        """Close the session: only another WELCOME opens one again."""
+        """Close the session; only another WELCOME opens one."""
         self._is_open = False
 
     def wait(self, *, now_ns: int) -> bool:
-        """Whether to go on waiting for the flight; where no session has come for long, it fails."""
-        if self.number is not None:  # it is the vehicle that is not up yet
+        """Whether to go on waiting for the flight; fails after too long without a session."""
+        if self.number is not None:  # the vehicle is not up yet
             return True
         if self._began_ns is None:
             self._began_ns = now_ns
@@ -294,16 +291,16 @@ class ServerSession:
         return False
 
     def _say_unanswered(self, left_ns: int, waited_ns: int) -> None:
-        """Say once, after a while, that nobody has answered."""
+        """Report once, after a while, that the server has not answered."""
         if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
             return
         self._is_unanswered = True
         host, port = self._server
-        said = Unanswered(vehicle=self._vehicle, host=host, port=port, left_s=left_ns / SECOND_NS)
-        self._events.append(said)
+        sent = Unanswered(vehicle=self._vehicle, host=host, port=port, left_s=left_ns / SECOND_NS)
+        self._events.append(sent)
 
     def _give_up(self, waited_s: float) -> None:
-        """Fail for want of a first session; a refusal has been said before."""
+        """Fail for lack of a first session; a refusal has been reported already."""
         if self._refusal is not None:
             self.failure = self._refusal
             return

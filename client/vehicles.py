@@ -1,6 +1,7 @@
-"""The table of vehicles: what `vehicle.kind` may name, and what makes each of them.
+"""Table of vehicles: the names that `vehicle.kind` accepts, and how each vehicle is made.
 
-A plug-in's vehicle is an entry like these. What one needs beside numpy is imported when it is made.
+A plug-in adds a vehicle in the same way. Packages that a vehicle needs beside numpy are imported
+when it is made.
 """
 
 from skytether.client.simulated import vehicle as computed
@@ -12,18 +13,19 @@ from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
 
 vehicle = VEHICLES
-"""Decorator of a vehicle: a function of the `Scenario` and its number that makes a `Vehicle`."""
+"""Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
+`Vehicle`."""
 
 
 @vehicle
 def simulated(scenario: Scenario, number: int) -> Vehicle:
-    """Velocity loop of first order in wind, computed: eq. (1), and what may differ from it."""
+    """Simulated velocity loop of first order in wind: eq. (1), with optional deviations from it."""
     return computed.simulated(scenario, number)
 
 
 @vehicle
 def quadrotor(scenario: Scenario, number: int) -> Vehicle:
-    """Quadrotor with rotors and loops of its own, in wind and turbulence, computed."""
+    """Simulated quadrotor with rotors and control loops, in wind and turbulence."""
     return computed.quadrotor(scenario, number)
 
 
@@ -36,10 +38,10 @@ def mavlink(scenario: Scenario, number: int) -> Vehicle:
 
 
 def make(scenario: Scenario, number: int) -> Vehicle:
-    """The vehicle of a scenario with a number.
+    """Vehicle of a scenario with a number.
 
     Raises:
-        ConfigError: there is none of that name, or it cannot be made.
+        ConfigError: the kind is unknown, or the vehicle cannot be made.
     """
     try:
         named = policies.shape(scenario.vehicle.kind, VEHICLES)

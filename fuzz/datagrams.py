@@ -123,7 +123,7 @@ class EndpointInFlight(Datagrams):
         self.client = Client(
             scenario, self._vehicle, server=("server", 0), vehicle=1, boot_id=2**50, link=link
         )
-        self.server = Server(scenario, boot_id=2**40, entropy=entropy, gate=gate, room=4)
+        self.server = Server(scenario, boot_id=2**40, entropy=entropy, gate=gate, capacity=4)
         for _ in range(200):
             self._pass()
 

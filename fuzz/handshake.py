@@ -96,7 +96,7 @@ class Strangers(EndpointInFlight):
         for client in (self.client, self.newcomer):
             self._unheard(client, payload, SERVER)
         assert [each.vehicle for each in self.server.sessions] == [1], payload.hex()
-        assert not self.server.sessions.coming, payload.hex()
+        assert not self.server.sessions.welcomed_vehicles, payload.hex()
         assert self.client._session.number == self._session, payload.hex()
         assert self.newcomer._session.number is None, payload.hex()
 
@@ -132,7 +132,7 @@ class Holder(Datagrams):
         self._now_ns, self._heard = SECOND_NS, 0
         self._gate = server_secure.SecureGate(self._keyring, entropy=self._entropy)
         self.server = Server(
-            self._scenario, boot_id=2**40, entropy=self._entropy, gate=self._gate, room=4
+            self._scenario, boot_id=2**40, entropy=self._entropy, gate=self._gate, capacity=4
         )
         self._link = client_secure.SecureLink(self._key, entropy=self._entropy)
         self.client = Client(
@@ -179,7 +179,7 @@ class Holder(Datagrams):
         assert sum(len(each.payload) for each in end.outbox()) <= question, packet.hex()
         assert len(end.events()) <= EVENTS_MAX + 20
         assert {each.vehicle for each in self.server.sessions} <= {NEWCOMER}, packet.hex()
-        assert {*self.server.sessions.coming} <= {NEWCOMER}, packet.hex()
+        assert {*self.server.sessions.welcomed_vehicles} <= {NEWCOMER}, packet.hex()
         known = self._gate._vehicles
         assert {*known} <= {NEWCOMER}
         assert all(len(each.pending) <= server_secure.PENDING_MAX for each in known.values())

@@ -1,1 +1,1 @@
-"""The ground side: estimate the vehicle's state, plan, decide when a horizon is worth a packet."""
+"""The server: estimates the vehicles' states, plans, and decides when to send a plan."""

@@ -39,26 +39,27 @@ class ServerOptions(ProcessOptions):
     """Options of `skytether server`."""
 
     bind: str = "127.0.0.1:47001"
-    """HOST:PORT to listen on; port 0 takes a free one. An IPv6 host stands in brackets, as in
-    [::1]:47001; its socket hears IPv6 alone, even that of [::]. A name means its IPv4 address, if
-    it has one."""
+    """HOST:PORT to listen on; port 0 takes a free one. An IPv6 host is written in brackets, as in
+    [::1]:47001; its socket receives IPv6 only, even for [::]. A name means its IPv4 address if it
+    has one."""
     vehicles: Annotated[int, Argument(metavar="N")] = VEHICLES_MAX
-    """Most vehicles at once, in each worker."""
+    """Largest number of vehicles at once, per worker."""
     workers: Annotated[int, Argument(metavar="N")] = 1
-    """Number of processes that share the address and the vehicles, one a core; with several, each
-    has files of its own, numbered, as in RECORD.1 or RECORD.1.mcap, and worker N serves metrics at
-    PORT + N - 1."""
+    """Number of processes that share the address and the vehicles, best one per core. With several,
+    each writes numbered files of its own, as in RECORD.1 or RECORD.1.mcap, and worker N serves
+    metrics at PORT + N - 1."""
     keys: Path | None = None
-    """File of the keys of all vehicles that may fly, made by `skytether keygen`. Without it the
-    link is plaintext, which is refused where other machines can reach it."""
+    """File with the keys of all vehicles, made by `skytether keygen`. Without it the link is
+    plaintext, which is refused if other machines can reach the address."""
     insecure: bool = False
-    """Do without keys even where other machines can reach it: anybody there can fly vehicles."""
+    """Accept plaintext even if other machines can reach the address: anybody there can fly
+    vehicles."""
 
 
 def serve(argv: Sequence[str]) -> None:
     """Plan for every vehicle that asks for it, until SIGINT or SIGTERM.
 
-    SIGUSR1 prints what was counted so far.
+    SIGUSR1 prints the counters so far.
     """
     options = command.parse(ServerOptions(), argv, "skytether server", serve.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_536)
@@ -88,14 +89,16 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the planner before a vehicle waits for it, so that workers share its memory."""
+    """Load the compiled planner before it is needed, and before workers are forked, so that they
+    share its memory.
+    """
     others = other_schemes(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)
 
 
 def _numbered(options: ServerOptions, number: int) -> ServerOptions:
-    """Options of one of several workers, with files and an address for metrics of its own."""
+    """Options of worker `number`, with files and a metrics address of its own."""
 
     def own(path: Path | None) -> Path | None:
         if path and path.suffix == RECORDING:
@@ -119,8 +122,8 @@ def _numbered(options: ServerOptions, number: int) -> ServerOptions:
 def _work(
     options: ServerOptions, keyring: Keyring | None, bind: Address | socket, number: int = 0
 ) -> None:
-    """Run the server, or one of several workers with a number and its own options."""
-    # Each worker knows sessions of its own.
+    """Run the server, or one of several workers."""
+    # Each worker has sessions of its own.
     gate: Gate = PlainGate()
     forms: tuple[Form, ...] = ()
     if keyring:
@@ -142,7 +145,7 @@ def _work(
             boot_id=secrets.randbits(64),
             entropy=secrets.token_bytes,
             gate=gate,
-            room=options.vehicles,
+            capacity=options.vehicles,
             recorder=running.recorder,
             plans=running.fed("plan", plan_columns(axes, control.horizon)),
             stopwatch=stopwatch,

@@ -1,11 +1,11 @@
-"""Algorithm of the server: what is computed at a step of n vehicles, without any datagram.
+"""Algorithm of the server: everything computed at a step for n vehicles, without any networking.
 
     observations → x̂(k), x̂(k+d) (`schemes`) → X_p(k+d), U(k+d), V, cost gap, deviation
-    (`mpc.hierarchical`) → event? (`trigger`) → what is sent, remembered.
+    (`mpc.hierarchical`) → event? (`trigger`) → plans are sent and remembered.
 
-With the schemes "predictive" and "none" d is 0; with "trajectory" nothing is planned, and
-`schemes.trajectory`, or on a mission `missions.mission_planner`, stands in place of both. Every
-vehicle is planned for at every step, for planning is a small part of what a step costs.
+The schemes "predictive" and "none" have d = 0. With "trajectory" there is no MPC:
+`schemes.trajectory`, or on a mission `missions.mission_planner`, takes its place. Every vehicle is
+planned for at every step, since planning is a small part of the cost of a step.
 """
 
 from collections import Counter
@@ -36,8 +36,8 @@ from skytether.shared.wire.protocol import Idle, Observation, committed_max
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
 """Members of `Idle` as plain numbers, for kernels."""
 BLOCK = 128
-"""Vehicles that are planned for at a time: what belongs to them stays in the cache, and no array is
-so large (128 KiB) that the C library would ask the kernel for its memory, and fault it in, anew."""
+"""Number of vehicles planned for together: their data stay in the cache, and no array is so large
+(128 KiB) that the C library would get new memory from the kernel for it each time."""
 
 
 def _mission(fleet: Fleet) -> Scheme:
@@ -55,11 +55,11 @@ def _mission(fleet: Fleet) -> Scheme:
 
 
 MISSION = Entry(_mission, (missions, splines))
-"""Scheme of vehicles that keep apart."""
+"""Scheme of vehicles on a mission."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
-    """Names of the modules whose kernels are not called where a scenario is flown."""
+    """Names of the modules whose kernels a scenario does not use."""
     entry = MISSION if scenario.is_mission else SCHEMES[scenario.control.scheme]
     every = chain.from_iterable(each.kernels for each in (MISSION, *SCHEMES.values()))
     names = tuple(f"{each.__name__}." for each in {*every}.difference(entry.kernels))
@@ -70,26 +70,27 @@ class Decisions(NamedTuple):
     """Decisions on n vehicles at a step; valid until the next decisions are made."""
 
     batch: Batch
-    """The vehicles, what is foreseen of them, and which are sent their plan."""
+    """The vehicles, their predictions, and which of them are sent a plan."""
     figures: Figures
     """Costs of the plans; shape (n,)."""
     planned: Array
     """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
     verdict: Verdict
-    """Verdict of the trigger."""
+    """Result of the trigger."""
     event: Flags
     """Whether each vehicle is sent its plan; shape (n,)."""
     solve_ns: int
-    """Time that planning for all of them took [ns], or -1 where nobody measures it."""
+    """Time taken to plan for all of them [ns], or -1 if not measured."""
 
 
 class Controller:
-    """Server's part of the paper's algorithms for up to `room` vehicles.
+    """The paper's algorithms on the server, for up to `capacity` vehicles.
 
     Args:
-        scenario: what to fly, and how to plan.
-        terms: the same, as far as both ends agree on it.
-        clock: knows half of the smallest round trip of each vehicle.
+        scenario: scenario of the flight.
+        terms: its terms.
+        capacity: largest number of vehicles.
+        clock: clock map, which knows the delays of each vehicle.
         stopwatch: measures the parts; the core has no clock of its own.
         references: see `Desired`.
     """
@@ -98,67 +99,67 @@ class Controller:
         self,
         scenario: Scenario,
         terms: Terms,
-        room: int,
+        capacity: int,
         clock: ClockMap,
         stopwatch: Stopwatch,
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         control = scenario.control
-        # Arrays of a block are allocated once, and written anew for each block of a tick.
-        block = min(room, BLOCK)
+        # Arrays of a block are allocated once and reused for each block of a tick.
+        block = min(capacity, BLOCK)
         self._age_max = terms.age_max
         self._clock = clock
         most = committed_max(terms)
         self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
-        """Longest delay to a vehicle that a horizon has room for [ns]."""
+        """Longest uplink delay with which a horizon can still be flown [ns]."""
         if not terms.indexed:
-            self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
-        self.desired = Desired(scenario, terms, room, block, references)
-        """Desired trajectories as far as they are known."""
+            self._uplink_max_ns = UNSEEN  # its first input is flown whenever it arrives
+        self.desired = Desired(scenario, terms, capacity, block, references)
+        """Desired trajectories."""
         is_mission = scenario.is_mission and references is not None
         entry = MISSION if is_mission else SCHEMES[scenario.control.scheme]
-        fleet = Fleet(scenario, terms, room, block, clock, self.desired, references, stopwatch)
+        fleet = Fleet(scenario, terms, capacity, block, clock, self.desired, references, stopwatch)
         self.scheme = entry.make(fleet)
-        """What is believed of vehicles, planned and sent."""
-        self._terms, self._room, self._block = terms, room, block
+        """Scheme, which predicts, plans and encodes."""
+        self._terms, self._capacity, self._block = terms, capacity, block
         self.faults: list[str] = []
-        """Tracebacks of mistakes in plug-ins' policies, one for each policy, to be told."""
-        self._sent_step = np.full(room, -1, dtype=np.int64)
-        """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
-        self._heartbeat_due: Flags = np.zeros(room, dtype=np.bool_)
-        """Whether each vehicle is sent a heartbeat at this tick if nothing else; shape (room,)."""
+        """Tracebacks of errors in plug-ins' policies, one per policy, to be reported."""
+        self._sent_step = np.full(capacity, -1, dtype=np.int64)
+        """Step of the newest horizon sent to each vehicle, or -1; shape (capacity,)."""
+        self._heartbeat_due: Flags = np.zeros(capacity, dtype=np.bool_)
+        """Whether each vehicle is due a heartbeat at this tick unless a plan is sent; shape
+        (capacity,)."""
         self._heartbeats = False
-        """Whether any is."""
-        self._able = np.zeros(room, dtype=np.bool_)
-        """Scratch: whether each of some vehicles is decided on; shape (room,)."""
+        """Whether any of them is due one."""
+        self._able = np.zeros(capacity, dtype=np.bool_)
+        """Scratch array: which of the given vehicles are decided on; shape (capacity,)."""
         self._all, self._none = np.arange(block), np.arange(0)
-        """Indices of all vehicles of a block, and of none."""
         self.change_trigger(control)
         self._stopwatch = stopwatch
-        self.last_step = np.full(room, -1, dtype=np.int64)
-        """Step of each vehicle that was decided last, or -1; shape (room,)."""
+        self.last_step = np.full(capacity, -1, dtype=np.int64)
+        """Latest step decided for each vehicle, or -1; shape (capacity,)."""
         self.observed_step = self.scheme.observed_step
-        """Step of the newest observation of each vehicle, or -1; shape (room,)."""
-        self.idle = np.zeros(room, dtype=np.int64)
-        """Why there was no plan for each vehicle, or none sent, one of `Idle`; shape (room,)."""
-        self._takes = np.ones(room, dtype=np.bool_)
-        """Whether each vehicle flies horizons, as it said last; shape (room,)."""
+        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+        self.idle = np.zeros(capacity, dtype=np.int64)
+        """Why each vehicle got no plan, one of `Idle`; shape (capacity,)."""
+        self._takes = np.ones(capacity, dtype=np.bool_)
+        """Whether each vehicle accepts horizons, as it last reported; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
-        self.budget = SharedBudget(shared, clock, room) if shared else None
-        """Bytes that all vehicles share, where there is a bound."""
+        self.budget = SharedBudget(shared, clock, capacity) if shared else None
+        """Byte budget of all vehicles; None if there is none."""
 
     @property
     def counts(self) -> Counter[str]:
-        """Events that were counted, by name."""
+        """Events counted so far, by name."""
         return Counter({**self._counts, **self.scheme.counts})
 
     def change_trigger(self, control: ControlConfig) -> None:
-        """Ask another trigger from the next step on; it knows of nothing that was sent before."""
+        """Use another trigger from the next step on; it has no memory of what was sent."""
         terms = self._terms
-        self._trigger = make_trigger(control, self._room, self.faults.append)
+        self._trigger = make_trigger(control, self._capacity, self.faults.append)
         doubts = DOUBTS if self._trigger.doubts else 0
-        self._found = found = foresight(
+        self._foresight = arrays = foresight(
             self._block,
             terms.axes,
             terms.planned,
@@ -166,20 +167,20 @@ class Controller:
             doubts,
             splines=terms.splines,
         )
-        self._known = KnownArrays(
+        self._trigger_inputs = KnownArrays(
             model=terms.model,
             dt_s=terms.dt_s,
             planned=terms.planned,
-            ahead=found.ahead,
-            horizons=found.horizons,
-            held=found.held if terms.commits else None,
+            ahead=arrays.ahead,
+            horizons=arrays.horizons,
+            held=arrays.held if terms.commits else None,
             sent_step=self._sent_step,
             heartbeat_due=self._heartbeat_due,
             desired=self.desired.states,
         )
 
     def forget(self, row: int) -> None:
-        """Begin anew with a vehicle in this row, or with a new life of it."""
+        """Reset the row for another vehicle, or for another run of its client."""
         self.last_step[row] = self._sent_step[row] = -1
         self.idle[row] = Idle.PLANS
         self._takes[row] = True
@@ -189,21 +190,23 @@ class Controller:
             self.budget.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """Keep an observation, unless a newer one is known (E11); whether it was kept."""
+        """Keep an observation unless a newer one is known (E11); returns whether it was kept."""
         kept = self.scheme.observe(row, observation)
         if kept:
             self._takes[row] = bool(observation.takes)
         return kept
 
     def note_heartbeats(self, rows: list[int]) -> None:
-        """Note the vehicles that are sent a heartbeat at this tick if nothing else."""
+        """Set the vehicles that are due a heartbeat at this tick unless a plan is sent."""
         if rows or self._heartbeats:
             self._heartbeat_due[:] = False
             self._heartbeat_due[rows] = True
             self._heartbeats = bool(rows)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
-        """Vehicles to decide on, and their steps: the step is new, and `idle` has no reason."""
+        """Vehicles to decide on, and their steps: those with a new step and no reason to be
+        idle.
+        """
         n, able = len(rows), self._able
         if n == _able(
             rows,
@@ -220,27 +223,26 @@ class Controller:
         return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
-        """Plan for vehicles that are able, and decide which are sent their horizon.
+        """Plan for vehicles, and decide which of them are sent their horizon.
 
         Args:
-            rows: the vehicles, no more than BLOCK; shape (n,).
-            step: k of each; shape (n,).
+            rows: vehicles returned by `able`, no more than BLOCK; shape (n,).
+            step: step k of each; shape (n,).
 
         Source: algorithms 1, 2.
         """
-        n, found, stopwatch = len(rows), self._found, self._stopwatch
-        self.scheme.foresee(rows, step, found)  # eq. (13)
+        n, predicted, stopwatch = len(rows), self._foresight, self._stopwatch
+        self.scheme.foresee(rows, step, predicted)  # eq. (13)
         stopwatch.lap("estimate")
-        self.scheme.plan(rows, step, found)  # eq. (14), (15)
+        self.scheme.plan(rows, step, predicted)  # eq. (14), (15)
         figures, planned = self.scheme.figures[:n], self.scheme.planned[:n]
-        situation = Situation(rows, figures, found.start[:n], planned, self._known)
+        situation = Situation(rows, figures, predicted.start[:n], planned, self._trigger_inputs)
         verdict = self._trigger.test(situation)  # eq. (16)
-        # A vehicle flies no horizon that was planned before it said that it would.
         event = verdict.event.copy()
         unsolved, events = _withhold(
             rows,
             step,
-            found.ahead,
+            predicted.ahead,
             self.observed_step,
             self._age_max,
             figures,
@@ -253,14 +255,14 @@ class Controller:
             # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
             # by.
             worth = verdict.figure if verdict.compares else figures["cost_gap"]
-            # A vehicle without a plan to fly on with cannot wait for bytes.
+            # A vehicle without a plan cannot wait for bytes.
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, urgent, worth, situation.since_sent_s)
             events = int(np.count_nonzero(event))
-        # After the budget: the committed scheme may replay only what is really sent.
-        self.scheme.remember(rows, step, found, event)  # eq. (12)
+        # After the budget: the committed scheme may only replay what is really sent.
+        self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
-        if events == n:  # of one vehicle: all or none
+        if events == n:  # with one vehicle: all or none
             sent = self._all[:n]
             self._trigger.sent(rows, figures)
         elif events:
@@ -273,7 +275,7 @@ class Controller:
         counts["events"] += events
         counts["unsolved"] += unsolved
         stopwatch.lap("trigger")
-        batch = Batch(rows, step, found, sent)
+        batch = Batch(rows, step, predicted, sent)
         return Decisions(batch, figures, planned, verdict, event, self.scheme.solve_ns)
 
 
@@ -300,7 +302,7 @@ def _able(
         if step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # Such a horizon would be over, or refused as too late, before it could be flown.
+            # Its horizon would be over, or refused as too late, on arrival.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]
@@ -320,13 +322,13 @@ def _withhold(
     idle: I1,
     event: B1,
 ) -> tuple[int, int]:
-    """Take back events whose plan is none, with the reason in `idle`; note that k is decided.
+    """Cancel events whose plan cannot be used, with the reason in `idle`, and set `last_step`.
 
-    A plan that would begin when its observation has become too old is not flown. Neither is one
-    that was made before its vehicle said that it would fly it.
+    A plan is not sent if it would begin when its observation is too old, or if its vehicle had not
+    yet said that it accepts horizons.
 
     Returns:
-        number of vehicles whose plan is unsolved, and of events that are left.
+        number of vehicles without a solution, and of remaining events.
     """
     unsolved, events = 0, 0
     for i in range(len(rows)):
@@ -346,7 +348,7 @@ def _withhold(
 
 @kernel
 def _note_sent(rows: I1, steps: I1, event: B1, sent_step: I1) -> None:
-    """Note the step at which vehicles are sent a horizon."""
+    """Set the step at which vehicles were last sent a horizon."""
     for i in range(len(rows)):
         if event[i]:
             sent_step[rows[i]] = steps[i]

@@ -1,7 +1,7 @@
 """The server as an endpoint: datagrams in, datagrams out, and a tick on its own grid of Δt.
 
-`reception` hears what vehicles say, `sessions` knows who flies, `tick` decides for all of them,
-with `controller`. Here they are put together.
+It combines `reception` (messages of vehicles), `sessions`, and `tick` with `controller` (decisions
+for all vehicles).
 """
 
 from collections import Counter
@@ -34,35 +34,34 @@ from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
-"""Vehicles at once, unless room is made for more."""
+"""Default largest number of vehicles at once."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-"""Edges between which ticks are counted for those who draw them over time [ms]."""
+"""Bin edges of the histogram of tick durations [ms]."""
 
 TRIGGER = keys_of(InFlight.TRIGGER)
-"""Keys of when horizons are sent."""
+"""Keys of the trigger."""
 ZONES = keys_of(InFlight.ZONES)
-"""Keys of where vehicles of a mission must not be."""
+"""Keys of forbidden zones on a mission."""
 GOALS = keys_of(InFlight.GOALS)
-"""Keys of where they are to fly."""
+"""Keys of a mission's goals."""
 POINT = keys_of(InFlight.POINT)
-"""Keys of a point that is led by hand."""
+"""Keys of a point that an operator moves."""
 
 
 class Server(Endpoint):
     """Plans for every vehicle that asks.
 
     Args:
-        scenario: what to fly, and how to plan.
-        boot_id: a number that no other life of the server has had.
-        entropy: makes so many random bytes.
-        gate: who may speak, and how.
-        room: for how many vehicles at once.
-        recorder: takes one row a tick and vehicle.
-        plans: takes one row for each horizon that is sent, see
-            `shared.telemetry.record.plan_columns`.
+        scenario: scenario of the flights.
+        boot_id: number unique to this run of the server.
+        entropy: returns this many random bytes.
+        gate: authenticates senders.
+        capacity: largest number of vehicles at once.
+        recorder: receives one row per tick and vehicle.
+        plans: receives one row per horizon sent, see `shared.telemetry.record.plan_columns`.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
-        references: desired trajectory of each vehicle, by its number, where they differ; left out:
-            the scenario's.
+        references: desired trajectory of each vehicle, by its number, if they differ; default: the
+            scenario's.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class Server(Endpoint):
         boot_id: int,
         entropy: Callable[[int], bytes],
         gate: Gate | None = None,
-        room: int = VEHICLES_MAX,
+        capacity: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
         plans: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
@@ -90,19 +89,21 @@ class Server(Endpoint):
         self.patience_ns = terms.dt_ns // 4
         own = scenario.is_mission or scenario.reference.shape == "target"
         if references is None and own:
-            references = lru_cache(room)(scenario.make_reference)
+            references = lru_cache(capacity)(scenario.make_reference)
         self._guided: Guided | None = None
         """Goals of a mission; None without one."""
         if scenario.is_mission and references:
             goals = given(scenario.mission.goals, scenario.model.axes)
             self._guided = Guided(references, goals)
-            references = lru_cache(room)(self._guided.of)
+            references = lru_cache(capacity)(self._guided.of)
         self.stopwatch = stopwatch or Stopwatch()
-        self._clock = ClockMap(room, terms.dt_ns, seconds_to_ns(scenario.link.asymmetry_s))
-        self.controller = Controller(scenario, terms, room, self._clock, self.stopwatch, references)
+        self._clock = ClockMap(capacity, terms.dt_ns, seconds_to_ns(scenario.link.asymmetry_s))
+        self.controller = Controller(
+            scenario, terms, capacity, self._clock, self.stopwatch, references
+        )
         silence_ns = scenario.link.patience_ns
         self.sessions = Sessions(
-            room,
+            capacity,
             entropy,
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
@@ -135,7 +136,7 @@ class Server(Endpoint):
             plans=plans,
         )
         self._expire_ns = 0
-        """Time of the next search for vehicles that are gone."""
+        """Time of the next search for silent vehicles."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Reception.hear`."""
@@ -146,12 +147,13 @@ class Server(Endpoint):
         return self._grid.due_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """The tick that is due; those that were slept through are only counted."""
-        tick_ns = self._grid.take(now_ns)
+        """Run the tick that is due; missed ticks are only counted."""
+        tick_ns = self._grid.next_tick(now_ns)
         if tick_ns is None:
             return
         if now_ns >= self._expire_ns:
-            # On the grid of its clock: a vehicle is forgotten at the same time in any company.
+            # At full seconds of the clock: a vehicle is forgotten at the same time whatever other
+            # vehicles there are.
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
@@ -167,11 +169,13 @@ class Server(Endpoint):
                 self._out += session.sealed(encode(Close(session.vehicle, session.number)))
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; with it the clocks of vehicles that tell theirs are known better."""
+        """See `Endpoint`; it improves the clock offsets of vehicles that also report the time of
+        day.
+        """
         self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """See `Endpoint`; the terms of the flight stay as they were agreed upon."""
+        """See `Endpoint`; the terms of the flight do not change."""
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
         if keys & GOALS and self._guided:
@@ -185,39 +189,46 @@ class Server(Endpoint):
             self.controller.desired.move(position, velocity if velocity.size else None, now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`: nobody may fly into a new zone."""
-        found = self.controller.scheme.objection(scenario.zones) if keys & ZONES else ""
-        return f"mission.zones: got {found}; nothing was changed" if found else ""
+        """See `Endpoint`: a new zone must not be in the way of a vehicle."""
+        objection = self.controller.scheme.objection(scenario.zones) if keys & ZONES else ""
+        return f"mission.zones: got {objection}; nothing was changed" if objection else ""
 
     @property
     def missed(self) -> int:
-        """Number of ticks that were slept through."""
+        """Number of missed ticks."""
         return self._grid.missed
 
     @property
     def dropped(self) -> Counter[Drop]:
-        """Number of datagrams dropped, by reason."""
+        """Number of dropped datagrams by reason."""
         return self._reception.dropped
 
     @property
     def refused(self) -> Counter[Refusal]:
-        """Number of HELLOs of vehicles that were refused, by reason."""
+        """Number of refused HELLOs by reason."""
         return self._reception.refused
 
     def _of_vehicle(self, row: int) -> dict[str, Any]:
-        """Figures of one vehicle; on a mission also what it waits for, and what its clock costs."""
+        """Figures of one vehicle; on a mission also what it waits for, and the effect of its
+        clock error.
+        """
         bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
-        told = {"step": int(self.controller.last_step[row]), "clock_bound_ms": round(bound_ms, 3)}
+        vehicle_figures = {
+            "step": int(self.controller.last_step[row]),
+            "clock_bound_ms": round(bound_ms, 3),
+        }
         scheme = self.controller.scheme
         clock_m, waits = scheme.clock_m(row), scheme.waits(row)
-        more = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
-        return told | {name: each for name, each in more.items() if each is not None}
+        mission_figures = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
+        return vehicle_figures | {
+            name: value for name, value in mission_figures.items() if value is not None
+        }
 
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         ticks = self._ticker.durations
         shown = self.sessions.first(VEHICLES_TOLD_MAX)
-        told = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}
+        vehicle_figures = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}
         return {
             "vehicles": len(self.sessions),
             "degraded": self._grid.degraded,
@@ -230,6 +241,6 @@ class Server(Endpoint):
             "counts": dict(self.controller.counts) | self._clock.counts,
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
-            "by_vehicle": told,
+            "by_vehicle": vehicle_figures,
             **({"budget": self.controller.budget.figures()} if self.controller.budget else {}),
         }

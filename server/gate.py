@@ -1,6 +1,6 @@
-"""The server's side of the link: who sent a datagram, and how that peer is answered.
+"""The server's side of the link: who sent a datagram, and how to answer.
 
-`PlainGate` believes everybody. `server.secure` opens what was sealed with a vehicle's key.
+`PlainGate` accepts everybody. `server.secure` decrypts packets with the vehicles' keys.
 """
 
 from typing import NamedTuple, Protocol
@@ -8,54 +8,55 @@ from typing import NamedTuple, Protocol
 from skytether.shared.core.endpoint import Datagram
 
 
-class WayBack(Protocol):
-    """Way to answer one peer."""
+class ReplyPath(Protocol):
+    """Encoder of the answers to one peer."""
 
     def seal(self, payload: bytes) -> bytes:
         """Datagram that carries a message to the peer."""
 
 
 class Call(NamedTuple):
-    """A message, and who sent it."""
+    """A message and its sender."""
 
     payload: bytes
     """The message."""
     vehicle: int | None
-    """Number of the vehicle whose key it was sealed with; None where there are no keys."""
-    line: WayBack
-    """Way to answer it."""
+    """Number of the vehicle whose key encrypted it; None without keys."""
+    line: ReplyPath
+    """Encoder of the answers to it."""
     moves: bool
-    """Whether nothing newer has come from the vehicle, so that it may have a new address."""
+    """Whether it is the newest packet of the vehicle, which may then change the vehicle's
+    address."""
 
 
 class Gate(Protocol):
-    """Turns datagrams of vehicles into messages."""
+    """Converts datagrams of vehicles to messages."""
 
     secure: bool
-    """Whether what comes out of `open` is known to come from a vehicle with a key."""
+    """Whether messages returned by `open` are authenticated."""
 
     def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
-        """Message in a datagram; None of a step towards one.
+        """Message in a datagram; None if it was part of a handshake.
 
         Raises:
-            ProtocolError: it is no vehicle's.
+            ProtocolError: it is not from a vehicle.
         """
 
     def admit(self, call: Call, *, now_ns: int) -> None:
-        """Admit the vehicle that says HELLO in this call: its further packets are opened."""
+        """Accept the vehicle whose HELLO is in this call: its further packets are opened."""
 
     def outbox(self) -> list[Datagram]:
-        """Datagrams of the gate's own to be sent; each is handed out once."""
+        """Datagrams of the gate itself; each is returned once."""
 
 
 class PlainGate:
-    """Gate without keys: everybody may pass."""
+    """Gate without keys: accepts everybody."""
 
     secure = False
 
     def open(self, datagram: Datagram, *, now_ns: int) -> Call:  # noqa: ARG002 - as of any `Gate`
         """See `Gate`."""
-        return Call(datagram.payload, None, _AS_IT_IS, moves=True)
+        return Call(datagram.payload, None, _PLAIN_REPLY, moves=True)
 
     def admit(self, call: Call, *, now_ns: int) -> None:
         """See `Gate`."""
@@ -65,12 +66,12 @@ class PlainGate:
         return []
 
 
-class _Open:
-    """Line without keys."""
+class _PlainReply:
+    """Encoder without encryption."""
 
     def seal(self, payload: bytes) -> bytes:
-        """See `WayBack`."""
+        """See `ReplyPath`."""
         return payload
 
 
-_AS_IT_IS = _Open()
+_PLAIN_REPLY = _PlainReply()

@@ -1,13 +1,14 @@
-"""Plausibility of observations: one may be well formed, in a session, and still be impossible.
+"""Plausibility check of observations: a well-formed one in an open session may still be impossible.
 
-Each is held against the one of its vehicle that was believed last:
+Each is compared with the vehicle's last accepted observation:
 
-    clock     with the delay of the other direction it makes no round trip of less than nothing
-    horizon   the horizon in force, and since when, go on with time and not beyond it
+    clock     with the delay of the other direction it must give a round trip of at least zero
+    horizon   the horizon in force, and since when, must advance with time and not beyond it
     jump      position and velocity have changed by no more than a vehicle can fly
 
-One that fails is dropped and counted. It may be the others that are wrong: REPEATS in a row that
-agree with each other are believed, and the vehicle is begun with anew.
+An observation that fails is dropped and counted. The earlier ones may be wrong instead: REPEATS
+observations in a row that are consistent with each other are accepted, and the vehicle's data are
+reset.
 """
 
 from enum import IntEnum
@@ -24,16 +25,16 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import NO_HORIZON, Observation
 
 REPEATS = 3
-"""Observations in a row, each possible after the one before, that are believed in the end."""
+"""Number of consistent observations in a row that are accepted against the earlier ones."""
 SLACK_NS = 50 * MILLISECOND_NS
 """Time by which drifting clocks may shorten a measured round trip [ns]."""
 
 
 class Statement:
-    """Record: an observation, but for its state."""
+    """Record: an observation without its state."""
 
     step: int
-    """Step of that observation, or -1 where there is none."""
+    """Step of the observation, or -1 if there is none."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
@@ -43,7 +44,8 @@ class Statement:
     backward: int
     """G of `server.common.clock` [ns]."""
     count: int
-    """Number of doubted ones in a row that agree, itself included; 0 unless it is doubted."""
+    """Number of rejected observations in a row that are consistent, including this one; 0 for an
+    accepted one."""
 
 
 STATEMENT = record(Statement)
@@ -51,10 +53,10 @@ position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.veloci
 
 
 class Belief(IntEnum):
-    """Verdict on an observation."""
+    """Result of the check of an observation."""
 
     ANEW = -1
-    """Believed, unlike all that was believed before."""
+    """Accepted, and the earlier observations are discarded."""
     BELIEVED = 0
     CLOCK = 1
     HORIZON = 2
@@ -62,7 +64,7 @@ class Belief(IntEnum):
 
 
 LAST, DOUBTED, NEW = 0, 1, 2
-"""Places of a vehicle's observations: believed last, doubted last, and to be judged."""
+"""Index of a vehicle's observations: last accepted, last rejected, and the one to be judged."""
 
 
 class HeardNumbers(NamedTuple):
@@ -75,42 +77,42 @@ class HeardNumbers(NamedTuple):
 
 
 class Plausibility:
-    """Judge of the observations of up to `capacity` vehicles."""
+    """Checks the observations of up to `capacity` vehicles."""
 
     def __init__(self, terms: Terms, capacity: int) -> None:
-        self._said = HeardNumbers(
+        self._observed = HeardNumbers(
             numbers=np.zeros((3, capacity), dtype=STATEMENT),
             states=np.zeros((3, capacity, terms.axes, 2)),
         )
         self._dt_s, self._H = terms.dt_s, terms.horizon
         self._noise_m = NOISE_M + NOISE_MPS * max(terms.dead_time_s)
-        """Largest change of position by noise, predicted over the dead time [m]."""
+        """Largest change of position by noise, after prediction over the dead time [m]."""
         for row in range(capacity):
             self.forget(row)
 
     def forget(self, row: int) -> None:
-        """Begin anew with a vehicle, or with a new life of it."""
-        self._said.numbers["step"][:, row] = -1
+        """Reset the row for another vehicle, or for another run of its client."""
+        self._observed.numbers["step"][:, row] = -1
 
     def judge(self, row: int, observation: Observation, F: int, G: int) -> int:
-        """Verdict on an observation of a vehicle.
+        """Result of the check of an observation.
 
         Args:
-            row: the vehicle.
-            observation: what it says.
+            row: row of the vehicle.
+            observation: the observation.
             F, G: of the observation and its echo, see `server.common.clock` [ns].
 
         Returns:
             a `Belief`.
         """
-        told = observation
+        message = observation
         return _judge(
-            self._said,
+            self._observed,
             row,
-            told.state,
-            told.step,
-            told.in_force,
-            told.since,
+            message.state,
+            message.step,
+            message.in_force,
+            message.since,
             F,
             G,
             self._H,
@@ -124,39 +126,43 @@ ANEW, BELIEVED, CLOCK, HORIZON, JUMP = map(int, Belief)
 
 
 @part
-def _against(said: HeardNumbers, row: int, which: int, H: int, dt: float, noise_m: float) -> int:
-    """Reason against the new observation after another; BELIEVED where nothing does."""
-    before, new = said.numbers[which, row], said.numbers[NEW, row]
+def _against(
+    observed: HeardNumbers, row: int, which: int, H: int, dt: float, noise_m: float
+) -> int:
+    """Reason why the new observation contradicts another; BELIEVED if it does not."""
+    before, new = observed.numbers[which, row], observed.numbers[NEW, row]
     verdict = BELIEVED
     if new.in_force > new.since + H or new.since > new.step:
         verdict = HORIZON
     elif before.step >= 0:
-        # F of one observation and G of another make a round trip as well, which cannot be shorter
-        # than nothing.
+        # F of one observation plus G of another is also a round trip, which cannot be negative.
         trip = min(new.forward + before.backward, new.backward + before.forward)
         if min(trip, new.forward + new.backward) < -SLACK_NS:
             verdict = CLOCK
-        elif new.step > before.step:  # an older one tells of the clocks alone
+        elif new.step > before.step:  # an older one is checked for its clocks only
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON
-            elif _jumps(said, row, which, (new.step - before.step) * dt, noise_m):
+            elif _jumps(observed, row, which, (new.step - before.step) * dt, noise_m):
                 verdict = JUMP
     return verdict
 
 
 @part
-def _jumps(said: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
-    """Whether no vehicle can come from the state of another observation to the new one's in time.
+def _jumps(observed: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
+    """Whether no vehicle can get from the state of another observation to the new one in time.
 
     Args:
-        time: between the two [s].
-        noise_m: what noise may add to a change of position [m].
+        said: observations of the vehicles.
+        row: row of the vehicle.
+        which: index of the other observation.
+        time: time between the two [s].
+        noise_m: change of position that noise may cause [m].
     """
     jumps = False
-    for axis in range(said.states.shape[2]):
-        p, v = said.states[which, row, axis, 0], said.states[which, row, axis, 1]
-        after_p, after_v = said.states[NEW, row, axis, 0], said.states[NEW, row, axis, 1]
+    for axis in range(observed.states.shape[2]):
+        p, v = observed.states[which, row, axis, 0], observed.states[which, row, axis, 1]
+        after_p, after_v = observed.states[NEW, row, axis, 0], observed.states[NEW, row, axis, 1]
         jumps |= velocity_leaps(v, after_v, time, NOISE_MPS)
         jumps |= position_leaps(p, v, after_p, after_v, time, noise_m)
     return jumps
@@ -164,7 +170,7 @@ def _jumps(said: HeardNumbers, row: int, which: int, time: float, noise_m: float
 
 @kernel
 def _judge(
-    said: HeardNumbers,
+    observed: HeardNumbers,
     row: int,
     state: R2,
     step: int,
@@ -176,21 +182,21 @@ def _judge(
     dt: float,
     noise_m: float,
 ) -> int:
-    """The verdict on a new observation, which takes its place among those of its vehicle."""
-    numbers, place = said.numbers, LAST
+    """Judge a new observation and store it with those of its vehicle."""
+    numbers, place = observed.numbers, LAST
     new = numbers[NEW, row]
     new.step, new.in_force, new.since = step, in_force, since
     new.forward, new.backward, new.count = F, G, 0
     for axis in range(len(state)):
         for n in range(2):
-            said.states[NEW, row, axis, n] = state[axis, n]
-    verdict = _against(said, row, LAST, H, dt, noise_m)
+            observed.states[NEW, row, axis, n] = state[axis, n]
+    verdict = _against(observed, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
-        # Three observations that agree with each other are believed after all: the vehicle may have
-        # been carried away, or have a new clock.
+        # Three consistent observations are accepted after all: the vehicle may have been carried
+        # away, or have a new clock.
         agrees = numbers[DOUBTED, row].step >= 0 and (
-            _against(said, row, DOUBTED, H, dt, noise_m) == BELIEVED
+            _against(observed, row, DOUBTED, H, dt, noise_m) == BELIEVED
         )
         numbers[NEW, row].count = numbers[DOUBTED, row].count + 1 if agrees else 1
         if numbers[NEW, row].count == REPEATS:
@@ -202,5 +208,5 @@ def _judge(
     numbers[place, row] = numbers[NEW, row]
     for axis in range(len(state)):
         for n in range(2):
-            said.states[place, row, axis, n] = said.states[NEW, row, axis, n]
+            observed.states[place, row, axis, n] = observed.states[NEW, row, axis, n]
     return verdict

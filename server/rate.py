@@ -1,27 +1,26 @@
-"""The rate at which a server may send, found from how long packets queue on the way.
+"""Rate control: the rate at which the server sends, from the queueing delay of its packets.
 
-A shared air passes so many bytes a second, and what is more waits. Every echo tells the delay G of
-a packet; above the least G of its vehicle in 20 s (`server.common.clock`) that is jitter and
-queue. A standing queue delays all packets, jitter not those that are lucky. With the low quantile Q
-and the median M of what the echoes of an epoch are above the least,
+A shared radio channel carries so many bytes a second; what is more has to queue. Every echo reports
+the delay G of a packet; its excess over the vehicle's smallest G in 20 s (`server.common.clock`) is
+jitter and queue. A standing queue delays all packets, jitter only some. With the low quantile Q and
+the median M of this excess over an epoch,
 
     q = Q - min Q of the last BASE epochs        queueing delay
-    s = TARGET_S + M - Q                         what is not certainly a queue
+    s = TARGET_S + M - Q                         largest delay not certainly due to a queue
 
 and with the rate r, and b bytes a second sent in the epoch,
 
-    r ← CUT p,  p = b / (1 + Δq / Δt)     q > s, and it does not fall by itself
-    r ← p (1 + (1 - CUT) (t / K - 1)³)    q ≤ LOW s, something had to wait, b > USED r
+    r ← CUT p,  p = b / (1 + Δq / Δt)     if q > s, and q does not fall by itself
+    r ← p (1 + (1 - CUT) (t / K - 1)³)    if q ≤ LOW s, something had to wait, b > USED r
 
-Where a queue grows by Δq in an epoch of Δt, so much less passes than is sent: p, with the b of the
-epoch before, which the echoes tell of. After a cut r is p again when it has risen for K, where it
-stays longest, and from there on rises ever faster (the window of CUBIC, RFC 9438); t is the time
-for which it rises. Until q has been above s once, r ← r FIRST_GAIN. r never falls below b as it
-rises. The epochs after a cut tell of packets that were sent before it, and change nothing.
+If a queue grows by Δq in an epoch of Δt, correspondingly less passes than is sent: p, with the b of
+the previous epoch, whose packets the echoes report. After a cut, r returns to p after the time K,
+is flattest there, and then rises ever faster (the window of CUBIC, RFC 9438); t is the time for
+which it has risen. Until q first exceeds s, r ← r FIRST_GAIN. While rising, r never falls below b.
+The epochs just after a cut concern packets sent before it and change nothing.
 
-Losses are not asked for. Where chance loses packets a lower rate would lose as many of them and
-deliver less; where a queue overflows the delay has grown before. A queue too short to delay by
-TARGET_S cannot be told from chance, and is not.
+Losses are not used. If they are random, a lower rate loses the same share and delivers less; if a
+queue overflows, the delay has grown before. A queue too short to delay by TARGET_S is not detected.
 """
 
 from collections import deque
@@ -35,62 +34,64 @@ from skytether.shared.law.model import Array, Indices
 START, LEAST, MOST = 2_000.0, 500.0, 1e9
 """First, smallest and largest rate [B/s]."""
 EPOCH_NS, PATIENCE_NS = SECOND_NS // 2, 5 * SECOND_NS
-"""Shortest epoch, which also lasts a round trip, and time after which few echoes will do [ns]."""
+"""Shortest epoch, which also lasts at least a round trip, and time after which fewer echoes suffice
+[ns]."""
 SAMPLES = 5
-"""Echoes that tell q."""
+"""Number of echoes needed for q."""
 QUANTILE = 0.2
-"""Quantile of the echoes that is Q: a few may be of vehicles that know no empty queue."""
+"""Quantile of the echoes for Q: some may come from vehicles that never saw an empty queue."""
 BASE = 32
-"""Number of epochs in one of which the queue was empty."""
+"""Number of epochs over which the queue is assumed to have been empty once."""
 TARGET_S, LOW = 0.05, 0.6
-"""Queueing delay that is put up with [s], and share of it up to which r rises."""
+"""Accepted queueing delay [s], and the share of it up to which r rises."""
 FALLS = 0.7
-"""Share of the q before, at most which q falls by itself."""
+"""If q has fallen to this share of the previous q, it counts as falling by itself."""
 USED = 0.8
-"""Share of r that must have been sent for it to rise: what nobody uses says nothing of the air."""
+"""Share of r that must have been sent for r to rise: unused rate says nothing about the channel."""
 FIRST_GAIN = 1.25
-"""Factor of a rise, before the first cut."""
+"""Factor of a rise before the first cut."""
 K_S = 8.0
-"""Time for which r rises from a cut to where it was too large [s]."""
-DEAF = 2
-"""Number of epochs after a cut that tell of what was sent before: a report is awaited, too."""
+"""Time for which r rises from a cut to the rate that was too large [s]."""
+IGNORED_EPOCHS = 2
+"""Number of epochs after a cut that still concern packets sent before it, reports included."""
 CUT = 0.85
-"""Share of what passes that is sent after a cut, so that the queue empties."""
+"""Share of the passing rate that is sent after a cut, so that the queue empties."""
 
 
 class RateControl:
-    """A rate that follows the queueing delay.
+    """Rate that follows the queueing delay.
 
     Args:
         clock: has the echoes of up to `capacity` vehicles.
+        capacity: largest number of vehicles.
     """
 
     def __init__(self, clock: ClockMap, capacity: int) -> None:
         self._seen = clock.seen
-        self._told = np.zeros(capacity, dtype=np.int64)
-        """Number of echoes of each vehicle that were counted."""
+        self._echoes_used = np.zeros(capacity, dtype=np.int64)
+        """Number of echoes of each vehicle used so far."""
         self._delays_s: list[float] = []
-        """Delays above the least of the epoch's echoes, one a vehicle and step at most [s]."""
+        """Excess delays of the epoch's echoes, at most one per vehicle and step [s]."""
         self._began_ns: int | None = None
         self._spent = 0.0
         self._passes: float | None = None
-        """Rate that passed when r was cut last, p [B/s]; None before."""
-        self._risen_s, self._deaf = 0.0, 0
-        """Time t for which r has risen since then [s], and epochs that tell of what was before."""
+        """Rate that passed at the last cut, p [B/s]; None before the first."""
+        self._risen_s, self._ignored_epochs = 0.0, 0
+        """Time t for which r has risen since then [s], and number of epochs still to be ignored."""
         self._low_s: deque[float] = deque(maxlen=BASE)
         """Q of the newest epochs [s]."""
         self._sent = 0.0
-        """Bytes a second of the epoch before [B/s]."""
+        """Rate sent in the previous epoch [B/s]."""
         self._trip_ns = 0
         self.needed = False
-        """Whether something had to wait in the epoch because of the rate."""
+        """Whether the rate made something wait in this epoch."""
         self.bytes_per_s = START
-        """The rate [B/s]."""
+        """Present rate [B/s]."""
         self.queueing_s = 0.0
         """Queueing delay of the newest epoch [s]."""
 
     def update(self, rows: Indices, spent_bytes: float, now_ns: int) -> None:
-        """Take what was heard and sent since the last update.
+        """Process the echoes and bytes since the last update.
 
         Args:
             rows: vehicles in session; shape (n,).
@@ -111,10 +112,10 @@ class RateControl:
         self._delays_s.clear()
 
     def _listen(self, rows: Indices) -> None:
-        """Take the newest echo of each vehicle that has told another."""
+        """Collect the newest echo of each vehicle that has a new one."""
         heard = self._seen.vehicles["echoes"][rows]
-        new = rows[heard != self._told[rows]]
-        self._told[rows] = heard
+        new = rows[heard != self._echoes_used[rows]]
+        self._echoes_used[rows] = heard
         if not len(new):
             return
         slot = (self._seen.vehicles["echoes"][new] - 1) % self._seen.echoes.shape[1]
@@ -124,26 +125,28 @@ class RateControl:
         self._trip_ns = int(np.median(least.sum(axis=1)))
 
     def _end(self, delays_s: Array, sent: float, passed_ns: int) -> None:
-        """End an epoch of some length [ns], in which so many bytes were sent a second [B/s]."""
+        """End an epoch of length `passed_ns` [ns] in which `sent` bytes a second were sent
+        [B/s].
+        """
         low, middle = np.quantile(delays_s, (QUANTILE, 0.5)).tolist()
         self._low_s.append(low)
         before, q, most = self.queueing_s, low - min(self._low_s), TARGET_S + middle - low
-        told, self._sent = min(sent, self._sent), sent
+        sent_before, self._sent = min(sent, self._sent), sent
         self.queueing_s = q
-        # Packets of these echoes were sent before the cut: cutting again for them would cut twice
-        # for one queue.
-        if self._deaf:
-            self._deaf -= 1
+        # These echoes are of packets sent before the cut: cutting again would count one queue
+        # twice.
+        if self._ignored_epochs:
+            self._ignored_epochs -= 1
         elif q > most and q > FALLS * before:
-            self._passes = told / (1.0 + max(q - before, 0.0) * SECOND_NS / passed_ns)
-            self._risen_s, self._deaf = 0.0, DEAF
+            self._passes = sent_before / (1.0 + max(q - before, 0.0) * SECOND_NS / passed_ns)
+            self._risen_s, self._ignored_epochs = 0.0, IGNORED_EPOCHS
             self.bytes_per_s = max(CUT * self._passes, LEAST)
         elif q <= LOW * most and self.needed and sent > USED * self.bytes_per_s:
             self._risen_s += passed_ns / SECOND_NS
             self.bytes_per_s = min(max(self.bytes_per_s, sent, self._risen()), MOST)
 
     def _risen(self) -> float:
-        """The rate after a rise [B/s]."""
+        """Rate after a rise [B/s]."""
         if self._passes is None:
             return self.bytes_per_s * FIRST_GAIN
         return self._passes * (1.0 + (1.0 - CUT) * (self._risen_s / K_S - 1.0) ** 3)

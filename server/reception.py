@@ -1,7 +1,7 @@
-"""The server's side of the conversation: who speaks, what is said, and what of it is believed.
+"""The server's side of the conversation: receives messages, checks and answers them.
 
-HELLO is answered by a WELCOME or a refusal, OBSERVATION is judged and handed to the controller,
-CLOSE ends a session. All else is dropped and counted by its reason.
+HELLO is answered by a WELCOME or a refusal, OBSERVATION is checked and passed to the controller,
+CLOSE ends a session. Everything else is dropped and counted by reason.
 """
 
 from collections import Counter, deque
@@ -45,39 +45,39 @@ from skytether.shared.wire.protocol import (
     stamped_ns,
 )
 
-REFUSALS_TOLD_MAX = 64
-"""Newest refusals that are remembered, so as not to tell the operator of each HELLO anew."""
-TELL_NS = 10 * SECOND_NS
-"""Time from one word about datagrams of strangers to the next [ns]."""
+REFUSALS_REPORTED = 64
+"""Number of newest refusals remembered, so that repeated HELLOs are not reported again."""
+REPORT_NS = 10 * SECOND_NS
+"""Interval between reports of unauthenticated datagrams [ns]."""
 IMPLAUSIBLE: dict[int, Drop] = {
     Belief.CLOCK: Drop.IMPLAUSIBLE_CLOCK,
     Belief.HORIZON: Drop.IMPLAUSIBLE_HORIZON,
     Belief.JUMP: Drop.IMPLAUSIBLE_JUMP,
 }
-"""Why an observation is dropped that is not believed."""
+"""Why an implausible observation is dropped."""
 
 CONTRADICTED = {
     Contradiction.CLOCK: "a clock was set, or runs wrong: it is measured anew",
     Contradiction.ASYMMETRY: "link.asymmetry_s does not hold: not believed any more",
     Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: all times count that may be",
 }
-"""What was contradicted that was known of a vehicle's clock, in words."""
+"""Contradictions in what is known of a vehicle's clock, in words."""
 
 
 class Reception:
-    """Hears vehicles.
+    """Receives messages of vehicles.
 
     Args:
-        terms: what is agreed upon with every vehicle.
-        boot_id: a number that no other life of the server has had.
-        gate: who may speak, and how.
-        sessions: who flies.
-        clock: learns of the vehicles' clocks.
-        controller: is given the observations that are believed.
-        grid: is armed by an observation.
+        terms: terms agreed with every vehicle.
+        boot_id: number unique to this run of the server.
+        gate: authenticates senders.
+        sessions: sessions of the vehicles.
+        clock: clock map, updated by observations.
+        controller: receives the accepted observations.
+        grid: ticks, started by an observation.
         stopwatch: measures the parts of the work.
-        out: takes the answers.
-        events: takes what the operator is told.
+        out: list to which answers are appended.
+        events: list to which events for the operator are appended.
     """
 
     def __init__(
@@ -106,30 +106,30 @@ class Reception:
         self._events = events
         self._plausibility = Plausibility(terms, len(sessions.vehicle))
         self.observations = 0
-        """Number of observations that were believed, in whatever order they came."""
+        """Number of accepted observations, in any order of arrival."""
         self.dropped: Counter[Drop] = Counter()
-        """Number of datagrams dropped, by reason."""
+        """Number of dropped datagrams by reason."""
         self.refused: Counter[Refusal] = Counter()
-        """Number of HELLOs of vehicles that were refused, by reason."""
+        """Number of refused HELLOs by reason."""
         self.time: TimeOfDay | None = None
-        """Time of day; None where the host does not know it."""
-        self._told: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_TOLD_MAX)
-        """Vehicle, boot id and refusal of the newest refusals that the operator was told."""
-        self._strangers = 0
-        """Number of datagrams that the gate has not let pass."""
-        self._tell_ns = 0
-        """Time from which the operator may be told of these again."""
+        """Time of day; None if the host does not know it."""
+        self._reported: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_REPORTED)
+        """Vehicle, boot id and refusal of the newest reported refusals."""
+        self._unauthenticated = 0
+        """Number of datagrams refused by the gate."""
+        self._report_ns = 0
+        """Time from which these may be reported again."""
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> None:
-        """HELLO opens a session, OBSERVATION feeds it, CLOSE ends it; all else is only counted."""
+        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it."""
         self._stopwatch.start()
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
         except ProtocolError as error:
             self.dropped[error.reason] += 1
-            self._strangers += 1
-            if now_ns >= self._tell_ns:
-                self._tell_of_strangers(datagram.peer, error.reason, now_ns)
+            self._unauthenticated += 1
+            if now_ns >= self._report_ns:
+                self._report_unauthenticated(datagram.peer, error.reason, now_ns)
             return
         finally:
             self._stopwatch.lap("open")
@@ -143,10 +143,10 @@ class Reception:
         self._stopwatch.lap("observe")
 
     def _take(self, call: Call, address: Address, now_ns: int) -> None:
-        """Take one message.
+        """Process one message.
 
         Raises:
-            ProtocolError: it is not one of a vehicle's, or not its own.
+            ProtocolError: it is not a vehicle's message, or claims another vehicle's number.
         """
         message = decode(call.payload, self._terms)
         self._stopwatch.lap("decode")
@@ -165,11 +165,11 @@ class Reception:
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def _tell_of_strangers(self, address: Address, reason: Drop, now_ns: int) -> None:
+    def _report_unauthenticated(self, address: Address, reason: Drop, now_ns: int) -> None:
         host, port = address
-        told = Unauthenticated(count=self._strangers, host=host, port=port, reason=reason)
-        self._events.append(told)
-        self._tell_ns = now_ns + TELL_NS
+        event = Unauthenticated(count=self._unauthenticated, host=host, port=port, reason=reason)
+        self._events.append(event)
+        self._report_ns = now_ns + REPORT_NS
 
     def _hello(self, hello: Hello, call: Call, address: Address, now_ns: int) -> None:
         row = self._sessions.row_of_other_life(hello)
@@ -182,12 +182,12 @@ class Reception:
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
         self._out.append(Datagram(call.line.seal(encode(welcome)), address))
-        # After the answer is sealed, which is what makes the channel.
+        # After sealing the answer, which creates the channel.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)
 
     def _refusal(self, hello: Hello, address: Address, now_ns: int) -> Refusal:
-        """Why a HELLO is refused, if not ACCEPTED; the operator is told once a life and reason."""
+        """Why a HELLO is refused, or ACCEPTED; reported once per run of the client and reason."""
         vehicle, (host, port) = hello.vehicle, address
         event: Event
         if hello.terms != self._terms:
@@ -197,22 +197,21 @@ class Reception:
             refusal, holder_at = Refusal.TAKEN, address_text(*holder.address)
             event = NumberTaken(vehicle=vehicle, host=host, port=port, holder=holder_at)
         elif self._sessions.is_full(hello, now_ns):
-            refusal, room = Refusal.FULL, len(self._sessions.vehicle)
-            event = ServerFull(vehicle=vehicle, host=host, port=port, room=room)
+            refusal, capacity = Refusal.FULL, len(self._sessions.vehicle)
+            event = ServerFull(vehicle=vehicle, host=host, port=port, room=capacity)
         else:
             return Refusal.ACCEPTED
         self.refused[refusal] += 1
-        told = vehicle, hello.boot_id, refusal
-        # Said once a life and reason, for a vehicle that is refused says HELLO every 0.4 s.
-        if told not in self._told:
-            self._told.append(told)
+        refused_run = vehicle, hello.boot_id, refusal
+        if refused_run not in self._reported:
+            self._reported.append(refused_run)
             self._events.append(event)
         return refusal
 
     def _observe(self, observation: Observation, call: Call, address: Address, now_ns: int) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
         row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
-        # A round trip of half an hour or more is none: less than nothing is made of it.
+        # A round trip of half an hour or more is impossible: it becomes negative and is rejected.
         backward_ns = stamped_ns(observation.backward_us, near_ns=-forward_ns)
         verdict = self._plausibility.judge(row, observation, forward_ns, backward_ns)
         if verdict > BELIEVED:
@@ -224,7 +223,7 @@ class Reception:
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
-        # Only after it was believed: an observation that is not does not keep a session alive.
+        # Only after it was accepted: a rejected observation does not keep a session alive.
         session.heard_ns = now_ns
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
         session.hearing.hear(observation.number, observation.step)
@@ -237,56 +236,56 @@ class Reception:
             now_ns=now_ns,
             is_newest=observation.step > self._controller.observed_step[row],
         )
-        self._tell_of_clock(session.vehicle, found)
+        self._report_clock(session.vehicle, found)
         if not self._controller.observe(row, observation):
             session.stale += 1
             return
-        # Only the packet with the highest counter moves the address: a copy that is sent on from
-        # elsewhere does not, once the original has come.
+        # Only the packet with the highest counter may change the address: a copy sent from
+        # elsewhere does not, once the original has arrived.
         if call.moves:
             session.address, session.line = address, call.line
         self._grid.arm(now_ns)
 
-    def _hear_time(self, told: Time, now_ns: int) -> None:
-        """Narrow the bounds of a vehicle's clock by the time of day that it has sent.
+    def _hear_time(self, message: Time, now_ns: int) -> None:
+        """Narrow the bounds of a vehicle's clock offset by the time of day that it has sent.
 
-        Without a time of day at this host as well it says nothing.
+        Needs a time of day on this host as well.
         """
-        session = self._sessions.find(told)
+        session = self._sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return
-        # Of all times with the stamp that which the delays speak for; the clocks have drifted apart
-        # since it was told.
+        # The stamp is ambiguous: choose the time closest to what the delays suggest. The clocks
+        # have drifted apart since it was sent.
         offset_ns, bound_ns = self._clock.middle_ns(session.row, now_ns)
         ahead_ns = self.time.ahead_ns
-        epoch_ns = stamped_ns(told.epoch_us, near_ns=ahead_ns - offset_ns)
-        age_ns = max(now_ns + offset_ns + bound_ns - told.step * self._terms.dt_ns, 0)
-        error_ns += told.error_us * MICROSECOND_NS + age_ns // DRIFT + MICROSECOND_NS
+        epoch_ns = stamped_ns(message.epoch_us, near_ns=ahead_ns - offset_ns)
+        age_ns = max(now_ns + offset_ns + bound_ns - message.step * self._terms.dt_ns, 0)
+        error_ns += message.error_us * MICROSECOND_NS + age_ns // DRIFT + MICROSECOND_NS
         found = self._clock.tell(session.row, ahead_ns - epoch_ns, error_ns, now_ns=now_ns)
-        self._tell_of_clock(session.vehicle, found)
+        self._report_clock(session.vehicle, found)
 
-    def _tell_of_clock(self, vehicle: int, found: Contradiction) -> None:
-        """Tell the operator what was contradicted that was known of a vehicle's clock."""
+    def _report_clock(self, vehicle: int, found: Contradiction) -> None:
+        """Report what a message contradicts of a vehicle's known clock offset."""
         if found is not Contradiction.NOTHING:
             what = CONTRADICTED[found]
             self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
     def _anew(self, row: int, life: tuple[int, int] | None) -> None:
-        """Forget all that is known of a vehicle but its session.
+        """Forget everything known of a vehicle except its session.
 
         Args:
-            row: the vehicle.
-            life: its number and boot id, if its clock may be the one that is known.
+            row: row of the vehicle.
+            life: its number and boot id, if its clock may be the same as before.
         """
         self._clock.forget(row, life)
         self._controller.forget(row)
         self._sessions.idle[row] = Idle.PLANS
 
     def _begin(self, observation: Observation, call: Call, now_ns: int) -> Session:
-        """The session of a first observation, now live."""
+        """Open the session of a first observation."""
         session = self._sessions.begin(observation, now_ns)
         session.line = call.line
         self._plausibility.forget(session.row)

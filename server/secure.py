@@ -1,9 +1,10 @@
-"""The server's side of secured links: who has a key, and which channel is whose.
+"""The server's side of secured links: keys, handshakes and channels of the vehicles.
 
-A HELLO is answered in two steps. Without a cookie of this server for the sender's address it draws
-a CHALLENGE that brings one, and nothing is kept. With it, it draws a RESPONSE with the WELCOME, and
-the channel that comes with it is pending until the vehicle's first packet in it: only then does it
-replace the live one. So a HELLO that somebody has recorded and repeats ends no flight.
+A HELLO is answered in two steps. Without a valid cookie for the sender's address, the server
+answers with a CHALLENGE that contains one, and stores nothing. With the cookie, it answers with a
+RESPONSE that contains the WELCOME and a new channel. That channel is pending until the vehicle's
+first packet in it; only then does it replace the live one. So a recorded HELLO that somebody
+repeats ends no flight.
 """
 
 import hashlib
@@ -34,26 +35,26 @@ from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 
 COOKIE_NS = 60 * SECOND_NS
-"""Time for which cookies are alike; each is good for this time and the next [ns]."""
+"""Period of the cookies; each is valid in its period and the next [ns]."""
 HANDSHAKES = 5
-"""Number of attempts of a vehicle, and of answers to what is repeated of them, in a second."""
+"""Number of attempts of a vehicle per second, and of answers to repeats of one."""
 PENDING_MAX = 64
-"""Number of pending channels of a vehicle. It uses the first that it hears of, and within a round
-trip of 12 s no more are made, even of HELLOs that somebody repeats: five a second."""
-DONE_MAX = 16
-"""Number of a vehicle's newest attempts that have brought a channel and are answered no more."""
+"""Number of pending channels of a vehicle. It uses the first one that reaches it, and up to a round
+trip of 12 s this limit is not exceeded, even if somebody repeats its HELLOs (five a second)."""
+COMPLETED_MAX = 16
+"""Number of a vehicle's newest completed attempts, which are not answered any more."""
 OUT_MAX = 1024
-"""Number of answers of the gate's own that wait to be sent; older ones give way."""
+"""Number of the gate's answers waiting to be sent; the oldest are dropped."""
 
 
 class _Pending(NamedTuple):
-    """Channel that no packet has come in."""
+    """Channel in which no packet has arrived yet."""
 
     channel: Channel
     public: bytes
-    """Ephemeral key of the attempt that it came from."""
+    """Ephemeral key of its attempt."""
     response: bytes
-    """RESPONSE that has brought it."""
+    """RESPONSE that created it."""
 
 
 FORMS = (
@@ -61,26 +62,26 @@ FORMS = (
     Form(bytes((VERSION, handshake.INITIATION)), INITIATION_BYTES, INITIATION_BYTES),
     Form(bytes((0x92 + len(Hello._fields),)), 1, PAYLOAD_BYTES_MAX),
 )
-"""Forms of what vehicles send: packets of a channel, and INITIATIONs. A HELLO in plaintext (an
-array of msgpack) is dropped as well, but the operator is to be told of it."""
+"""Formats of vehicles' datagrams: packets of a channel, and INITIATIONs. A plaintext HELLO (an
+array of msgpack) is dropped, but admitted so that it can be reported."""
 
 
 class _HandshakeRate:
-    """Number of handshakes in a second.
+    """Rate limit of handshakes.
 
     Args:
-        now_ns: time now; all of them are left.
+        now_ns: time now; the whole second's share is available.
     """
 
     __slots__ = ("_granted_ns",)
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Time up to which they have been granted, each a share of a second [ns]."""
+        """Time up to which shares of a second have been granted [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether one more is granted."""
-        # A bucket of one second: what was not used before that is gone.
+        # A bucket of one second: what was not used earlier is lost.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False
@@ -91,58 +92,58 @@ class _HandshakeRate:
 class _KeyedVehicle:
     """Channels and attempts of one vehicle."""
 
-    __slots__ = ("attempts", "done", "live", "pending", "previous", "repeats")
+    __slots__ = ("attempts", "completed", "live", "pending", "previous", "repeats")
 
     def __init__(self, now_ns: int) -> None:
         self.attempts = _HandshakeRate(now_ns)
-        """Attempts, which nobody else can make: repeats, which anybody can, take none of them."""
+        """Limit of attempts, which need the key; repeats, which anybody can send, do not count."""
         self.repeats = _HandshakeRate(now_ns)
-        """Limit of further answers to an attempt that has been answered."""
+        """Limit of answers to repeats of an attempt."""
         self.live: Channel | None = None
-        """Channel that the vehicle sends in."""
+        """Channel in which the vehicle sends."""
         self.previous: Channel | None = None
-        """Channel that it has sent in before."""
+        """Channel in which it sent before."""
         self.pending: dict[int, _Pending] = {}
-        """Channels by number that it may send in next, the oldest first."""
-        self.done: deque[bytes] = deque(maxlen=DONE_MAX)
-        """Ephemeral keys of the newest attempts that have brought a channel."""
+        """Pending channels by number, oldest first."""
+        self.completed: deque[bytes] = deque(maxlen=COMPLETED_MAX)
+        """Ephemeral keys of the newest completed attempts."""
 
     def find(self, number: int) -> Channel | None:
-        """Channel with a number."""
-        for each in (self.live, self.previous):
-            if each is not None and each.number == number:
-                return each
+        """Channel with a number; None if there is none."""
+        for open_channel in (self.live, self.previous):
+            if open_channel is not None and open_channel.number == number:
+                return open_channel
         pending = self.pending.get(number)
         return None if pending is None else pending.channel
 
     def response(self, public: bytes) -> bytes | None:
-        """Newest RESPONSE to an attempt, whose channel is pending; None where there is none."""
+        """Newest RESPONSE to an attempt whose channel is pending; None if there is none."""
         answered = (each for each in reversed(self.pending.values()) if each.public == public)
         newest = next(answered, None)
         return None if newest is None else newest.response
 
     def add(self, pending: _Pending) -> None:
-        """Keep a channel as pending; the oldest gives way where there are too many."""
+        """Add a pending channel; the oldest is dropped if there are too many."""
         self.pending[pending.channel.number] = pending
         if len(self.pending) > PENDING_MAX:
             del self.pending[next(iter(self.pending))]
 
     def promote(self, number: int, now_ns: int) -> None:
-        """Make a pending channel the live one; those that were pending before it go."""
+        """Make a pending channel the live one, and drop those that were pending before it."""
         channel, public, _ = self.pending[number]
-        self.done.append(public)
-        for each in list(self.pending):
-            del self.pending[each]
-            if each == number:
+        self.completed.append(public)
+        for older in list(self.pending):
+            del self.pending[older]
+            if older == number:
                 break
-        # For a while both are opened: packets of the old channel are still under way.
+        # Both are opened for a while: packets of the old channel are still on their way.
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
         self.previous, self.live = self.live, channel
 
 
 class _Answer:
-    """Line of a HELLO: its answer brings a channel."""
+    """Encoder of the answer to a HELLO, which creates a channel."""
 
     def __init__(self, gate: "SecureGate", key: VehicleKey, noise: Responder, now_ns: int) -> None:
         self._gate = gate
@@ -151,13 +152,13 @@ class _Answer:
         self._now_ns = now_ns
         self.key = key
         self.pending: _Pending | None = None
-        """Channel that the answer has brought; each answer has another."""
+        """Channel created by the answer; each answer creates another one."""
 
     def seal(self, payload: bytes) -> bytes:
         """Datagram that carries a WELCOME.
 
         Raises:
-            ProtocolError: no secret can be agreed upon with the vehicle's ephemeral key.
+            ProtocolError: the vehicle's ephemeral key gives no shared secret.
         """
         gate, vehicle = self._gate, self.key.vehicle
         try:
@@ -165,9 +166,9 @@ class _Answer:
         except NoiseError:
             raise ProtocolError(Drop.FORGED) from None
         number = gate.number(vehicle)
-        brought = Channel(vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns)
+        created = Channel(vehicle, number, seal=keys.back, open_=keys.forth, born_ns=self._now_ns)
         response = write_response(self.key, number, message, self.public)
-        self.pending = _Pending(brought, self.public, response)
+        self.pending = _Pending(created, self.public, response)
         return response
 
 
@@ -175,8 +176,8 @@ class SecureGate:
     """Gate that only vehicles with a key pass.
 
     Args:
-        keyring: keys of all vehicles that may come.
-        entropy: gives so many bytes that nobody else can know.
+        keyring: keys of all admissible vehicles.
+        entropy: returns this many unpredictable bytes.
     """
 
     secure = True
@@ -185,16 +186,16 @@ class SecureGate:
         self._keyring = keyring
         self.entropy = entropy
         self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
-        """Secret that cookies are made of in this life of the server."""
+        """Secret of the cookies, new in each run of the server."""
         self._vehicles: dict[int, _KeyedVehicle] = {}
-        """Vehicles that have a key and have come back with a cookie."""
+        """Vehicles with a key that have returned a valid cookie."""
         self._out: deque[Datagram] = deque(maxlen=OUT_MAX)
 
     def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
-        """Message in a datagram; None of an INITIATION whose answer is in the outbox.
+        """Message in a datagram; None for an INITIATION whose answer is in the outbox.
 
         Raises:
-            ProtocolError: no vehicle that has a key made it, or it has come before or too late.
+            ProtocolError: no vehicle with a key sent it, or it is a repeat or too old.
         """
         match kind(datagram.payload):
             case channel.DATA:
@@ -204,7 +205,7 @@ class SecureGate:
         raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
     def admit(self, call: Call, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
-        """Keep the channel that came with the answer to the HELLO in this call as pending."""
+        """Keep the channel created by the answer to this HELLO as pending."""
         answer = call.line
         assert isinstance(answer, _Answer)
         assert answer.pending is not None
@@ -217,31 +218,32 @@ class SecureGate:
         return out
 
     def number(self, vehicle: int) -> int:
-        """Number for a new channel of a vehicle, which nobody can guess."""
-        known = self._vehicles[vehicle]
-        # Drawn again where the vehicle has a channel of this number, once in 2^32.
+        """Unpredictable number for a new channel of a vehicle."""
+        keyed = self._vehicles[vehicle]
+        # Drawn again if the vehicle has a channel of this number, once in 2^32.
         while True:
             (number,) = CHANNEL.unpack(self.entropy(CHANNEL.size))
-            if known.find(number) is None:
+            if keyed.find(number) is None:
                 return int(number)
 
     def _data(self, packet: bytes, now_ns: int) -> Call:
         vehicle, number = channel.address(packet)
-        known = self._vehicles.get(vehicle)
-        used = None if known is None else known.find(number)
-        if known is None or used is None:
+        keyed = self._vehicles.get(vehicle)
+        used = None if keyed is None else keyed.find(number)
+        if keyed is None or used is None:
             raise ProtocolError(Drop.UNKNOWN_CHANNEL)
         payload, newest = used.open(packet, now_ns=now_ns)
         check_place(payload, in_handshake=False)
-        if number in known.pending:
-            known.promote(number, now_ns)
-        return Call(payload, vehicle, used, moves=newest and used is known.live)
+        if number in keyed.pending:
+            keyed.promote(number, now_ns)
+        return Call(payload, vehicle, used, moves=newest and used is keyed.live)
 
     def _initiation(self, datagram: Datagram, now_ns: int) -> Call | None:
-        """Call of a HELLO with a cookie; without one it draws a CHALLENGE.
+        """HELLO of an INITIATION with a valid cookie; otherwise answers with a CHALLENGE.
 
-        An attempt is answered anew as long as repeats are granted, and then as before: nobody who
-        repeats what a vehicle has sent can use up the answers that it needs.
+        Repeats of an attempt get new answers while the rate limit grants them, and then the
+        previous one: somebody who repeats a vehicle's packets cannot use up the answers that it
+        needs.
         """
         packet, peer = datagram.payload, datagram.peer
         vehicle, number = handshake.address(packet)
@@ -250,23 +252,24 @@ class SecureGate:
             raise ProtocolError(Drop.UNKNOWN_KEY)
         cookie, message = read_initiation(key, packet)
         if not self._is_valid(cookie, peer, now_ns):
-            # Nothing is kept of a sender before a cookie has shown that it hears at its address.
+            # Nothing is stored for a sender before a cookie has shown that it receives at its
+            # address.
             fresh = self._cookie(peer, now_ns // COOKIE_NS)
             challenge = write_challenge(key, fresh, message[:KEY_BYTES])
             self._out.append(Datagram(challenge, peer))
             return None
-        known = self._vehicles.get(vehicle)
-        if known is None:
-            known = self._vehicles[vehicle] = _KeyedVehicle(now_ns)
+        keyed = self._vehicles.get(vehicle)
+        if keyed is None:
+            keyed = self._vehicles[vehicle] = _KeyedVehicle(now_ns)
         public = message[:KEY_BYTES]
-        if public in known.done:  # the vehicle has closed this attempt
+        if public in keyed.completed:  # the vehicle has completed this attempt
             raise ProtocolError(Drop.REPLAYED)
-        response = known.response(public)
-        # A new attempt needs the key, a repeated one only ears: so the two do not share a limit.
+        response = keyed.response(public)
+        # A new attempt needs the key, a repeat only eavesdropping: so they have separate limits.
         if response is None:
-            if not known.attempts.grant(now_ns):
+            if not keyed.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
-        elif not known.repeats.grant(now_ns):
+        elif not keyed.repeats.grant(now_ns):
             self._out.append(Datagram(response, peer))
             return None
         try:
@@ -278,15 +281,16 @@ class SecureGate:
         return Call(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)
 
     def _is_valid(self, cookie: bytes, peer: Address, now_ns: int) -> bool:
-        """Whether a cookie is this server's, for the sender, of this time or the last."""
+        """Whether a cookie is valid for the sender now."""
         time = now_ns // COOKIE_NS
         return any(
-            hmac.compare_digest(cookie, self._cookie(peer, each)) for each in (time, time - 1)
+            hmac.compare_digest(cookie, self._cookie(peer, period)) for period in (time, time - 1)
         )
 
-    def _cookie(self, peer: Address, time: int) -> bytes:
-        """Cookie for an address in the given one of the times of COOKIE_NS."""
+    def _cookie(self, peer: Address, period: int) -> bytes:
+        """Cookie for an address in a period of COOKIE_NS."""
         host, port = peer
-        # Made anew to be compared and never stored: any number of strangers costs no memory.
-        told = f"{host} {port} {time}".encode()
-        return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()
+        # Computed for each comparison and never stored: any number of unknown senders costs no
+        # memory.
+        text = f"{host} {port} {period}".encode()
+        return hashlib.blake2s(text, key=self._secret, digest_size=COOKIE_BYTES).digest()

@@ -1,7 +1,7 @@
-"""The server's tick: which step each vehicle is at, what to send it, and what is written down.
+"""The server's tick: the present step of each vehicle, its plan, packets and records.
 
-Ticks lie on a grid of Δt with absolute deadlines; one whose time has passed is skipped and counted,
-never caught up with.
+Ticks lie on a grid of Δt with absolute deadlines; a missed one is skipped and counted, never made
+up for.
 """
 
 from collections import deque
@@ -32,11 +32,11 @@ from skytether.shared.telemetry.record import FIGURES, Recorder
 from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
-"""Number of ticks that may be missed in a second before the server calls itself degraded."""
+"""Number of ticks that may be missed in a second before the server reports itself as degraded."""
 EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
 """Columns of the record that may be empty."""
 TICK_BIN_NS = MILLISECOND_NS // 20
-"""Resolution at which the length of a tick is counted [ns]."""
+"""Bin width of the histogram of tick durations [ns]."""
 
 
 class Grid:
@@ -44,7 +44,7 @@ class Grid:
 
     Args:
         dt_ns: time from one tick to the next [ns].
-        events: takes what the operator is told.
+        events: list to which events for the operator are appended.
     """
 
     def __init__(self, dt_ns: int, events: Events) -> None:
@@ -53,28 +53,28 @@ class Grid:
         self.due_ns: int | None = None
         """Time of the next tick; None while there is no vehicle to plan for."""
         self.missed = 0
-        """Number of ticks that were slept through."""
+        """Number of missed ticks."""
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
-        """Times of the newest ticks that were missed."""
+        """Times of the newest missed ticks."""
         self.degraded = False
-        """Whether more ticks are missed than may be."""
+        """Whether too many ticks are missed."""
 
     def arm(self, now_ns: int) -> None:
-        """Schedule the next tick, for there is a vehicle to plan for."""
+        """Schedule the next tick, since there is a vehicle to plan for."""
         dt_ns = self._dt_ns
-        if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also where our clock went back
+        if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also if our clock was set back
             self.due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
 
     def rest(self) -> None:
         """Cancel the next tick."""
         self.due_ns = None
 
-    def take(self, now_ns: int) -> int | None:
-        """Time of the tick that is due, if one is; those that were slept through are counted."""
+    def next_tick(self, now_ns: int) -> int | None:
+        """Time of the tick that is due, or None; missed ticks are counted."""
         if self.due_ns is None or now_ns < self.due_ns:
             return None
-        # Skipped and not made up for: plans for steps that are over are worth nothing, and a burst
-        # of ticks would delay the next one too.
+        # Missed ticks are not made up for: plans for past steps are useless, and a burst of ticks
+        # would delay the next one too.
         late = (now_ns - self.due_ns) // self._dt_ns
         self.missed += late
         self._note_missed(late, now_ns)
@@ -83,10 +83,10 @@ class Grid:
         return tick_ns
 
     def _note_missed(self, count: int, now_ns: int) -> None:
-        """Note the ticks that were missed, and whether these are too many in a second."""
+        """Note missed ticks, and whether there are too many in a second."""
         if not (count or self.degraded):
             return
-        # An hour of sleep counts many ticks, of which the deque keeps the newest few in any case.
+        # An hour of suspension is many ticks, of which the deque keeps the newest few only.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
         if many != self.degraded:
@@ -95,19 +95,19 @@ class Grid:
 
 
 class Ticker:
-    """Decides for all vehicles in session, sends them horizons and heartbeats, and records.
+    """Decides for all vehicles in session, sends horizons and heartbeats, and records.
 
     Args:
-        terms: what is agreed upon with every vehicle.
-        sessions: who flies.
-        clock: tells the step of each.
-        controller: plans.
-        grid: tells how many ticks were missed.
+        terms: terms agreed with every vehicle.
+        sessions: sessions of the vehicles.
+        clock: gives the step of each vehicle.
+        controller: plans and decides.
+        grid: times of the ticks.
         stopwatch: measures the parts of a tick.
-        out: takes what is sent.
-        events: takes what the operator is told.
-        recorder: takes one row a tick and vehicle.
-        plans: takes one row for each horizon that is sent.
+        out: list to which datagrams are appended.
+        events: list to which events for the operator are appended.
+        recorder: receives one row per tick and vehicle.
+        plans: receives one row per horizon sent.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Ticker:
         self._recorder, self._plans = recorder, plans
         self._records = recorder is not None or plans is not None
         self._columns = [str(each) for each in FIGURES[terms.scheme]]
-        """Columns of the record that figures of plans are written to."""
+        """Columns of the record for the figures of plans."""
         self.durations = Histogram(TICK_BIN_NS)
         """Duration of each tick, while the stopwatch runs."""
 
@@ -142,7 +142,7 @@ class Ticker:
         """Run a tick: plan, send, and record.
 
         Args:
-            tick_ns: time that it was due at.
+            tick_ns: time at which it was due.
             now_ns: time now.
         """
         controller = self._controller
@@ -164,9 +164,9 @@ class Ticker:
             self._stopwatch.lap("encode")
             if self._records:
                 self._record(decisions)
-        # Bytes are compared in a sixth of the time of numbers, and seldom differ.
+        # Comparing bytes takes a sixth of the time of comparing numbers, and they seldom differ.
         if controller.idle.tobytes() != self._sessions.idle.tobytes():
-            self._tell_idle()
+            self._report_idle()
         if controller.faults:
             self._events += [Fault(traceback=said) for said in controller.faults]
             controller.faults.clear()
@@ -176,14 +176,14 @@ class Ticker:
         if inside := controller.scheme.inside:
             self._events += [InZone(vehicle=each, zone=zone) for each, zone in inside]
             inside.clear()
-        # Last, for a horizon that was sent at this tick stands in place of a heartbeat.
+        # Last, since a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
-    def _tell_idle(self) -> None:
-        """Tell the operator for which vehicles planning has stopped, and for which it goes on."""
+    def _report_idle(self) -> None:
+        """Report for which vehicles planning has stopped or resumed."""
         idle = self._controller.idle
         for row in np.flatnonzero(idle != self._sessions.idle).tolist():
             self._sessions.idle[row] = idle[row]
@@ -194,7 +194,7 @@ class Ticker:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
     def _send_plans(self, batch: Batch, now_ns: int) -> None:
-        # The time of sending and not the tick's due time: the vehicle measures the delay by this
+        # The time of sending, not the tick's due time: the vehicle measures the delay by this
         # stamp.
         sessions, sent_us = self._sessions, stamp_us(now_ns)
 
@@ -207,7 +207,7 @@ class Ticker:
             self._send(sessions.at(row), payload, is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
-        """Send a heartbeat to each of these that was sent nothing at this tick."""
+        """Send a heartbeat to each vehicle that was sent nothing at this tick."""
         for session in due:
             if session.is_heartbeat_due(now_ns):
                 idle = int(self._sessions.idle[session.row])
@@ -226,8 +226,7 @@ class Ticker:
         datagrams, budget = session.sealed(payload), self._controller.budget
         self._out += datagrams
         if budget:
-            # The line carries the headers of IP and UDP as well: 28 bytes, more than a whole
-            # heartbeat.
+            # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
             size = sum(len(each.payload) + HEADER_BYTES for each in datagrams)
             budget.charge(session.row, size, is_plan=is_plan)
 
@@ -237,17 +236,17 @@ class Ticker:
             self._record_plans(self._plans, batch)
         if self._recorder is None:
             return
-        rows, found = batch.rows, batch.found
+        rows, predicted = batch.rows, batch.found
         n = len(rows)
         self._recorder.append(
             n,
             vehicle=self._sessions.vehicle[rows],
             step=batch.step,
             reference=self._controller.desired.now(rows, batch.step),
-            estimate=found.estimate[:n],
-            ahead=found.ahead[:n],
+            estimate=predicted.estimate[:n],
+            ahead=predicted.ahead[:n],
             planned=decisions.planned,
-            input=found.horizons[:n, :, 0],
+            input=predicted.horizons[:n, :, 0],
             observed_step=self._controller.observed_step[rows],
             **self._figures(decisions),
             threshold=decisions.verdict.threshold,
@@ -261,22 +260,22 @@ class Ticker:
         self._stopwatch.lap("record")
 
     def _figures(self, decisions: Decisions) -> dict[str, Array | float]:
-        """Figures of plans for the record: NaN where there is none."""
-        figures, verdict, nothing = decisions.figures, decisions.verdict, float("nan")
-        told: dict[str, Array | float] = {column: figures[column] for column in self._columns}
+        """Figures of plans for the record; NaN if there is none."""
+        figures, verdict, missing = decisions.figures, decisions.verdict, float("nan")
+        columns: dict[str, Array | float] = {column: figures[column] for column in self._columns}
         solved = figures["solved"]
         if not solved.all():
-            told = {name: np.where(solved, figure, nothing) for name, figure in told.items()}
-        if EXPECTED_GAP in told and not decisions.batch.found.doubt.size:
-            told[EXPECTED_GAP] = nothing
-        told[OWN] = verdict.figure if verdict.compared is Compared.OWN else nothing
-        return told
+            columns = {name: np.where(solved, figure, missing) for name, figure in columns.items()}
+        if EXPECTED_GAP in columns and not decisions.batch.found.doubt.size:
+            columns[EXPECTED_GAP] = missing
+        columns[OWN] = verdict.figure if verdict.compared is Compared.OWN else missing
+        return columns
 
     def _record_plans(self, plans: Recorder, batch: Batch) -> None:
-        told = self._controller.scheme.sent_plans(batch)
+        sent_plans = self._controller.scheme.sent_plans(batch)
         plans.append(
             len(batch.sent),
             vehicle=self._sessions.vehicle[batch.rows[batch.sent]],
-            **told._asdict(),
+            **sent_plans._asdict(),
             disturbance=batch.found.disturbance[batch.sent],
         )

@@ -276,7 +276,7 @@ class Air:
 
     def figures(self) -> dict[str, Any]:
         """Figures of the client about its autopilot."""
-        return self.client.told()["autopilot"]
+        return self.client.vehicle_figures()["autopilot"]
 
     def rmse(self, settle_s: float = 5.0) -> float:
         """Error in the plane between the truth and what was desired, rms [m]."""

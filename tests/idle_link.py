@@ -101,7 +101,7 @@ class _Unsealed:
     """Way back of a session without encryption."""
 
     def seal(self, payload: bytes) -> bytes:
-        """See `WayBack`."""
+        """See `ReplyPath`."""
         return payload
 
 

@@ -139,7 +139,7 @@ class Lives:
     def _server(self, scenario: Scenario) -> Server:
         self._servers += 1
         entropy = stream(scenario.seed, "entropy", self._servers).bytes
-        return Server(scenario, boot_id=self._servers, entropy=entropy, room=self.count)
+        return Server(scenario, boot_id=self._servers, entropy=entropy, capacity=self.count)
 
     def _set(self, values: Mapping[str, Any]) -> None:
         with suppress(ConfigError):  # the refusal is an event

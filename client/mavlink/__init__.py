@@ -1,10 +1,10 @@
 """A vehicle with an autopilot that speaks MAVLink: ArduCopter or PX4.
 
-    port        what comes from the autopilot and goes to it, in bytes and time
-    setup       which autopilot it is, and whether what it does in silence is safe
-    launch      mode, arming, take-off and landing, all of them the autopilot's own
-    vehicle     what the pilot knows of all that: velocities in, measurements out
+    port        messages from the autopilot and to it
+    setup       which autopilot it is, and whether its parameters are safe if set-points stop
+    launch      mode, arming, take-off and landing, all done by the autopilot
+    vehicle     the pilot's interface: velocities in, measurements out
 
-`condition` has what the autopilot has said of itself last, `positions` what it has measured, and
-`clock` when that was. Axes, frames and bytes are those of `skytether.mavlink`.
+`condition` has the autopilot's newest status, `positions` its measurements, and `clock` converts
+its time stamps. Axes, frames and encoding are in `skytether.mavlink`.
 """

@@ -1,17 +1,17 @@
-"""The autopilot's clock, as TIMESYNC shows it: time since its boot, mapped to the client's own.
+"""The autopilot's clock from TIMESYNC: time since its boot, converted to the client's clock.
 
     the client asks at t₁ and hears at t₂ that the autopilot's clock showed b in between:
-    offset = (t₁ + t₂) / 2 - b, wrong by no more than (t₂ - t₁) / 2
+    offset = (t₁ + t₂) / 2 - b, with an error of at most (t₂ - t₁) / 2
 
-Answers that took much longer than the quickest of the window are left out; a line through the rest
-has offset and drift. Any two answers bound the drift between them:
+Answers much slower than the fastest of the window are left out. A line through the rest gives
+offset and drift. Any two answers bound the drift:
 
-    drift = (offset₂ - offset₁) / (t₂ - t₁), wrong by no more than the mean of both round trips
-            / (t₂ - t₁)
+    drift = (offset₂ - offset₁) / (t₂ - t₁), with an error of at most the mean of both round trips
+                                             / (t₂ - t₁)
 
-In the first seconds, in which a fit would follow the noise, the drift is the least one within these
-bounds. The line is moved to where no answer contradicts it: each bounds the offset at its time, and
-since then the clocks have drifted within the bounds.
+In the first seconds, when a fit would follow the noise, the drift of smallest magnitude within
+these bounds is used. The line is then shifted until no answer contradicts it: each answer bounds
+the offset at its time, and since then the clocks have drifted within the bounds.
 """
 
 from collections import deque
@@ -21,44 +21,44 @@ from typing import NamedTuple
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 WINDOW = 64
-"""Answers that are kept."""
+"""Number of answers kept."""
 KNOWN = 4
-"""Answers from which on the clock is known."""
+"""Number of answers from which on the clock is known."""
 ASKED_MAX = 16
-"""Questions that wait for their answer; older ones are given up."""
+"""Number of open questions; older ones are given up."""
 ROUND_TRIP_MAX_NS = SECOND_NS
-"""Longest round trip of an answer that is used, of an autopilot aboard [ns]."""
+"""Longest round trip of an answer that is used, for an autopilot aboard [ns]."""
 SPREAD_NS = MILLISECOND_NS
-"""Time beyond the least round trip, and half of that, up to which an answer counts [ns]."""
+"""An answer counts if its round trip is at most 1.5 times the shortest, plus this [ns]."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
-"""Time between the first and the last answer from which on drift is fitted [ns]."""
+"""Time span of the answers from which on drift is fitted [ns]."""
 DRIFT_MAX = 0.02
 """Largest drift that is followed: PX4's own simulator runs 0.9 % slow."""
 WANDER = 500e-6
-"""Largest change of the drift within the window: a crystal that warms up, a busy simulator."""
+"""Largest change of the drift within the window, from a warming crystal or a busy simulator."""
 RATED = 8
-"""Newest answers from which the rate of a clock that cannot be followed is found."""
+"""Number of newest answers that give the rate of a clock that cannot be followed."""
 JUMP_NS = 100 * MILLISECOND_NS
-"""Time beyond the round trip by which an answer is off where a clock has jumped [ns]."""
+"""Deviation of an answer, beyond its round trip, that suggests a jump of the clock [ns]."""
 JUMPS = 3
-"""Answers in a row that are off by which a jump is believed."""
+"""Number of deviating answers in a row that confirm a jump."""
 BOOT_MAX_NS = 2**62
-"""Largest time since boot that is believed [ns]."""
+"""Largest time since boot that is accepted [ns]."""
 
 
 class Sample(NamedTuple):
     """Answer to a question for the time."""
 
     local_ns: int
-    """Middle between question and answer [ns; the client's clock]."""
+    """Midpoint between question and answer [ns; the client's clock]."""
     offset_ns: int
-    """The client's clock less the autopilot's [ns]."""
+    """The client's clock minus the autopilot's [ns]."""
     round_trip_ns: int
     """Time from question to answer [ns]."""
 
 
 class BootClock:
-    """Maps the time since the autopilot's boot to the client's clock.
+    """Converts the time since the autopilot's boot to the client's clock.
 
     Args:
         round_trip_max_ns: longest round trip of an answer that is used [ns].
@@ -66,82 +66,87 @@ class BootClock:
 
     def __init__(self, round_trip_max_ns: int = ROUND_TRIP_MAX_NS) -> None:
         self._round_trip_max_ns = round_trip_max_ns
-        self._asked: deque[int] = deque(maxlen=ASKED_MAX)
+        self._questions: deque[int] = deque(maxlen=ASKED_MAX)
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
         self._taken = 0
-        """Number of answers taken since the clock was begun."""
-        self._odd: list[Sample] = []
-        """Newest answers in a row that are off."""
+        """Number of answers used since the clock was started."""
+        self._deviating: list[Sample] = []
+        """Newest deviating answers in a row."""
         self._line = (0, 0.0, 0.0)
-        """Time of the client's clock [ns], offset then [ns], and drift."""
+        """Reference time [ns; the client's clock], offset at that time [ns], and drift."""
         self.round_trip_ns: int | None = None
-        """Least round trip of the window [ns]."""
+        """Shortest round trip of the window [ns]."""
         self.drift = 0.0
         """Rate at which the client's clock gains on the autopilot's."""
-        self._heard: deque[tuple[int, int]] = deque(maxlen=RATED)
-        """Newest answers, whether or not the line goes through them: time of the client's clock and
-        time since boot [ns]."""
+        self._answers: deque[tuple[int, int]] = deque(maxlen=RATED)
+        """Newest answers, whether or not the line fits them: the client's clock and time since boot
+        [ns]."""
         self.jumps = 0
-        """Times that the autopilot's clock was begun anew, as after a reboot."""
+        """Number of restarts of the autopilot's clock, as after a reboot."""
 
     @property
     def is_known(self) -> bool:
-        """Whether enough answers have come."""
+        """Whether enough answers have arrived."""
         return self._taken >= KNOWN
 
     @property
     def wrong_rate(self) -> float | None:
-        """Speed of the autopilot's clock, 1 for ours, where it cannot be followed; else None."""
-        if len(self._heard) < KNOWN:
+        """Rate of the autopilot's clock relative to ours if it cannot be followed; otherwise
+        None.
+        """
+        if len(self._answers) < KNOWN:
             return None
-        (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._heard[0], self._heard[-1]
-        passed_ns, told_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
-        # The bounds of two answers as below, and of a reboot there is nothing to say.
-        doubt_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
-        if told_ns <= 0 or abs(told_ns - passed_ns) <= DRIFT_MAX * passed_ns + doubt_ns:
+        (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._answers[0], self._answers[-1]
+        passed_ns, boot_passed_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
+        # Error bounds of two answers as above; a reboot (negative time) is not a wrong rate.
+        error_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
+        if (
+            boot_passed_ns <= 0
+            or abs(boot_passed_ns - passed_ns) <= DRIFT_MAX * passed_ns + error_ns
+        ):
             return None
-        return told_ns / passed_ns
+        return boot_passed_ns / passed_ns
 
     def ask(self, *, now_ns: int) -> int:
-        """Stamp of a question that is sent now."""
-        self._asked.append(now_ns)
+        """Time stamp for a question sent now."""
+        self._questions.append(now_ns)
         return now_ns
 
     def hear(self, boot_ns: int, stamp_ns: int, *, now_ns: int) -> bool:
-        """Take an answer; False of one that was not asked for, came twice, late, or is impossible.
+        """Process an answer; False if it was not asked for, is a duplicate, late or impossible.
 
         Args:
-            boot_ns: time since boot that the autopilot tells.
-            stamp_ns: stamp of the question.
+            boot_ns: time since boot in the answer.
+            stamp_ns: time stamp of the question.
             now_ns: time now.
         """
-        if stamp_ns not in self._asked:
+        if stamp_ns not in self._questions:
             return False
-        self._asked.remove(stamp_ns)
+        self._questions.remove(stamp_ns)
         round_trip_ns = now_ns - stamp_ns
         if not (0 <= round_trip_ns <= self._round_trip_max_ns and 0 < boot_ns < BOOT_MAX_NS):
             return False
         local_ns = stamp_ns + round_trip_ns // 2
         sample = Sample(local_ns, local_ns - boot_ns, round_trip_ns)
-        self._heard.append((local_ns, boot_ns))
+        self._answers.append((local_ns, boot_ns))
         if self._samples and abs(sample.offset_ns - self._offset(local_ns)) > (
             JUMP_NS + round_trip_ns
         ):
-            self._odd.append(sample)
-            if len(self._odd) < JUMPS:
+            self._deviating.append(sample)
+            if len(self._deviating) < JUMPS:
                 return False
             self._samples.clear()
-            self._samples.extend(self._odd[:-1])
+            self._samples.extend(self._deviating[:-1])
             self._taken = len(self._samples)
             self.jumps += 1
-        self._odd.clear()
+        self._deviating.clear()
         self._samples.append(sample)
         self._taken += 1
         self._fit()
         return True
 
     def _fit(self) -> None:
-        """Put a line through the answers that came quickly, and agree with the newest of them."""
+        """Fit a line to the answers with short round trips, consistent with the newest of them."""
         least = min(sample.round_trip_ns for sample in self._samples)
         most = least + least // 2 + SPREAD_NS
         quick = [sample for sample in self._samples if sample.round_trip_ns <= most]
@@ -162,7 +167,7 @@ class BootClock:
         self._line = newest, self._within(base + offset, *bounds), self.drift
 
     def _within(self, offset_ns: float, least_drift: float, most_drift: float) -> float:
-        """Offset at the newest answer, the nearest to this one that no answer contradicts [ns]."""
+        """Offset at the newest answer, moved as little as needed to agree with all answers [ns]."""
         newest = self._samples[-1].local_ns
         least = max(
             sample.offset_ns - sample.round_trip_ns / 2 + least_drift * (newest - sample.local_ns)
@@ -179,7 +184,7 @@ class BootClock:
         return offset_ns + drift * (local_ns - origin_ns)
 
     def local_ns(self, boot_ns: int) -> int:
-        """Time of the client's clock at a time since boot; the clock must be known."""
+        """Client's time at a time since boot; the clock must be known."""
         origin_ns, offset_ns, drift = self._line
         # local = boot + offset + drift * (local - origin), solved for local
         since_ns = boot_ns + int(offset_ns) - origin_ns
@@ -187,10 +192,9 @@ class BootClock:
 
 
 def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
-    """Newest answers that do not contradict each other, and the least and largest drift that they
-    allow.
+    """Newest answers that are consistent, and the smallest and largest drift that they allow.
 
-    Older ones are of before the drift changed, or before the clock stood still for a while.
+    Older ones date from before the drift changed, or before the clock stood still for a while.
     """
     least, most = -DRIFT_MAX, DRIFT_MAX
     newest = samples[-1]

@@ -1,4 +1,4 @@
-"""Condition of the vehicle, as its autopilot has told it last."""
+"""Condition of the vehicle, as last reported by its autopilot."""
 
 from math import isfinite
 
@@ -7,75 +7,75 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ASTRAY_NS = 500 * MILLISECOND_NS
-"""Time for which the estimate has to be bad [ns]: flags flicker where a receiver changes
+"""Time for which the estimate has to be bad [ns]: flags flicker when a receiver changes
 satellites."""
 LOW_NS = 2 * SECOND_NS
-"""Time for which the battery has to be low [ns]: its voltage sags where thrust is wanted."""
+"""Time for which the battery has to be low [ns]: its voltage sags under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
-"""Age up to which a heartbeat tells of now [ns]: one may be lost."""
+"""Age up to which a heartbeat counts as current [ns]: one may be lost."""
 NUMBERS = 256
-"""Numbers of frames, after which they begin anew."""
+"""Number of sequence numbers of frames, which then start again."""
 OVERTAKEN_NS = SECOND_NS
-"""Longest time for which a frame with a lower number than the newest counts as overtaken [ns];
-after a longer pause its sender may have begun anew."""
+"""Longest time for which a frame with a lower number counts as overtaken [ns]; after a longer pause
+its sender may have restarted."""
 KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
-"""Flag of an estimate that knows its velocity."""
+"""Flag of an estimate with a valid velocity."""
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
-"""Flags of an estimate that knows its position; one is enough."""
+"""Flags of an estimate with a valid position; one is enough."""
 STANDS_IN = dialect.ESTIMATOR_CONST_POS_MODE
-"""Flag of an estimate that takes the vehicle for standing still, for want of anything better."""
+"""Flag of an estimate that assumes a standing vehicle for lack of data."""
 UNKNOWN_MV, UNKNOWN_PERCENT = 65535, -1
 BATTERY_BAD = range(
     int(dialect.MAV_BATTERY_CHARGE_STATE_LOW), int(dialect.MAV_BATTERY_CHARGE_STATE_UNHEALTHY) + 1
 )
-"""Charge states in which the autopilot itself calls a battery low, or worse."""
+"""Charge states in which the autopilot itself reports a low battery, or worse."""
 
 
 class Condition:
-    """Condition of the autopilot and its vehicle, as far as it is known.
+    """Condition of the autopilot and its vehicle, as far as known.
 
     Args:
         battery_min: share of the battery's charge below which it is low.
-        battery_min_v: voltage below which it is low [V]; 0: none is.
+        battery_min_v: voltage below which it is low [V]; 0: not checked.
     """
 
     def __init__(self, battery_min: float, battery_min_v: float) -> None:
         self._battery_min, self._battery_min_v = battery_min, battery_min_v
         self.heard_ns: int | None = None
-        """Time of the newest message of the autopilot."""
+        """Time of the autopilot's newest message."""
         self.heartbeat_ns: int | None = None
         """Time of its newest heartbeat."""
         self._number = 0
-        """Number of the newest frame."""
+        """Sequence number of the newest frame."""
         self._number_ns: int | None = None
-        """Time at which it came."""
+        """Time of its arrival."""
         self.mode = -1
-        """Number of its mode; -1 before it is known."""
+        """Number of its mode; -1 if unknown."""
         self.armed = False
         self.landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
         """MAV_LANDED_STATE."""
         self.charge: float | None = None
-        """Charge of the battery, from 0 to 1; None where nobody knows."""
+        """Charge of the battery, from 0 to 1; None if unknown."""
         self.voltage: float | None = None
-        """Voltage of the battery [V]."""
+        """Voltage of the battery [V]; None if unknown."""
         self.home: tuple[float, float, float] | None = None
         """Latitude and longitude of home [°], and its altitude above the sea [m]."""
         self.home_up = 0.0
         """Altitude of home in the autopilot's local frame [m]."""
         self._is_bad: dict[str, bool] = {}
-        """Whether the estimate is bad, by the message that says so."""
+        """Whether the estimate is bad, by reporting message."""
         self._astray_ns: int | None = None
-        """Time since which the estimate is bad."""
+        """Time since which the estimate has been bad; None if it is good."""
         self._is_low: dict[str, bool] = {}
-        """Whether the battery is low, by the message that says so."""
+        """Whether the battery is low, by reporting message."""
         self._low_ns: int | None = None
-        """Time since which the battery is low."""
+        """Time since which the battery has been low; None if it is not."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Take a message of the autopilot, unless a newer one has come before it.
+        """Process a message of the autopilot, unless a newer one arrived before it.
 
-        These messages have no stamps: a heartbeat that was overtaken would give back what a pilot
-        has just taken.
+        These messages have no time stamps: an overtaken heartbeat would undo the mode that a pilot
+        has just chosen.
         """
         self.heard_ns = now_ns
         if self._is_overtaken(message.get_seq(), now_ns):
@@ -126,7 +126,7 @@ class Condition:
 
     @property
     def battery_is_weak(self) -> bool:
-        """Whether the battery is low now, if only for a moment."""
+        """Whether the battery is low now, even if only for a moment."""
         return self._low_ns is not None
 
     def battery_is_low(self, *, now_ns: int) -> bool:
@@ -134,16 +134,16 @@ class Condition:
         return self._low_ns is not None and now_ns - self._low_ns >= LOW_NS
 
     def is_astray(self, *, now_ns: int) -> bool:
-        """Whether the autopilot has said for ASTRAY_NS that it does not know where it is."""
+        """Whether the autopilot has reported a bad estimate for ASTRAY_NS."""
         return self._astray_ns is not None and now_ns - self._astray_ns >= ASTRAY_NS
 
     def is_fresh(self, *, now_ns: int) -> bool:
-        """Whether mode and arming are those of now, as far as heartbeats tell."""
+        """Whether mode and arming are current, judging by heartbeats."""
         return self.heartbeat_ns is not None and now_ns - self.heartbeat_ns <= FRESH_NS
 
     @property
     def is_airborne(self) -> bool:
-        """Whether the autopilot says that it is in the air."""
+        """Whether the autopilot reports that it is in the air."""
         return self.landed in (
             dialect.MAV_LANDED_STATE_IN_AIR,
             dialect.MAV_LANDED_STATE_TAKEOFF,
@@ -152,12 +152,12 @@ class Condition:
 
     @property
     def is_flying(self) -> bool:
-        """Whether it is armed and in the air, neither climbing nor landing by itself."""
+        """Whether it is armed and in the air, neither taking off nor landing."""
         return self.armed and self.landed == dialect.MAV_LANDED_STATE_IN_AIR
 
 
 def _since(before_ns: int | None, now_so: bool, now_ns: int) -> int | None:
-    """Time since which something is so; None where it is not."""
+    """Start of a condition that holds now; None if it does not."""
     if not now_so:
         return None
     return now_ns if before_ns is None else before_ns

@@ -1,4 +1,4 @@
-"""Differences of ArduCopter and PX4: numbers and names of modes, and the way into the air."""
+"""Differences between ArduCopter and PX4: numbers and names of modes, and the take-off sequence."""
 
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -19,62 +19,63 @@ AIRBORNE = frozenset(
         int(dialect.MAV_TYPE_DECAROTOR),
     }
 )
-"""Types of vehicles that hover, and so can be flown."""
+"""Types of vehicles that can hover, and so be flown."""
 
 
 class LaunchStep(Enum):
-    """A step on the way into the air."""
+    """Step of the take-off sequence."""
 
     HOLD = auto()
-    """Step: a mode that flies by itself, and none of a pilot's."""
+    """Wait for a mode that flies by itself, none of a pilot's."""
     GUIDE = auto()
-    """Step: the mode that follows setpoints."""
+    """Wait for the mode that follows set-points."""
     ARM = auto()
-    """Step: armed."""
+    """Wait until armed."""
     LIFT = auto()
-    """Step: the command to take off is acknowledged."""
+    """Wait until the command to take off is accepted."""
     CLIMB = auto()
-    """Step: at the altitude of take-off."""
+    """Wait until the take-off altitude is reached."""
 
 
 @dataclass(frozen=True)
 class Flavour:
-    """An autopilot, as far as it is unlike the other."""
+    """Properties in which the autopilots differ."""
 
     name: str
     guided: int
-    """Number of the mode that follows setpoints."""
+    """Number of the mode that follows set-points."""
     land: int
     """Number of the mode that lands."""
     back: int
-    """Number of the mode that returns home, and lands there."""
+    """Number of the mode that returns home and lands there."""
     hold: int
-    """Number of the mode that stays where it is."""
+    """Number of the mode that holds the position."""
     own: frozenset[int]
-    """Numbers of the modes that the vehicle is in between arming and following setpoints."""
+    """Numbers of the modes allowed between arming and following set-points."""
     steps: tuple[LaunchStep, ...]
-    """Way into the air."""
+    """Take-off sequence."""
     streams_first: bool
-    """Whether setpoints must be coming before it goes into its guided mode, and bring it back."""
+    """Whether set-points have to be sent before it enters its guided mode; they also bring it back
+    there."""
     words_for_stations: bool
-    """Whether it sends its texts to ground stations alone."""
+    """Whether it sends status texts to ground stations only."""
     time_out: str
-    """Name of the parameter for how long it waits for setpoints [s]."""
+    """Name of the parameter of its set-point time-out [s]."""
     above_sea: bool
-    """Whether the altitude of take-off is told above the sea, and not above home."""
+    """Whether the take-off altitude is given above the sea, not above home."""
     bytewise: bool
-    """Whether a parameter's bits are sent, see `mavlink.parameters`."""
+    """Whether parameters are sent bytewise, see `mavlink.parameters`."""
     submodes: bool
     """Whether a mode's number has two parts."""
     modes: dict[int, str]
-    """Names of modes."""
+    """Names of the modes by number."""
 
     def mode_name(self, mode: int) -> str:
         """Name of a mode."""
         return self.modes.get(mode, f"mode {mode}")
 
     def mode_parts(self, mode: int) -> tuple[float, float, float]:
-        """Parameters of the command that goes into a mode."""
+        """Parameters of the command that sets a mode."""
         if self.submodes:
             return CUSTOM, float(mode >> 16 & 0xFF), float(mode >> 24)
         return CUSTOM, float(mode), 0.0
@@ -151,11 +152,11 @@ FLAVOURS = {
     int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA): ARDUPILOT,
     int(dialect.MAV_AUTOPILOT_PX4): PX4,
 }
-"""Flavours by the MAV_AUTOPILOT of a heartbeat."""
+"""Flavours by MAV_AUTOPILOT of a heartbeat."""
 
 
 def unfit(heartbeat: Message) -> str:
-    """Why the vehicle of a heartbeat cannot be flown; empty where it can."""
+    """Why the vehicle that sent a heartbeat cannot be flown; empty if it can."""
     if heartbeat.autopilot not in FLAVOURS:
         return f"its autopilot is number {heartbeat.autopilot}, expected ArduPilot (3) or PX4 (12)"
     if heartbeat.type not in AIRBORNE:

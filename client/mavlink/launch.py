@@ -1,14 +1,14 @@
-"""Into the air and down again: mode, arming, take-off and landing, all of them the autopilot's own.
+"""Take-off and landing: mode, arming, climb and descent, all done by the autopilot.
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's own state says so, and its command is repeated until then. We
-arm only what stands on the ground and whose scenario is armed, and leave a mode of a pilot to him:
-once the vehicle is armed, its mode is never changed but from one of ours.
+A step is done when the autopilot's own state says so; until then its command is repeated. Only a
+vehicle on the ground whose scenario is armed is armed, and a pilot's mode is left alone: once the
+vehicle is armed, its mode is changed only if it is one of ours.
 
-What an earlier life of the client has armed, or somebody else, is not armed again before a person
-says so: a process that is started again after a landing must not take off. And a vehicle that is in
-the air while nobody knows where the scenario's origin is hovers until somebody says that.
+A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
+an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
+whose origin is unknown hovers until an operator gives the origin.
 """
 
 from enum import Enum, auto
@@ -30,21 +30,21 @@ from skytether.shared.core.endpoint import Events
 AGAIN_NS = SECOND_NS
 """Time after which a command is repeated [ns]."""
 STREAM_NS = 500 * MILLISECOND_NS
-"""Time for which setpoints run before a mode is asked for that needs them [ns]."""
+"""Time for which set-points are sent before requesting a mode that needs them [ns]."""
 FRESH_NS = 500 * MILLISECOND_NS
-"""Age up to which a position tells where the vehicle is now [ns]."""
+"""Age up to which a position counts as current [ns]."""
 LAND_MAX_NS = 120 * SECOND_NS
-"""Longest time that a landing is waited for [ns]."""
+"""Longest wait for a landing [ns]."""
 RETURN_MAX_NS = 600 * SECOND_NS
-"""Longest time that a return is waited for [ns]."""
+"""Longest wait for a return [ns]."""
 REFUSED_NS = 4 * SECOND_NS
-"""Time after which a vehicle that was told to return, and does not, is told to land [ns]."""
+"""Time after which a vehicle that ignores the command to return is told to land [ns]."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot that is the reason why a step is not done [ns]."""
+"""Silence of the autopilot that is reported as the reason why a step is not done [ns]."""
 SILENT_MAX_NS = 10 * SECOND_NS
-"""Longest silence of the autopilot in a landing that is waited for [ns]."""
+"""Silence of the autopilot after which a landing is no longer waited for [ns]."""
 THERE_M = 0.3
-"""Distance from the altitude of take-off within which it is there [m]."""
+"""Largest difference from the take-off altitude at which the climb is over [m]."""
 STILL_MPS = 0.3
 """Vertical speed below which the climb is over [m/s]."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
@@ -55,9 +55,9 @@ RESULTS = {
     number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_RESULT"].items()
 }
-"""Names of answers to commands."""
-UNHEARD = "nothing is heard of it"
-"""Why a step is not done where the autopilot is silent."""
+"""Words for the results of commands."""
+SILENT = "nothing is heard of it"
+"""Reason why a step is not done if the autopilot is silent."""
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
     LaunchStep.HOLD: "not in a mode that holds",
@@ -69,7 +69,7 @@ NOT_DONE = {
 
 
 class Phase(Enum):
-    """Stage of a flight."""
+    """Phase of a flight."""
 
     GROUND = auto()
     CLIMBING = auto()
@@ -78,18 +78,18 @@ class Phase(Enum):
 
 
 class Launch:
-    """Takes one vehicle into the air and down again.
+    """Take-off and landing of one vehicle.
 
     Args:
-        vehicle: number of the vehicle, for what is told.
+        vehicle: number of the vehicle, for events.
         flavour: which autopilot.
         target: numbers of its system and component.
-        altitude: altitude to take off to, above the ground [m].
+        altitude: take-off altitude above the ground [m].
         patience_ns: time that each step may take [ns].
         from_takeoff: whether our origin is where the vehicle is armed.
-        condition: what the autopilot says of itself.
-        positions: what it measures.
-        events: takes what is told.
+        condition: status of the autopilot.
+        positions: its measurements.
+        events: list to which events are appended.
     """
 
     def __init__(
@@ -111,38 +111,37 @@ class Launch:
         self._condition, self._positions, self._events = condition, positions, events
         self.phase = Phase.GROUND
         self._step = 0
-        """Number of the step of the climb."""
+        """Index of the current step of the take-off sequence."""
         self._since_ns: int | None = None
-        """Time since which the present step is waited for."""
+        """Time since which the current step is waited for."""
         self._asked_ns: int | None = None
-        """Time at which its command was sent last."""
+        """Time at which its command was last sent."""
         self._accepted = False
-        """Whether the take-off was accepted."""
-        self.waits_for_word = ""
-        """Why it is not armed before a person says that it may be; empty where it is."""
-        self._asks_for_word = False
+        """Whether the take-off command was accepted."""
+        self.why_not_armed = ""
+        """Why an operator has to allow arming; empty if not needed."""
+        self._asked_to_arm = False
         """Whether the operator was told so."""
         self._hovers_ns: int | None = None
-        """Time since which it hovers until somebody says where the origin is; None while it does
-        not."""
+        """Time since which it hovers until the origin is given; None while it does not."""
         self.took_off = False
-        """Whether it was armed in this life of the client."""
+        """Whether this run of the client has armed it."""
         self._closed = False
-        """Whether nothing is to begin any more."""
-        self._way_down = flavour.land
+        """Whether nothing may begin any more."""
+        self._landing_mode = flavour.land
         """Number of the mode in which it comes down."""
         self.waits_for = ""
-        """What is missing before it takes off, in words; empty where nothing is."""
-        self._words = ""
-        """Newest reason that the autopilot gave in this step."""
+        """What is missing before it takes off, in words; empty if nothing is."""
+        self._stated_reason = ""
+        """Reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
-        """Refusals of this step that were told: command and result."""
+        """Refusals reported in this step: command and result."""
         self.failure: NotTakenOff | None = None
 
     # -- into the air ------------------------------------------------------------------------
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        """Go on with the take-off; returns whether the vehicle can be flown.
+        """Continue the take-off; returns whether the vehicle can be flown.
 
         Args:
             may_arm: whether a vehicle on the ground is armed.
@@ -166,16 +165,16 @@ class Launch:
         return self.phase is Phase.FLYING
 
     def _is_placed(self, now_ns: int) -> bool:
-        """Whether it is known where the vehicle is now."""
+        """Whether the present position is known."""
         came_ns = self._positions.came_ns
         return came_ns is not None and now_ns - came_ns <= FRESH_NS
 
     def _begin(self, may_arm: bool, now_ns: int) -> None:
-        """Begin the climb once that can be, or find it to be over."""
+        """Begin the climb when possible, or find that the vehicle is flying already."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
         if self._silence(now_ns):
-            self._wait("not ready", UNHEARD, now_ns)
+            self._wait("not ready", SILENT, now_ns)
         elif not condition.is_fresh(now_ns=now_ns) or not condition.landed:
             self._wait("not ready", "it does not say whether it is on the ground", now_ns)
         elif not self._is_placed(now_ns):
@@ -183,17 +182,17 @@ class Launch:
         elif condition.is_flying and condition.mode == flavour.guided:
             self._go_on(now_ns)
         elif condition.armed and condition.is_airborne:
-            self.waits_for_word = "it was in the air when this client began"
+            self.why_not_armed = "it was in the air when this client began"
             expected = f"expected it on the ground, or in {guided}"
             self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
         elif condition.armed and condition.mode not in flavour.own:
-            self.waits_for_word = self.waits_for_word or "it was armed by somebody else"
+            self.why_not_armed = self.why_not_armed or "it was armed by somebody else"
             expected = f"expected it disarmed, or in {guided}"
             self._wait("not flown", f"it is armed, in {mode}; {expected}", now_ns)
         elif may_arm and condition.battery_is_weak:
             self._wait("not armed", "its battery is low, see mavlink.battery_min", now_ns)
-        elif may_arm and self.waits_for_word:
-            self._ask_for_word()
+        elif may_arm and self.why_not_armed:
+            self._ask_to_arm()
         elif may_arm:
             self.took_off = True
             self._enter(Phase.CLIMBING, now_ns)
@@ -201,7 +200,7 @@ class Launch:
             self._since_ns, self.waits_for = None, "armed = true"
 
     def _go_on(self, now_ns: int) -> None:
-        """Fly a vehicle on that is in the air, or let it hover until its origin is known."""
+        """Fly a vehicle that is already in the air, or let it hover until its origin is known."""
         if self._positions.has_origin:
             self._hovers_ns = None
             self._enter(Phase.FLYING, now_ns)
@@ -212,21 +211,21 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # it is ours, and lands
+            self._enter(Phase.FLYING, now_ns)  # it is under our control, and lands
             self._fail(waited, "nobody has said where its origin is, see mavlink.origin", now_ns)
 
-    def _ask_for_word(self) -> None:
-        """Say once that a person has to say that the vehicle may be armed."""
+    def _ask_to_arm(self) -> None:
+        """Report once that an operator has to allow arming."""
         self._since_ns, self.waits_for = None, "armed = true"
-        if not self._asks_for_word:
-            self._asks_for_word = True
-            self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.waits_for_word))
+        if not self._asked_to_arm:
+            self._asked_to_arm = True
+            self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.why_not_armed))
 
     def arm(self) -> None:
-        """Take a person's word that the vehicle may be armed; it counts on the ground alone."""
+        """Allow arming, as an operator said; ignored unless the vehicle is on the ground."""
         condition = self._condition
         if self.phase is Phase.GROUND and not (condition.armed or condition.is_airborne):
-            self.waits_for_word, self._asks_for_word = "", False
+            self.why_not_armed, self._asked_to_arm = "", False
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase, self.waits_for = phase, ""
@@ -234,16 +233,16 @@ class Launch:
 
     def _begin_step(self, step: int, now_ns: int) -> None:
         self._step, self._since_ns, self._asked_ns = step, now_ns, None
-        self._words = ""
+        self._stated_reason = ""
         self._refused.clear()
 
     def _climb(self, now_ns: int) -> None:
-        """Go on to the first step that is not done."""
+        """Advance to the first step that is not done."""
         condition, steps = self._condition, self._flavour.steps
         while self._step < len(steps):
             armed_before = steps.index(LaunchStep.ARM) < self._step
             if armed_before and not condition.armed:
-                self._fail("not taken off", self._words or "it was disarmed", now_ns)
+                self._fail("not taken off", self._stated_reason or "it was disarmed", now_ns)
                 return
             begun = self._step > 0 or condition.armed
             if begun and condition.mode not in self._flavour.own:
@@ -276,19 +275,19 @@ class Launch:
                 return there and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
-        """Wait for the autopilot, but no longer than it may take."""
+        """Wait for the autopilot, and fail when it takes too long."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if self.phase is Phase.GROUND:
             self.waits_for = f"its autopilot, {doing}: {why}"
         else:
-            self.waits_for = f"its autopilot, {doing}: {UNHEARD}" if self._silence(now_ns) else ""
+            self.waits_for = f"its autopilot, {doing}: {SILENT}" if self._silence(now_ns) else ""
         if now_ns - self._since_ns > self._patience_ns:
             waited = f"{doing} in {self._patience_ns / SECOND_NS:g} s"
-            self._fail(waited, self._silence(now_ns) or self._words or why, now_ns)
+            self._fail(waited, self._silence(now_ns) or self._stated_reason or why, now_ns)
 
     def _silence(self, now_ns: int) -> str:
-        """Sentence about an autopilot that is heard no more; empty where it is."""
+        """Sentence about a silent autopilot; empty if it is heard."""
         heard_ns = self._condition.heard_ns
         if heard_ns is None or now_ns - heard_ns <= QUIET_NS:
             return ""
@@ -301,8 +300,8 @@ class Launch:
 
     @property
     def streams_zeros(self) -> bool:
-        """Whether setpoints of zero have to run: the next mode needs a stream of them, or it
-        hovers.
+        """Whether zero set-points have to be sent: the next mode needs a stream of them, or the
+        vehicle hovers.
         """
         if self.phase is Phase.GROUND and self._hovers_ns is not None:
             return self._condition.mode == self._flavour.guided
@@ -313,31 +312,33 @@ class Launch:
     # -- down again --------------------------------------------------------------------------
 
     def return_home(self, *, now_ns: int) -> None:
-        """Return home and land there from now on, where the vehicle is ours and in the air."""
+        """Return home and land there, if the vehicle is under our control and in the air."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
-            self._way_down = self._flavour.back
+            self._landing_mode = self._flavour.back
         self.land(now_ns=now_ns)
 
     def land(self, *, now_ns: int) -> None:
-        """Land from now on, where the vehicle is ours and in the air."""
+        """Land, if the vehicle is under our control and in the air."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
             self._enter(Phase.LANDING, now_ns)
 
     def close(self, *, now_ns: int) -> list[Message]:
-        """End the launch; returns messages that make the vehicle land, where it is ours now."""
+        """End the launch; returns messages that make the vehicle land if it is under our
+        control.
+        """
         self._closed = True
         if self.phase is Phase.GROUND or not self._is_ours(now_ns):
             return []
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether it is armed and in a mode of ours, as far as is known now."""
+        """Whether it is armed and in a mode of ours, as far as is currently known."""
         condition = self._condition
         in_ours = condition.mode in self._flavour.own and condition.armed
         return in_ours and condition.is_fresh(now_ns=now_ns)
 
     def is_down(self, *, now_ns: int) -> bool:
-        """Whether the vehicle needs no more care, or is out of our hands."""
+        """Whether the vehicle needs no more control, or is out of our control."""
         condition = self._condition
         if self.phase is Phase.GROUND or not condition.armed:
             return True
@@ -345,8 +346,8 @@ class Launch:
             return False
         assert self._since_ns is not None
         lost = condition.heard_ns is None or now_ns - condition.heard_ns > SILENT_MAX_NS
-        obeys = condition.mode in (*self._flavour.own, self._flavour.land, self._way_down)
-        most_ns = LAND_MAX_NS if self._way_down == self._flavour.land else RETURN_MAX_NS
+        obeys = condition.mode in (*self._flavour.own, self._flavour.land, self._landing_mode)
+        most_ns = LAND_MAX_NS if self._landing_mode == self._flavour.land else RETURN_MAX_NS
         return lost or not obeys or now_ns - self._since_ns > most_ns
 
     # -- what is asked and heard -------------------------------------------------------------
@@ -379,19 +380,19 @@ class Launch:
         return self._lift() if step is LaunchStep.LIFT else None
 
     def _come_down(self, now_ns: int) -> Message:
-        """Command to land or to return; one that does not return for long lands."""
+        """Command to land or to return; a vehicle that ignores the command to return lands."""
         assert self._since_ns is not None
         if now_ns - self._since_ns > REFUSED_NS:
-            self._way_down = self._flavour.land
-        return self._mode_command(self._way_down)
+            self._landing_mode = self._flavour.land
+        return self._mode_command(self._landing_mode)
 
     def _lift(self) -> Message | None:
         altitude = self._altitude
         if self._flavour.above_sea:
             if self._condition.home is None:
-                self._words = "it does not know where home is"
+                self._stated_reason = "it does not know where home is"
                 return None
-            # Home was set some time ago, and the estimate of the height has drifted since.
+            # Home was set a while ago, and the height estimate has drifted since.
             ground = self._positions.origin[2] - self._condition.home_up
             altitude += self._condition.home[2] + ground
         nan = float("nan")
@@ -400,12 +401,12 @@ class Launch:
     def _mode_command(self, mode: int) -> Message:
         return self._long(SET_MODE, *self._flavour.mode_parts(mode))
 
-    def _long(self, command: int, *given: float) -> Message:
-        padded = (*given, *(0.0,) * (7 - len(given)))
+    def _long(self, command: int, *parameters: float) -> Message:
+        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
         return dialect.MAVLink_command_long_message(*self._target, command, 0, *padded)
 
     def hear(self, message: Message) -> None:
-        """Take the answer to one of our commands."""
+        """Process the answer to one of our commands."""
         command, result = message.command, message.result
         if command not in WORDS or result == IN_PROGRESS:
             return
@@ -423,8 +424,8 @@ class Launch:
             self._refused.add((command, result))
             asked = WORDS[command]
             self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
-        self._words = self._words or answer
+        self._stated_reason = self._stated_reason or answer
 
-    def heard_words(self, text: str) -> None:
-        """Note what the autopilot has said in words: it is why a step is not done."""
-        self._words = text
+    def hear_text(self, text: str) -> None:
+        """Note a text from the autopilot as the reason why a step is not done."""
+        self._stated_reason = text

@@ -1,8 +1,8 @@
-"""The autopilot's line as an endpoint: what comes from the autopilot, and all that goes to it.
+"""The connection to the autopilot as an endpoint: all messages from it and to it.
 
-Its own loop sends a heartbeat each second and, while the pilot flies, the velocity that he wants,
-never a position. Whatever ends that loop ends the setpoints, and the autopilot's own time-out acts:
-nothing in here repeats what was said by somebody who is gone.
+Its own loop sends a heartbeat each second and, while the pilot flies, the desired velocity, never a
+position. If this loop ends, so do the set-points, and the autopilot's own time-out acts: nothing
+here repeats the command of a pilot that is gone.
 """
 
 import math
@@ -28,7 +28,7 @@ from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams
 from skytether.client.mavlink.texts import SAME_TEXT_NS, LoggedTexts
 from skytether.client.navigation import Leaps
-from skytether.client.vehicle import Frame
+from skytether.client.vehicle import VehicleMemory
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
@@ -53,47 +53,47 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 TICK_NS = 100 * MILLISECOND_NS
-"""Time between two looks at what is due beside setpoints [ns]."""
+"""Interval between checks of what is due beside set-points [ns]."""
 HEARTBEAT_NS = SECOND_NS
-"""Time between two heartbeats of ours [ns]."""
+"""Interval between our heartbeats [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 100 * MILLISECOND_NS, SECOND_NS
-"""Time between two questions for the autopilot's clock [ns]: before it is known, and then."""
+"""Interval between questions for the autopilot's clock [ns]: before it is known, and after."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
-"""Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
+"""Time after which a silent pilot counts as gone [ns]; then no set-point is sent."""
 SETPOINTS_MAX_HZ = 50.0
-"""Largest number of setpoints in a second."""
-LOOK_NS = 300 * MILLISECOND_NS
-"""Time after a pause of setpoints from which on a heartbeat tells of now [ns]: those before it may
-have waited for us in a queue."""
+"""Largest number of set-points in a second."""
+CURRENT_NS = 300 * MILLISECOND_NS
+"""Time after a pause of set-points from which on a heartbeat counts as current [ns]: earlier ones
+may have waited in a queue."""
 LATE = 1.1
-"""Share of the time between two setpoints after which one is repeated: a step may come late."""
+"""A set-point is repeated after this many intervals, since a step may come late."""
 ZERO_NS = 50 * MILLISECOND_NS
-"""Time between two setpoints of zero, where a mode needs a stream of them [ns]."""
+"""Interval between zero set-points, if a mode needs a stream of them [ns]."""
 FRESH_NS = 200 * MILLISECOND_NS
-"""Age up to which a velocity is compared with what was told [ns]."""
+"""Age up to which a velocity is compared with the command [ns]."""
 CLOSES = 3
-"""Times that a vehicle in the air is told to land when its process ends."""
-ADDRESSES_TOLD = 4
-"""Most addresses of others that are told while the autopilot is silent."""
+"""Number of times that a vehicle in the air is told to land when the process ends."""
+ADDRESSES_REPORTED = 4
+"""Number of foreign addresses reported while the autopilot is silent."""
 VELOCITY_ALONE = 0b110111000111
-"""Type mask of a setpoint: neither position nor acceleration, nor yaw or its rate."""
+"""Type mask of a set-point with neither position nor acceleration, nor yaw or yaw rate."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
 AUTOPILOT_COMPONENT = int(dialect.MAV_COMP_ID_AUTOPILOT1)
 WARNING = int(dialect.MAV_SEVERITY_WARNING)
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 RATES = {
-    int(dialect.MAVLINK_MSG_ID_HEARTBEAT): 5.0,  # so that a pilot's switch is seen at once
+    int(dialect.MAVLINK_MSG_ID_HEARTBEAT): 5.0,  # so that a pilot's mode switch is seen at once
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 2.0,
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): 1.0,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.5,
 }
-"""Rates that are asked for [Hz], beside those of positions and of the estimate's health."""
+"""Requested rates [Hz], beside those of positions and of the estimator status."""
 
 
 def _start(scenario: Scenario, vehicle: int) -> Vector:
-    """Place of take-off, in our axes [m]: on a mission, below where it begins."""
+    """Position of take-off, in our axes [m]; on a mission, below its start position."""
     if not scenario.is_mission:
         return 0.0, 0.0, 0.0
     x, y = scenario.start_m(vehicle)[:2].tolist()
@@ -101,7 +101,7 @@ def _start(scenario: Scenario, vehicle: int) -> Vector:
 
 
 def given_origin(scenario: Scenario) -> Vector | None:
-    """Origin that a scenario states, in our axes [m]; None of one that is where it takes off."""
+    """Origin given by a scenario, in our axes [m]; None if it is the place of take-off."""
     match scenario.mavlink.origin:
         case "takeoff":
             return None
@@ -109,12 +109,12 @@ def given_origin(scenario: Scenario) -> Vector | None:
             return 0.0, 0.0, 0.0
         case (x, y, *up):
             return float(x), float(y), float(up[0]) if up else 0.0
-    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused it
+    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused anything else
 
 
 def returns_below_m(scenario: Scenario) -> float | None:
-    """Altitude below which a lost vehicle returns home [m], infinite without a fence; None of one
-    that lands where it is.
+    """Altitude below which a vehicle without a link returns home [m], infinite without a fence;
+    None for a vehicle that lands where it is.
     """
     if scenario.vehicle.on_loss != "return":
         return None
@@ -123,23 +123,23 @@ def returns_below_m(scenario: Scenario) -> float | None:
 
 
 class Port(Endpoint):
-    """Line to one autopilot.
+    """Connection to one autopilot.
 
     Args:
-        scenario: its keys of `mavlink`.
-        vehicle: number of the vehicle, for what is told.
-        line: where the autopilot is.
-        altitude: altitude to take off to [m].
+        scenario: scenario, with its keys of `mavlink`.
+        vehicle: number of the vehicle, for events.
+        line: address of the autopilot.
+        altitude: take-off altitude [m].
     """
 
     _setup: Setup | None = None
-    """Judge of its parameters; None, as its launch and its streams, before it was heard."""
+    """Check of its parameters; None, like launch and streams, until the autopilot is heard."""
     _launch: Launch | None = None
     _streams: Streams | None = None
     _unfit: NotTakenOff | None = None
-    """Event after which it is not flown, of one that is unfit or was not heard."""
+    """Event that an unsuitable or silent vehicle is not flown."""
     _set_up_ns: int | None = None
-    """Time at which all was set up but the clock."""
+    """Time at which everything but the clock was ready."""
 
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, altitude: float) -> None:
         super().__init__()
@@ -147,9 +147,9 @@ class Port(Endpoint):
         self._vehicle, self._altitude = vehicle, altitude
         self._peer: Address | None = line.peer
         self._line, self._may_move = scenario.vehicle.address, line.kind == "udp"
-        """Line, and whether the autopilot may have another address on it after a restart."""
+        """Address, and whether the autopilot may have another one after a restart."""
         self._elsewhere: list[Address] = []
-        """Other addresses from which something came while the autopilot was silent."""
+        """Other addresses from which something arrived while the autopilot was silent."""
         self._codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self._clock = BootClock()
         self._condition = Condition(keys.battery_min, keys.battery_min_v)
@@ -163,52 +163,53 @@ class Port(Endpoint):
         """Measurements."""
         self._texts = LoggedTexts(vehicle, self._events)
         self.sets_parameters = False
-        """Whether parameters that are not safe are set."""
+        """Whether unsafe parameters are changed."""
         self._target: tuple[int, int] | None = None
-        """Numbers of the autopilot's system and component; None before it was heard."""
+        """Numbers of the autopilot's system and component; None until it is heard."""
         self._flavour: Flavour = ARDUPILOT
         self._counts: Counter[str] = Counter()
         self.now_ns = 0
         """Time of the newest call."""
         self._began_ns: int | None = None
-        self._jumps, self._unusable = 0, False
-        """Jumps of the clock before it was set up; whether it was told that positions are
-        dropped."""
+        self._jumps, self._reported_unusable = 0, False
+        """Clock jumps up to the newest check of the parameters, and whether it was reported that
+        positions cannot be used."""
         self._tick_ns = 0
-        self._beat_ns = self._clock_ns = 0
+        self._heartbeat_ns = self._clock_ns = 0
         """Times of the next heartbeat, and of the next question for the clock."""
         self._velocity = (0.0, 0.0, 0.0)
-        """Velocity that is flown, in our axes [m/s]."""
+        """Desired velocity, in our axes [m/s]."""
         self._flown_ns: int | None = None
-        """Time at which the pilot said so; None before he did."""
+        """Time of the pilot's newest command; None before the first."""
         self._sent_ns: int | None = None
-        """Time of the newest setpoint."""
-        self._looks_ns: int | None = None
-        """Time since which setpoints wait for the mode to be heard, after a pause; else None."""
-        each = scenario.dt_ns
-        parts = -(-each * keys.setpoints_hz // SECOND_NS)
-        self._repeat_ns = round(LATE * each / parts)
+        """Time of the newest set-point."""
+        self._mode_awaited_ns: int | None = None
+        """Time since which, after a pause, set-points wait for a current mode; None if they do
+        not."""
+        step_ns = scenario.dt_ns
+        parts = -(-step_ns * keys.setpoints_hz // SECOND_NS)
+        self._repeat_ns = round(LATE * step_ns / parts)
         self._was_armed = False
-        """Whether a life of the client has armed it since a person last said that it may be."""
+        """Whether a run of the client has armed it since an operator last allowed arming."""
         self._rivals, self._obedience = Rivals(), Obedience(scenario)
         self._yields = False
-        """Whether a second commander has the vehicle: nothing is sent."""
-        self._said_ns: dict[Reason, int] = {}
-        """Times at which a second commander was told of, by the way it was noticed."""
+        """Whether a second commander has the vehicle, so that nothing is sent."""
+        self._reported_ns: dict[Reason, int] = {}
+        """Times at which a second commander was reported, by how it was detected."""
         self._returns_below_m = returns_below_m(scenario)
         self._was_disarmed = False
-        """Whether it was disarmed since it flew: it is not flown again."""
+        """Whether it was disarmed since it flew, so that it is not flown again."""
 
     # -- what the vehicle asks ---------------------------------------------------------------
 
     @property
     def is_ready(self) -> bool:
-        """Whether the autopilot is there, and set up safely."""
+        """Whether the autopilot is connected and configured safely."""
         return self._setup is not None and self._setup.is_done and self._clock.is_known
 
     @property
     def waits_for(self) -> str:
-        """What is missing before the vehicle can be flown, in words; empty where nothing is."""
+        """What is missing before the vehicle can be flown, in words; empty if nothing is."""
         if self._setup is None or self._launch is None:
             return f"a heartbeat of its autopilot at {self._line}"
         if not self._setup.is_done:
@@ -216,7 +217,7 @@ class Port(Endpoint):
         return self._launch.waits_for if self._clock.is_known else self._clock_fault()
 
     def _clock_fault(self) -> str:
-        """What is missing of a clock that is not known, in words."""
+        """What is missing until the clock is known, in words."""
         rate = self._clock.wrong_rate
         if rate is None:
             return "an answer of its autopilot to TIMESYNC"
@@ -225,20 +226,20 @@ class Port(Endpoint):
 
     @property
     def failure(self) -> AboardFailure | None:
-        """Event after which the vehicle is not flown."""
+        """Event that makes the vehicle unusable."""
         if self._unfit or self._setup is None or self._launch is None:
             return self._unfit
         return self._setup.failure or self._launch.failure
 
     @property
     def is_down(self) -> bool:
-        """Whether the vehicle needs no more care."""
+        """Whether the vehicle needs no more control."""
         return self._launch is None or self._launch.is_down(now_ns=self.now_ns)
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        """Go on with the take-off, see `Launch`."""
+        """Continue the take-off, see `Launch`."""
         self.now_ns = now_ns
-        # Where an earlier life has flown it since this boot, its parameters were safe.
+        # If an earlier run has flown it since this boot, its parameters were safe.
         may_fly = self.is_ready or self.positions.is_recalled
         if self._launch is None or not may_fly or self.failure:
             return False
@@ -249,26 +250,26 @@ class Port(Endpoint):
         """Whether this run of the client has armed the autopilot."""
         return self._launch is not None and self._launch.took_off
 
-    def recall(self, frame: Frame) -> None:
-        """Take what an earlier life of the client has kept."""
-        self._was_armed = frame.armed
-        self.positions.recall(frame)
+    def recall(self, saved: VehicleMemory) -> None:
+        """Restore state saved by an earlier run of the client."""
+        self._was_armed = saved.armed
+        self.positions.recall(saved)
 
     @property
-    def frame(self) -> Frame:
-        """What the next life of the client needs to know."""
+    def frame(self) -> VehicleMemory:
+        """State that the next run of the client needs."""
         return self.positions.frame(armed=self._was_armed or self.took_off)
 
     def arm(self) -> None:
-        """Take a person's word that the vehicle may be armed."""
+        """Allow arming, as an operator said."""
         if self._launch is None:
             self._was_armed = False
             return
         self._launch.arm()
-        self._was_armed = self._was_armed and bool(self._launch.waits_for_word)
+        self._was_armed = self._was_armed and bool(self._launch.why_not_armed)
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """Cause for which the vehicle must not follow a plan now."""
+        """Reason that forbids following a plan now."""
         self.now_ns = now_ns
         condition = self._condition
         if not condition.armed or self._was_disarmed:
@@ -288,24 +289,24 @@ class Port(Endpoint):
         return self._silence(now_ns)
 
     def _silence(self, now_ns: int) -> Reason | None:
-        """Cause that the autopilot says nothing that can be used, if that is so."""
+        """Reason why the autopilot sends nothing usable; None if it does."""
         if not self._is_past(self.positions.came_ns, now_ns):
-            self._unusable = False
+            self._reported_unusable = False
             return None if self._condition.is_fresh(now_ns=now_ns) else Reason.MUTE
         if self._is_past(self.positions.heard_ns, now_ns):
             return Reason.MUTE
-        self._tell_unusable()
+        self._report_unusable()
         return Reason.UNUSABLE
 
     def _is_past(self, came_ns: int | None, now_ns: int) -> bool:
-        """Whether something came longer ago than the autopilot may be silent."""
+        """Whether something arrived longer ago than the autopilot may be silent."""
         return came_ns is None or now_ns - came_ns > seconds_to_ns(self._keys.silence_s)
 
-    def _tell_unusable(self) -> None:
-        """Say once why no position can be used."""
-        if self._unusable or not self.positions.fault:
+    def _report_unusable(self) -> None:
+        """Report once why no position can be used."""
+        if self._reported_unusable or not self.positions.fault:
             return
-        self._unusable = True
+        self._reported_unusable = True
         fault = self.positions.fault
         if (rate := self._clock.wrong_rate) is not None:
             fault += (
@@ -314,27 +315,27 @@ class Port(Endpoint):
         self._events.append(PositionsDropped(vehicle=self._vehicle, why=fault))
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """How a second commander is noticed; None where there is none."""
+        """How a second commander was detected; None if there is none."""
         rivals, obedience = self._rivals, self._obedience
         event: AboardEvent
         if rivals.are_there(now_ns=now_ns):
-            system, component, said = rivals.newest
+            system, component, content = rivals.newest
             cause = Reason.RIVAL
             event = SecondCommander(
-                vehicle=self._vehicle, system=system, component=component, said=said
+                vehicle=self._vehicle, system=system, component=component, said=content
             )
         elif obedience.strays(now_ns=now_ns):
             cause = Reason.STRAYED
             event = Strays(vehicle=self._vehicle, off_mps=obedience.off_mps)
         else:
             return None
-        if now_ns - self._said_ns.get(cause, -SAME_TEXT_NS) >= SAME_TEXT_NS:
-            self._said_ns[cause] = now_ns
+        if now_ns - self._reported_ns.get(cause, -SAME_TEXT_NS) >= SAME_TEXT_NS:
+            self._reported_ns[cause] = now_ns
             self._events.append(event)
         return cause
 
     def fly(self, velocity: tuple[float, float, float]) -> None:
-        """Send a velocity now, unless one was sent just before, and repeat it for a while."""
+        """Send a velocity now, unless one was just sent, and repeat it for a while."""
         came_ns = self.positions.came_ns
         if came_ns is not None and self.now_ns - came_ns <= FRESH_NS:
             self._obedience.step(velocity, self.positions.velocity, now_ns=self.now_ns)
@@ -346,7 +347,7 @@ class Port(Endpoint):
             self._send_velocity(self.now_ns)
 
     def return_home(self) -> None:
-        """Command the autopilot to return home by itself, and to land there."""
+        """Command the autopilot to return home by itself and land there."""
         if self._launch is not None:
             self._launch.return_home(now_ns=self.now_ns)
             self._tick_ns = self.now_ns
@@ -381,15 +382,17 @@ class Port(Endpoint):
                 self._counts["heard"] += 1
                 self._hear(message, now_ns)
         if self._target is None and self._is_quiet(now_ns) and self._may_move:
-            self._tell_elsewhere(datagram.peer, messages)
+            self._report_elsewhere(datagram.peer, messages)
 
     def _is_quiet(self, now_ns: int) -> bool:
-        """Whether the autopilot has been silent for a while, at the address that it has."""
+        """Whether the autopilot has been silent for a while, at its known address."""
         since_ns = self._condition.heard_ns or self._began_ns or now_ns
         return now_ns - since_ns > QUIET_NS
 
     def _hear_elsewhere(self, datagram: Datagram, now_ns: int) -> None:
-        """Take the autopilot from its new address, where it may have one, or say what comes."""
+        """Follow the autopilot to a new address if that is allowed; otherwise report what
+        arrived.
+        """
         codec = Codec(self._keys.system, self._keys.component)
         messages = codec.decode(datagram.payload)
         for message in messages:
@@ -399,29 +402,29 @@ class Port(Endpoint):
                 self._move(datagram.peer)
                 self.receive(datagram, now_ns=now_ns)
                 return
-        self._tell_elsewhere(datagram.peer, messages)
+        self._report_elsewhere(datagram.peer, messages)
 
-    def _tell_elsewhere(self, peer: Address, messages: Sequence[Message]) -> None:
-        """Say once of each address that what comes from there is not the autopilot's."""
-        if peer in self._elsewhere or len(self._elsewhere) == ADDRESSES_TOLD:
+    def _report_elsewhere(self, peer: Address, messages: Sequence[Message]) -> None:
+        """Report once per address that its datagrams are not from the autopilot."""
+        if peer in self._elsewhere or len(self._elsewhere) == ADDRESSES_REPORTED:
             return
         self._elsewhere.append(peer)
         expected = address_text(*self._peer) if self._peer else self._line
-        said = AutopilotElsewhere(
+        elsewhere = AutopilotElsewhere(
             vehicle=self._vehicle,
             came_from=address_text(*peer),
             expected=expected,
             content=_content(messages),
         )
-        self._events.append(said)
+        self._events.append(elsewhere)
 
     def _is_on_the_ground(self, heartbeat: Message) -> bool:
-        """Whether the vehicle was disarmed before its silence, and says so now."""
+        """Whether the vehicle was disarmed before its silence, and still is."""
         armed = heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED
         return not (self._condition.armed or armed)
 
     def _move(self, peer: Address) -> None:
-        """Go on with the autopilot at another address: it has restarted, so all is set up anew."""
+        """Continue at the autopilot's new address: it has restarted, so check everything again."""
         assert self._peer is not None
         before, after = address_text(*self._peer), address_text(*peer)
         self._events.append(AutopilotMoved(vehicle=self._vehicle, before=before, after=after))
@@ -430,17 +433,17 @@ class Port(Endpoint):
         self._set_up_anew()
 
     def _set_up_anew(self) -> None:
-        """Look at the parameters of an autopilot that has restarted, before a flight alone."""
+        """Check the parameters of a restarted autopilot again, unless it flies."""
         if self._target is not None and self._launch and self._launch.phase is Phase.GROUND:
             self._set_up(self._target)
 
     def _hear_other(self, message: Message, sender: tuple[int, int], now_ns: int) -> None:
-        """Take a message of neither the autopilot nor us."""
+        """Process a message that is neither from the autopilot nor from us."""
         if self._target is not None and sender != (self._keys.system, self._keys.component):
             self._rivals.hear(message, self._target[0], now_ns=now_ns)
 
     def _meet(self, message: Message, sender: tuple[int, int], peer: Address) -> None:
-        """Take who sends a heartbeat for our autopilot, if it is one."""
+        """Adopt the sender of a heartbeat as our autopilot, if it is one."""
         system, component = sender
         if component != AUTOPILOT_COMPONENT or self._keys.autopilot not in (0, system):
             return
@@ -455,7 +458,7 @@ class Port(Endpoint):
         self._set_up(sender)
 
     def _set_up(self, sender: tuple[int, int]) -> None:
-        """Begin to look at the parameters, and to ask for streams."""
+        """Start to check the parameters, and to request streams."""
         keys, flavour = self._keys, self._flavour
         self._set_up_ns = None
         self._setup = Setup(
@@ -479,7 +482,7 @@ class Port(Endpoint):
             events=self._events,
         )
         if self._was_armed:
-            self._launch.waits_for_word = "an earlier run of its client has armed it"
+            self._launch.why_not_armed = "an earlier run of its client has armed it"
         estimate = (
             dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
             if flavour is ARDUPILOT
@@ -518,7 +521,7 @@ class Port(Endpoint):
             case "STATUSTEXT":
                 text = self._texts.hear(message, now_ns=now_ns)
                 if text and message.severity <= WARNING:
-                    launch.heard_words(text)
+                    launch.hear_text(text)
             case "COMMAND_ACK" if message.command == SET_INTERVAL:
                 self._hear_interval(message.result)
             case "COMMAND_ACK":
@@ -527,7 +530,7 @@ class Port(Endpoint):
                 self._setup.hear(message)
 
     def _hear_interval(self, result: int) -> None:
-        """Count a refusal of a stream, and tell the first."""
+        """Count a refused stream, and report the first."""
         if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._counts["streams_refused"]:
@@ -558,8 +561,12 @@ class Port(Endpoint):
     def _tick(self, now_ns: int) -> None:
         assert self._began_ns is not None
         self._texts.tick(now_ns=now_ns)
-        if self._peer is not None and now_ns >= self._beat_ns and not self._is_given_up(now_ns):
-            self._beat_ns = now_ns + HEARTBEAT_NS
+        if (
+            self._peer is not None
+            and now_ns >= self._heartbeat_ns
+            and not self._is_given_up(now_ns)
+        ):
+            self._heartbeat_ns = now_ns + HEARTBEAT_NS
             self._say(_heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER))
             if self._may_be_station():
                 self._say(_heartbeat(dialect.MAV_TYPE_GCS))
@@ -581,17 +588,18 @@ class Port(Endpoint):
             self._say(message)
 
     def _is_given_up(self, now_ns: int) -> bool:
-        """Whether it is to land, and does not say that it does: without our heartbeats its own
-        failsafe lands it.
+        """Whether it does not obey the command to land: without our heartbeats its own failsafe
+        lands it.
         """
         launch = self._launch
         lands = launch is not None and launch.phase is Phase.LANDING
         return lands and not self._condition.is_fresh(now_ns=now_ns)
 
     def _may_be_station(self) -> bool:
-        """Whether we tell PX4 that we are a ground station too: it says nothing in words to others.
+        """Whether to announce ourselves to PX4 as a ground station too: only those receive its
+        texts.
 
-        Not where PX4 acts when it loses its ground station: it would miss the loss of another one.
+        Not if PX4 reacts to losing its ground station: it would miss the loss of another one.
         """
         setup = self._setup
         return (
@@ -602,7 +610,7 @@ class Port(Endpoint):
         )
 
     def _await_clock(self, now_ns: int) -> None:
-        """Give up where everything but the clock was set up long ago."""
+        """Give up if everything but the clock has been ready for too long."""
         assert self._setup is not None
         if not self._setup.is_done or self._clock.is_known or self._unfit:
             self._set_up_ns = None
@@ -612,26 +620,26 @@ class Port(Endpoint):
             self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
 
     def _give_up(self, doing: str, why: str) -> None:
-        """Fail: something has not come in time."""
+        """Fail because something did not arrive in time."""
         doing = f"{doing} in {self._keys.patience_s:g} s"
         self._unfit = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
         self._events.append(self._unfit)
 
     def _setpoint_ns(self) -> int | None:
-        """Time of the next setpoint; None where none is to be sent."""
+        """Time of the next set-point; None if none is to be sent."""
         launch, sent_ns = self._launch, self._sent_ns
         if launch is None:
             return None
         if launch.streams_zeros:
             return self.now_ns if sent_ns is None else sent_ns + ZERO_NS
-        if not self._may_fly() or self._looks_ns is not None:
+        if not self._may_fly() or self._mode_awaited_ns is not None:
             return None
         assert self._flown_ns is not None
         due_ns = self._flown_ns if sent_ns is None else sent_ns + self._repeat_ns
         return due_ns if due_ns - self._flown_ns <= UNFLOWN_NS else None
 
     def _may_fly(self) -> bool:
-        """Whether the pilot flies, and the autopilot obeys us."""
+        """Whether the pilot flies, and the autopilot follows our set-points."""
         condition, launch = self._condition, self._launch
         return (
             launch is not None
@@ -643,24 +651,24 @@ class Port(Endpoint):
         )
 
     def _may_go_on(self, now_ns: int) -> bool:
-        """Whether setpoints may go on; after a long pause the autopilot has to be heard first.
+        """Whether set-points may continue; after a long pause the autopilot has to be heard first.
 
-        PX4 has left its guided mode then, and the first setpoint would bring it back by itself.
+        PX4 has then left its guided mode, and the first set-point would bring it back.
         """
         if not self._flavour.streams_first or self._sent_ns is None or self._setup is None:
             return True
         loss_s = self._setup.value(self._flavour.time_out) or 0.0
-        if self._looks_ns is None and now_ns - self._sent_ns > seconds_to_ns(loss_s):
-            self._looks_ns = now_ns
-        if self._looks_ns is None:
+        if self._mode_awaited_ns is None and now_ns - self._sent_ns > seconds_to_ns(loss_s):
+            self._mode_awaited_ns = now_ns
+        if self._mode_awaited_ns is None:
             return True
         heard_ns = self._condition.heartbeat_ns
-        if heard_ns is not None and heard_ns - self._looks_ns >= LOOK_NS:
-            self._looks_ns = None
-        return self._looks_ns is None
+        if heard_ns is not None and heard_ns - self._mode_awaited_ns >= CURRENT_NS:
+            self._mode_awaited_ns = None
+        return self._mode_awaited_ns is None
 
     def _send_velocity(self, now_ns: int) -> None:
-        """Send the velocity that is flown, or zero where a stream of that is wanted."""
+        """Send the desired velocity, or zero if a stream of zeros is needed."""
         launch = self._launch
         if launch is None or self._target is None:
             return
@@ -695,7 +703,7 @@ class Port(Endpoint):
             self.send(self._codec.encode(message), self._peer)
 
     def close(self, *, now_ns: int) -> None:
-        """See `Endpoint`; a vehicle in the air that is ours lands by itself."""
+        """See `Endpoint`; a vehicle in the air under our control lands by itself."""
         self.now_ns = now_ns
         if self._launch is None:
             return
@@ -705,9 +713,9 @@ class Port(Endpoint):
     # -- figures -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`; what is not known is left out."""
+        """See `Endpoint`; unknown figures are left out."""
         condition, clock, counts = self._condition, self._clock, self._counts
-        told: dict[str, Any] = {
+        port_figures: dict[str, Any] = {
             "mode": self._flavour.mode_name(condition.mode),
             "mode_number": condition.mode,
             "armed": int(condition.armed),
@@ -722,17 +730,17 @@ class Port(Endpoint):
             "drift_ppm": 1e6 * clock.drift,
         }
         if clock.round_trip_ns is not None:
-            told["round_trip_ms"] = clock.round_trip_ns / MILLISECOND_NS
+            port_figures["round_trip_ms"] = clock.round_trip_ns / MILLISECOND_NS
         if condition.charge is not None:
-            told["battery"] = condition.charge
+            port_figures["battery"] = condition.charge
         if condition.voltage is not None:
-            told["voltage_v"] = condition.voltage
+            port_figures["voltage_v"] = condition.voltage
         if condition.home is not None:
             names = ("latitude_deg", "longitude_deg", "altitude_m")
-            told["home"] = dict(zip(names, condition.home, strict=True))
+            port_figures["home"] = dict(zip(names, condition.home, strict=True))
         if self._setup is not None and self._setup.fence:
-            told["fence"] = self._setup.fence
-        return told
+            port_figures["fence"] = self._setup.fence
+        return port_figures
 
 
 def _content(messages: Sequence[Message]) -> str:
@@ -745,6 +753,6 @@ def _content(messages: Sequence[Message]) -> str:
 
 
 def _heartbeat(kind: int) -> Message:
-    """Heartbeat of a MAV_TYPE that is no autopilot."""
+    """Heartbeat of a MAV_TYPE that is not an autopilot."""
     active = dialect.MAV_STATE_ACTIVE
     return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, active, 3)

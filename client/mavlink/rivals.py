@@ -1,7 +1,8 @@
-"""Second commanders: others on the line that tell our autopilot where to fly.
+"""Second commanders: others on the network that command our autopilot.
 
-An autopilot obeys whoever speaks last, and does not say whom. What a router or a radio shows us of
-others is all that can be seen of them here; of those it does not show, `obedience` sees the effect.
+An autopilot obeys the latest command without saying whose it was. Here other commanders are
+detected from the messages that a router or radio passes on to us; `obedience` detects the others by
+their effect.
 """
 
 from collections import deque
@@ -11,11 +12,11 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import SECOND_NS
 
 WINDOW_NS = SECOND_NS
-"""Time within which set-points are counted [ns]."""
+"""Window in which set-points are counted [ns]."""
 LEAST = 2
-"""Set-points within it that make a second commander: one may be a stray."""
+"""Number of set-points in the window that make a second commander; a single one may be a stray."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence after which it is gone [ns]."""
+"""Silence after which a second commander counts as gone [ns]."""
 STREAMS = frozenset(
     {
         "SET_POSITION_TARGET_LOCAL_NED",
@@ -24,7 +25,7 @@ STREAMS = frozenset(
         "SET_ACTUATOR_CONTROL_TARGET",
     }
 )
-"""Set-points, of which a stream is sent."""
+"""Set-points that are sent as a stream."""
 GOTO = frozenset(
     {
         int(dialect.MAV_CMD_DO_REPOSITION),
@@ -33,32 +34,32 @@ GOTO = frozenset(
         int(dialect.MAV_CMD_OVERRIDE_GOTO),
     }
 )
-"""Commands that lead a vehicle in its present mode, and are sent once. Another mode is seen in its
+"""Commands that move a vehicle in its present mode, and are sent once. A change of mode is seen in
 heartbeats."""
 GUIDED_ITEM = (2, 3)
-"""Values of `current` of a mission's item that is flown to at once, or sets an altitude."""
+"""Values of `current` of a mission item that is flown to at once, or sets an altitude."""
 STICK = 50
-"""Deflection of a stick that counts, of 1000, or of 500 µs."""
+"""Stick deflection that counts, of 1000, or of 500 µs."""
 CENTRE_US = 1500
 UNUSED_US = (0, 65535)
 """Pulse widths of a channel that is not overridden [µs]."""
 
 
 class Rivals:
-    """Others that command our autopilot, as far as the line shows them."""
+    """Others that command our autopilot, as far as their messages reach us."""
 
     def __init__(self) -> None:
         self._times_ns: deque[int] = deque(maxlen=LEAST)
         self._active_ns: int | None = None
         """Time of the newest set-point of a second commander; None without one."""
         self.newest: tuple[int, int, str] = (0, 0, "")
-        """Numbers of its system and component, and the kind of its newest message."""
+        """Numbers of its system and component, and the type of its newest message."""
 
     def hear(self, message: Message, system: int, *, now_ns: int) -> None:
-        """Take a message of somebody else.
+        """Process a message of another sender.
 
         Args:
-            message: what came.
+            message: the message.
             system: number of our autopilot's system.
             now_ns: time now.
         """
@@ -76,7 +77,7 @@ class Rivals:
 
 
 def _weight(message: Message, system: int) -> int:
-    """Number of set-points that a message counts for."""
+    """Number of set-points that a message counts as."""
     kind = message.get_type()
     named = message.target if kind == "MANUAL_CONTROL" else getattr(message, "target_system", None)
     if named not in (0, system):

@@ -1,10 +1,11 @@
-"""Parameters that decide what an autopilot does in silence: what they mean, and which are safe.
+"""Parameters that decide how an autopilot reacts to silence: their meaning and safe values.
 
-**Safe is what ends by itself.** Without setpoints the vehicle may fly on for a second at most, and
-once our process is gone it has to come down; to hover or to fly on for ever is not safe.
+**Safe means that the flight ends by itself.** Without set-points the vehicle may fly on for one
+second at most, and once our process is gone it has to come down; hovering or flying on for ever is
+unsafe.
 
-A parameter that must be known is refused where the autopilot does not have it; of any other it is
-told that it is missing.
+A required parameter that the autopilot does not have makes it unsafe; any other is reported as
+missing.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,27 +14,27 @@ from typing import NamedTuple
 from skytether.shared.core.aboard import AutopilotParameter
 
 SILENCE_MAX_S = 1.0
-"""Longest time for which a vehicle may fly on without setpoints [s]."""
+"""Longest time for which a vehicle may fly on without set-points [s]."""
 SILENCE_MIN_S = 0.2
-"""Shortest time-out with which it flies at all where setpoints come at 10 Hz [s]."""
+"""Shortest usable time-out if set-points arrive at 10 Hz [s]."""
 TOLERANCE = 1e-6
-"""Tolerance for a decimal number stored as a float of 32 bits."""
+"""Rounding error of a decimal number stored as float32."""
 
 
 class Rule(NamedTuple):
     """Requirement on a parameter."""
 
     names: tuple[str, ...]
-    """Names of the parameter, the newest last: an autopilot has one of them."""
+    """Names of the parameter in versions of the autopilot, newest last."""
     meaning: Callable[[float], str]
     """Meaning of a value, in words."""
     is_safe: Callable[[float], bool] = lambda _: True
     wanted: str = ""
-    """Values that are safe, in words."""
+    """Safe values, in words."""
     value: float = 0.0
-    """Value that is set where it is not."""
+    """Value to set if the present one is unsafe."""
     required: bool = False
-    """Whether it must be known."""
+    """Whether the parameter must be known."""
 
 
 def _table(meanings: Mapping[int, str], other: str) -> Callable[[float], str]:
@@ -102,7 +103,7 @@ def _options(value: float) -> str:
 
 
 CLEAR_M = 1.0
-"""Distance below the fence at which a vehicle returns whose parameter is set [m]."""
+"""Distance below the fence of the return altitude that is set [m]."""
 
 
 def _below(value: float, below_m: float) -> bool:
@@ -110,11 +111,11 @@ def _below(value: float, below_m: float) -> bool:
 
 
 def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
-    """Rule for an altitude of the return: below the fence.
+    """Rule that a vehicle returns below the fence.
 
     Args:
         name: name of the parameter.
-        what: what it does at that altitude.
+        what: what the vehicle does at that altitude.
         below_m: altitude of the fence [m]; infinite without one.
         scale: number of the parameter's units in a metre.
     """
@@ -129,7 +130,7 @@ def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
 
 
 def _ardupilot_returns(below_m: float | None) -> tuple[Rule, ...]:
-    """Rules for the return of ArduCopter; none for one that does not return."""
+    """Rules for the return of ArduCopter; none if it does not return."""
     if below_m is None:
         return ()
     return (
@@ -146,7 +147,7 @@ def _ardupilot_returns(below_m: float | None) -> tuple[Rule, ...]:
 
 
 def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
-    """Rules for the return of PX4; none for one that does not return."""
+    """Rules for the return of PX4; none if it does not return."""
     if below_m is None:
         return ()
     return (
@@ -166,7 +167,7 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
 
     Args:
         system: number of our own system.
-        returns_below_m: altitude below which it has to return home, where it does [m].
+        returns_below_m: altitude below which it has to return home, if it does [m].
     """
     return (
         *_ardupilot_returns(returns_below_m),
@@ -234,7 +235,7 @@ def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
     """Rules for PX4.
 
     Args:
-        returns_below_m: altitude below which it has to return home, where it does [m].
+        returns_below_m: altitude below which it has to return home, if it does [m].
     """
     return (
         *_px4_returns(returns_below_m),
@@ -290,9 +291,10 @@ def _limit(value: float, where: str) -> str:
 
 
 def judged(rule: Rule, values: Mapping[str, float]) -> AutopilotParameter:
-    """AutopilotParameter of a rule, and what is wrong with it.
+    """Parameter of a rule, its meaning, and whether it is safe.
 
     Args:
+        rule: the rule.
         values: values of the parameters that the autopilot has, by name.
     """
     for name in rule.names:

@@ -1,9 +1,9 @@
-"""Setting up: which autopilot it is, and whether what it does in silence is safe.
+"""Set-up: which autopilot it is, and whether its parameters are safe.
 
     heartbeat → version → parameters, read one by one → all safe, or refused, or set and read again
 
-Every question is asked again until it is answered, as often as a bad line needs; a parameter of
-which nothing is heard then is one that the autopilot does not have.
+Each question is repeated until it is answered, often enough for a bad line. A parameter that is
+never answered counts as one that the autopilot does not have.
 """
 
 from collections.abc import Mapping
@@ -25,27 +25,28 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time after which a question is asked again [ns]."""
+"""Time after which a question is repeated [ns]."""
 TRIES = 10
-"""Times that a question is asked; with a tenth lost each way, one in ten million stays open."""
+"""Number of times that a question is asked; with 10 % loss each way, one in ten million stays
+open."""
 AT_ONCE = 4
-"""Questions that wait for their answers at once: a serial line takes no more."""
+"""Number of open questions: a serial line takes no more."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 
 
 class Setup:
-    """Judges, and where it may, sets the parameters of an autopilot.
+    """Checks the parameters of an autopilot, and sets unsafe ones if allowed.
 
     Args:
-        vehicle: number of the vehicle, for what is told.
+        vehicle: number of the vehicle, for events.
         flavour: which autopilot.
         target: numbers of its system and component.
         system: number of our own system.
-        sets: whether parameters that are not safe are set.
-        returns_below_m: altitude below which it has to return home, where it does [m].
-        events: takes what is told.
+        sets: whether unsafe parameters are set.
+        returns_below_m: altitude below which it has to return home, if it does [m].
+        events: list to which events are appended.
     """
 
     def __init__(
@@ -68,15 +69,15 @@ class Setup:
         )
         self._bytewise = flavour.bytewise
         self._version: str | None = None
-        """Name and version; None until it is known, or not told."""
+        """Name and version; None while unknown."""
         self._version_tries = 0
         self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
-        """Times that each parameter was asked for, or set, that is not known yet."""
+        """Times that each unknown parameter was asked for, or set."""
         self._values: dict[str, float] = {}
         self._kinds: dict[str, int] = {}
-        """Types of the parameters that are known."""
+        """Types of the known parameters."""
         self._setting: dict[str, tuple[float, float]] = {}
-        """Values before and after of parameters that are being set."""
+        """Old and new values of parameters that are being set."""
         self._changed: list[tuple[str, float, float]] = []
         self._asked_ns: int | None = None
         self.is_done = False
@@ -85,11 +86,11 @@ class Setup:
 
     @property
     def fence(self) -> dict[str, float]:
-        """Parameters of the autopilot's own fence that are known: values by name."""
+        """Known parameters of the autopilot's own fence: values by name."""
         return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
 
     def value(self, name: str) -> float | None:
-        """Value of a parameter; None where it is not known."""
+        """Value of a parameter; None if unknown."""
         return self._values.get(name)
 
     @property
@@ -102,7 +103,7 @@ class Setup:
     # What is heard
 
     def hear(self, message: Message) -> None:
-        """Take a message of the autopilot."""
+        """Process a message of the autopilot."""
         match message.get_type():
             case "AUTOPILOT_VERSION" if self._version is None:
                 can, number = message.capabilities, message.flight_sw_version
@@ -126,9 +127,9 @@ class Setup:
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # it has no other name beside this one
-                for each in rule.names:
-                    self._tries.pop(each, None)
+            if name in rule.names:  # an autopilot has only one of the names
+                for other_name in rule.names:
+                    self._tries.pop(other_name, None)
 
     def _found(self, name: str) -> None:
         self._version = name
@@ -173,7 +174,7 @@ class Setup:
         ]
 
     def _question(self, name: str) -> Message:
-        """Message that asks for a parameter, or sets it; either is answered by its value."""
+        """Message that asks for a parameter, or sets it; the answer is its value in both cases."""
         if name not in self._setting:
             return dialect.MAVLink_param_request_read_message(*self._target, name.encode(), -1)
         kind, (_, wanted) = self._kinds[name], self._setting[name]
@@ -184,11 +185,11 @@ class Setup:
     # What follows
 
     def _judge(self) -> None:
-        """Say what has been read, and go on, set what is not safe, or fail."""
+        """Report what has been read; then finish, set what is unsafe, or fail."""
         judged = {rule: safety.judged(rule, self._values) for rule in self._rules}
-        told = tuple(judged.values())
+        parameters = tuple(judged.values())
         unsafe = {rule: parameter for rule, parameter in judged.items() if parameter.wanted}
-        self._say(told)
+        self._report(parameters)
         if not unsafe:
             self.is_done = True
         elif self._sets and not self._setting and not self._changed:
@@ -204,9 +205,9 @@ class Setup:
                 self._setting[parameter.name] = (parameter.value, rule.value)
                 self._tries[parameter.name] = 0
 
-    def _say(self, told: tuple[AutopilotParameter, ...]) -> None:
+    def _report(self, parameters: tuple[AutopilotParameter, ...]) -> None:
         if self._changed:
             changes = tuple(self._changed)
             self._events.append(ParametersSet(vehicle=self._vehicle, changes=changes))
         elif not self._setting:
-            self._events.append(ParametersRead(vehicle=self._vehicle, parameters=told))
+            self._events.append(ParametersRead(vehicle=self._vehicle, parameters=parameters))

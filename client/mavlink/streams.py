@@ -1,4 +1,4 @@
-"""Streams of messages that are asked for, and asked for again where they do not come."""
+"""Streams of messages, requested again if they do not arrive."""
 
 from collections.abc import Mapping
 
@@ -8,31 +8,31 @@ from skytether.shared.base.units import SECOND_NS
 
 SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
 SHARE = 0.7
-"""Share of the rate asked for with which a stream counts as coming."""
+"""Share of the requested rate at which a stream counts as present."""
 WINDOW_NS = 2 * SECOND_NS
-"""Time over which messages are counted [ns], and at least that of LEAST of them."""
+"""Window in which messages are counted [ns], longer if LEAST messages need more time."""
 LEAST = 3.0
 BACK_OFF_MAX = 8
-"""Longest window, in shortest ones: some streams have nothing to tell for long."""
+"""Longest window, as a multiple of the shortest: some streams are silent for long."""
 
 
 class _Stream:
-    """Stream of one kind of message.
+    """Stream of one type of message.
 
     Args:
-        rate: rate asked for [Hz].
+        rate: requested rate [Hz].
     """
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
         self.count = 0
-        """Messages in this window."""
+        """Number of messages in this window."""
         self.least_ns = max(WINDOW_NS, round(LEAST / rate * SECOND_NS))
         """Shortest window [ns]."""
         self.window_ns = 0
         """Length of this window [ns]; 0 before the first."""
         self.until_ns = 0
-        """End of this window: it is asked for then, unless enough came."""
+        """End of this window, when the stream is requested again unless enough arrived."""
 
 
 class Streams:
@@ -46,7 +46,7 @@ class Streams:
     def __init__(self, rates: Mapping[int, float], target: tuple[int, int]) -> None:
         self._target = target
         self.newest = ""
-        """Name of the message that was asked for last."""
+        """Name of the message requested last."""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
 
     def hear(self, number: int) -> None:
@@ -55,7 +55,7 @@ class Streams:
             self._streams[number].count += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Command for the next stream that does not come, if there is one."""
+        """Request for the next missing stream, if there is one."""
         for number, stream in self._streams.items():
             if now_ns < stream.until_ns:
                 continue

@@ -1,11 +1,11 @@
-"""A vehicle whose autopilot speaks MAVLink: velocities in, measurements out."""
+"""A vehicle with a MAVLink autopilot: velocities in, measurements out."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from skytether.client.mavlink.port import Port, given_origin
-from skytether.client.vehicle import Frame, Measurement, Vehicle
+from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import AboardFailure
 from skytether.shared.core.line import parse_line
@@ -16,21 +16,21 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 PLANE_ALTITUDE_M = 3.0
-"""Altitude at which a vehicle flies that is flown in the plane [m]."""
+"""Altitude of a vehicle that is flown in the plane [m]."""
 ORIGIN = keys_of(InFlight.ORIGIN)
 ALTITUDE_MIN_M = 0.5
 """Least altitude of take-off [m]."""
 
 
 class MavlinkVehicle(Vehicle):
-    """A vehicle that an autopilot flies.
+    """A vehicle flown by an autopilot.
 
     Args:
-        scenario: what is flown.
+        scenario: scenario of the flight.
         number: number of the vehicle.
 
     Raises:
-        ConfigError: the line to the autopilot is none, or the flight begins on the ground.
+        ConfigError: the address of the autopilot is invalid, or the flight begins on the ground.
     """
 
     returns = True
@@ -52,7 +52,7 @@ class MavlinkVehicle(Vehicle):
         return True
 
     def fly(self, velocity: Array) -> None:
-        """See `Vehicle`; in the plane it stays at its altitude."""
+        """See `Vehicle`; in the plane it keeps its altitude."""
         x, y, *up = velocity.tolist()
         self._port.fly((x, y, up[0] if up else 0.0))
 
@@ -71,7 +71,7 @@ class MavlinkVehicle(Vehicle):
         return self._port.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """See `Vehicle`; a vehicle on the ground is armed only where its scenario is."""
+        """See `Vehicle`; a vehicle on the ground is armed only if its scenario is."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
 
     def is_up(self, *, now_ns: int) -> bool:
@@ -84,11 +84,11 @@ class MavlinkVehicle(Vehicle):
         return self._port.took_off
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> VehicleMemory:
         """See `Vehicle`."""
         return self._port.frame
 
-    def recall(self, frame: Frame) -> None:
+    def recall(self, frame: VehicleMemory) -> None:
         """See `Vehicle`."""
         self._port.recall(frame)
 
@@ -110,12 +110,12 @@ class MavlinkVehicle(Vehicle):
         self._port.positions.decide(keeps_frame=keeps_frame)
 
     def land(self) -> bool:
-        """See `Vehicle`; the autopilot's own landing."""
+        """See `Vehicle`; by the autopilot's landing mode."""
         self._port.land()
         return True
 
     def return_home(self) -> None:
-        """See `Vehicle`; the autopilot's own return."""
+        """See `Vehicle`; by the autopilot's return mode."""
         self._port.return_home()
 
     @property
@@ -124,14 +124,14 @@ class MavlinkVehicle(Vehicle):
         return self._port.is_down
 
     def change(self, scenario: Scenario) -> None:
-        """See `Vehicle`; whoever arms the scenario lets the vehicle take off."""
+        """See `Vehicle`; arming the scenario lets the vehicle take off."""
         self._may_arm = scenario.armed
         origin, positions = given_origin(scenario), self._port.positions
         if origin is not None and not positions.has_origin:
             positions.place(origin)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Vehicle`: an origin that is known stays, or the fence would move in flight."""
+        """See `Vehicle`; a known origin stays, since changing it would move the fence in flight."""
         if keys & ORIGIN and self._port.positions.has_origin:
             x, y, z = self._port.positions.origin
             known = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
@@ -140,14 +140,14 @@ class MavlinkVehicle(Vehicle):
 
 
 def altitude(scenario: Scenario, number: int = 1) -> float:
-    """Altitude to take off to, of the vehicle with this number [m].
+    """Take-off altitude of a vehicle [m].
 
     Raises:
         ConfigError: the flight would begin on the ground.
     """
-    given = scenario.mavlink.takeoff_m
-    if given != "auto":
-        return float(given)
+    takeoff_m = scenario.mavlink.takeoff_m
+    if takeoff_m != "auto":
+        return float(takeoff_m)
     if scenario.model.axes == 2:
         return PLANE_ALTITUDE_M
     start = float(scenario.given_reference(number)(np.zeros(()))[2, 0])

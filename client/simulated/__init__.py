@@ -1,1 +1,1 @@
-"""The simulated vehicle: what flies, the weather that it flies in, and what measures it."""
+"""Simulated vehicles: plant, weather and sensor."""

@@ -1,6 +1,6 @@
-"""Normal numbers of a simulated vehicle's wind and noise, drawn for many steps at a time.
+"""Normal random numbers for a simulated vehicle's wind and noise, drawn in blocks of many steps.
 
-Drawn step by step they are the same: numpy fills an array with one number after the other.
+The numbers are the same as if drawn step by step: numpy fills an array one number after another.
 """
 
 import numpy as np
@@ -8,11 +8,11 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 BLOCK = 256
-"""Steps for which numbers are drawn at a time."""
+"""Number of steps in a block."""
 
 
 class Normals:
-    """Normal numbers of a stream, step by step.
+    """Normal random numbers of a stream, step by step.
 
     Args:
         rng: stream that they are drawn from; nothing else may draw from it before `give_back`.
@@ -25,10 +25,10 @@ class Normals:
         """State of the stream before the block was drawn."""
         self._block = np.empty((0, *shape))
         self._used = 0
-        """Number of steps of the block that have passed."""
+        """Number of steps of the block that have been used."""
 
     def next(self) -> Array:
-        """Numbers of the next step, of the shape given."""
+        """Numbers of the next step."""
         if self._used == len(self._block):
             self._before = self._rng.bit_generator.state
             self._block = self._rng.standard_normal((BLOCK, *self._shape))
@@ -37,7 +37,7 @@ class Normals:
         return self._block[self._used - 1]
 
     def give_back(self) -> None:
-        """Rewind the stream to just behind the numbers of the steps that were taken."""
+        """Rewind the stream to just after the numbers that were used."""
         if self._used < len(self._block):
             self._rng.bit_generator.state = self._before
             self._rng.standard_normal((self._used, *self._shape))

@@ -1,9 +1,9 @@
-"""The paper's model of a vehicle, eq. (1), with what may differ from what the server knows of it.
+"""The paper's vehicle model, eq. (1), with optional deviations from the server's model.
 
     v̇(t) = (g u(t - θ) + w - v(t)) / τ + a      g: gain, θ: dead time [s]
-                                                w, a: what the air does, see `simulated.weather`
+                                             w, a: effects of the air, see `simulated.weather`
 
-Every part is discretised exactly, the dead time included (`shared.law.dead_time`).
+Every part is discretised exactly, including the dead time (`shared.law.dead_time`).
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 @compilable
 def moved(x: Table, model: Table, inputs: Numbers) -> None:
-    """Move a vehicle on by a step, in place.
+    """Advance a vehicle by one step, in place.
 
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
@@ -33,7 +33,7 @@ class FirstOrderPlant:
     """First-order vehicle with the true time constants, gain and dead time of a scenario.
 
     Args:
-        weather: air that it flies in.
+        weather: wind and gusts.
 
     Source: eq. (1).
     """
@@ -42,17 +42,20 @@ class FirstOrderPlant:
         tau, late_s = scenario.true_tau_s, scenario.true_dead_time_s.tolist()
         model = discretise(tau, scenario.control.dt)
         self._model, self._gain = np.stack(model, -1), scenario.true_gain
-        late = [dead_time(*each, scenario.dt_ns) for each in zip(tau.tolist(), late_s, strict=True)]
+        late = [
+            dead_time(*theta_s, scenario.dt_ns)
+            for theta_s in zip(tau.tolist(), late_s, strict=True)
+        ]
         self._late = np.array([each.late for each in late])
         self._inputs = OnTheirWay(model.axes(), late) if any(late_s) else None
-        """Inputs on their way; None where each acts at once."""
+        """Inputs that are not acting yet; None without a dead time."""
         self.weather = weather
         self.x = np.zeros((len(tau), 2))
-        """Position [m] and velocity [m/s] now, in the world frame; shape (axes, 2)."""
+        """Present position [m] and velocity [m/s], in the world frame; shape (axes, 2)."""
         self.x[:, 0] = scenario.start_m(number)
 
     def state(self) -> Array:
-        """Position [m] and velocity [m/s] now, in the world frame; shape (axes, 2)."""
+        """Present position [m] and velocity [m/s], in the world frame; shape (axes, 2)."""
         return self.x.copy()
 
     def advance(self, command: Array) -> None:

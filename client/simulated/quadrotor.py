@@ -1,4 +1,4 @@
-"""A quadrotor as what flies in simulation: its rigid body, rotors, loops and air, see `quadrotor`.
+"""Simulated quadrotor: rigid body, rotors, control loops and air, see `quadrotor`.
 
 In the plane it keeps its altitude by itself.
 """
@@ -12,16 +12,16 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 GAINS = {"crazyflie": CRAZYFLIE, "1.5kg": ARDUPILOT, "sih": PX4}
-"""Gains of the autopilot that flies each frame."""
+"""Gains of the autopilot for each frame."""
 ALTITUDE_M = 5.0
 """Altitude of a flight in the plane [m]."""
 
 
 class QuadrotorPlant:
-    """A quadrotor of a scenario, in hover at the start.
+    """Quadrotor of a scenario, hovering at the start.
 
     Args:
-        rng: chance of its gusts, for this vehicle alone.
+        rng: random stream of its gusts.
         number: number of the vehicle.
     """
 
@@ -38,7 +38,7 @@ class QuadrotorPlant:
         self.change(vehicle)
 
     def state(self) -> Array:
-        """Position [m] and velocity [m/s] now, of each axis; shape (axes, 2)."""
+        """Present position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
         quadrotor = self._quadrotor
         return np.stack((quadrotor.position(), quadrotor.velocity()), -1)[: self._axes]
 

@@ -2,9 +2,9 @@
 
     z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise, drawn anew each time
 
-A measurement is made at the begin of a step, and had at the begin of another: of the first that is
-no earlier than it is due, and than its delay allows. At step 0 everything is due that is measured
-at all. Until then the vehicle has stood where it starts.
+A measurement is made at the start of a step, and becomes available at the start of the first step
+at which it is due and its delay has passed. At step 0 everything measured at all is due; before
+that the vehicle has stood at its start.
 """
 
 from collections import deque
@@ -20,7 +20,7 @@ from skytether.shared.scenario.schema import Scenario
 
 
 @compilable
-def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, told: Table) -> None:
+def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, measured: Table) -> None:
     """Measure the whole state.
 
     Args:
@@ -28,11 +28,11 @@ def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, told: Table)
         bias: b of positions and velocities; shape (2, axes).
         noise: σ of a position and of a velocity.
         drawn: n of positions and velocities; shape (2, axes).
-        told: output: positions and velocities measured; shape (2, axes).
+        measured: output: measured positions and velocities; shape (2, axes).
     """
     for which in range(2):
         for axis in range(len(state)):
-            told[which, axis] = (
+            measured[which, axis] = (
                 state[axis, which] + bias[which, axis] + noise[which] * drawn[which, axis]
             )
 
@@ -41,7 +41,7 @@ class Sensor:
     """Sensor of a scenario's vehicle.
 
     Args:
-        rng: chance of its noise, for this vehicle alone.
+        rng: random stream of its noise.
     """
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
@@ -56,13 +56,13 @@ class Sensor:
         self._rng = rng
         noisy = self._noise.nonzero()[0].tolist()
         self._normals = Normals(rng, (len(noisy), len(nothing))) if noisy else None
-        """Numbers n of a sensor that measures the whole state at every step."""
+        """Random numbers n of a sensor that measures the whole state at every step."""
         self._noisy = noisy
         """Which of position (0) and velocity (1) have noise."""
         self._drawn = np.zeros_like(self._bias)
-        """Numbers n where not both have noise; shape (2, axes)."""
+        """Numbers n if only one has noise; shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)
-        """Measurements that are not available yet, the oldest first; each of shape (axes, 2)."""
+        """Measurements that are not available yet, oldest first; each of shape (axes, 2)."""
         self._step = 0
 
     def measure(self, state: Array, *, began_ns: int = 0) -> Measurement:
@@ -78,27 +78,27 @@ class Sensor:
             return Measurement(stamp_ns, *state.T.tolist())
         states = self._states
         states.append(state)
-        # Before the first measurement is due, the vehicle has stood where it begins.
+        # Before the first measurement is due, the vehicle has stood at its start.
         while len(states) <= self.delay:
             states.append(states[0])
         if self._is_prompt:
-            told, drawn = np.empty_like(self._bias), self._drawn
+            measured, drawn = np.empty_like(self._bias), self._drawn
             if self._normals is not None:
                 drawn = self._normals.next()
-                if len(drawn) < len(told):
+                if len(drawn) < len(measured):
                     self._drawn[self._noisy], drawn = drawn, self._drawn
-            sensed(states[0], self._bias, self._noise, drawn, told)
-            return Measurement(stamp_ns, *told.tolist())
+            sensed(states[0], self._bias, self._noise, drawn, measured)
+            return Measurement(stamp_ns, *measured.tolist())
         return Measurement(stamp_ns, *(self._measure(states[0], which, step) for which in (0, 1)))
 
     def _measure(self, state: Array, which: int, step: int) -> list[float] | None:
-        """Position (0) or velocity (1) of a state, where one is due at a step."""
+        """Position (0) or velocity (1) of a state, if one is due at a step."""
         every_ns, time_ns = self._every_ns[which], step * self._dt_ns
-        # Due at the first step at or after a multiple of the interval, though that is no multiple
+        # Due at the first step at or after a multiple of the interval, which may not be a multiple
         # of Δt.
         if not every_ns or time_ns % every_ns >= self._dt_ns:
             return None
-        told = state[:, which] + self._bias[which]
+        measured = state[:, which] + self._bias[which]
         if noise := self._noise[which]:
-            told += noise * self._rng.standard_normal(len(state))
-        return told.tolist()
+            measured += noise * self._rng.standard_normal(len(state))
+        return measured.tolist()

@@ -1,4 +1,4 @@
-"""A vehicle that is computed: a plant in its weather, advanced step by step, and its sensor."""
+"""Simulated vehicle: a plant in its weather, advanced step by step, and its sensor."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -16,14 +16,14 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 WIND = keys_of(InFlight.WIND)
-"""Wind and gust keys."""
+"""Keys of wind and gusts."""
 
 
 class Plant(Protocol):
     """Simulated vehicle, advanced step by step."""
 
     def state(self) -> Array:
-        """Position [m] and velocity [m/s] now, of each axis; shape (axes, 2)."""
+        """Present position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
 
     def advance(self, command: Array) -> None:
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
@@ -33,12 +33,12 @@ class Plant(Protocol):
 
 
 class SimulatedVehicle(Vehicle):
-    """A plant that is measured at the begin of each step.
+    """Plant that is measured at the start of each step.
 
     Args:
         dt_ns: length of a step [ns].
-        plant: what flies, wherever it is by now.
-        sensor: what measures it.
+        plant: the plant, in its present state.
+        sensor: its sensor.
     """
 
     changeable = WIND
@@ -48,32 +48,32 @@ class SimulatedVehicle(Vehicle):
         self.plant, self.sensor = plant, sensor
         self._began_ns = 0
         self._step = -1
-        """Step at whose begin the plant's state is; -1 before the flight."""
+        """Step at whose start the plant's state is; -1 before the flight."""
         self._velocity = np.zeros(len(plant.state()))
 
     def fly(self, velocity: Array) -> None:
-        """See `Vehicle`; it is flown from the begin of the step on."""
+        """See `Vehicle`; flown from the start of the step on."""
         self._velocity = velocity
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """See `Vehicle`; all steps that have begun by now are flown first."""
-        told: list[Measurement] = []
+        """See `Vehicle`; first flies all steps that have begun by now."""
+        available: list[Measurement] = []
         if self._step < 0:
             self._began_ns, self._step = now_ns, 0
-            self._measure(told)
-        # The plant stands at the begin of a step and is flown on when it is looked at: it needs no
+            self._measure(available)
+        # The plant's state is that of the start of a step, and is advanced when needed: it has no
         # clock of its own.
         while self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             self.plant.advance(self._velocity)
             self._step += 1
-            self._measure(told)
-        return told
+            self._measure(available)
+        return available
 
-    def _measure(self, told: list[Measurement]) -> None:
-        """Add the measurement that is available at the step, if there is one."""
+    def _measure(self, available: list[Measurement]) -> None:
+        """Append the measurement that is available at the step, if there is one."""
         measured = self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
         if measured.position or measured.velocity:
-            told.append(measured)
+            available.append(measured)
 
     def truth(self) -> Array:
         """See `Vehicle`."""
@@ -85,7 +85,7 @@ class SimulatedVehicle(Vehicle):
 
 
 def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
-    """The quadrotor of a scenario with a number, whose gusts and noise are its own."""
+    """Quadrotor of a scenario, with random gusts and noise of its own."""
     from skytether.client.simulated.quadrotor import QuadrotorPlant  # numba takes a second
 
     plant = QuadrotorPlant(scenario, stream(scenario.seed, "turbulence", number), number)
@@ -94,7 +94,7 @@ def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
 
 
 def simulated(scenario: Scenario, number: int) -> SimulatedVehicle:
-    """The vehicle of a scenario with a number, whose winds and noise are its own."""
+    """First-order vehicle of a scenario, with random winds and noise of its own."""
     weather = Weather(scenario, stream(scenario.seed, "wind", number))
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
     return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather, number), sensor)

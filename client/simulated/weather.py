@@ -1,7 +1,7 @@
-"""Wind and gusts: what the air does to a simulated vehicle over each step.
+"""Wind and gusts: effects of the air on a simulated vehicle over each step.
 
     w      steady wind [m/s]
-    a      gusts [m/s²], constant over a step: they begin and end by chance, each blowing one way
+    a      gusts [m/s²], constant over a step: they start and end at random, each in one direction
     white  acceleration of the strength `vehicle.wind` [m/s per √s]
 
 A constant acceleration a acts like the input τ a. The covariance of the white part over a step has
@@ -18,12 +18,12 @@ from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 @compilable
 def shoved(x: Table, white: Table, drawn: Table) -> None:
-    """Add white acceleration's part of a step to positions and velocities, in place.
+    """Add the effect of white acceleration over a step to positions and velocities, in place.
 
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         white: square root of its covariance, [L11, L21, L22] of each axis.
-        drawn: two normal numbers an axis.
+        drawn: two normal random numbers per axis.
     """
     for i in range(len(x)):
         n, m = drawn[i, 0], drawn[i, 1]
@@ -35,7 +35,7 @@ class Weather:
     """Weather of a scenario.
 
     Args:
-        rng: chance of wind and gusts, for one vehicle alone.
+        rng: random stream of wind and gusts of one vehicle.
     """
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
@@ -43,7 +43,7 @@ class Weather:
         self._dt_s = scenario.control.dt
         self._tau = scenario.true_tau_s
         self._gust: Array | None = None
-        """Way that the gust blows, of any length; shape (axes,). None between gusts."""
+        """Direction of the gust, of any length; shape (axes,). None between gusts."""
         self._normals = Normals(rng, (len(self._tau), 2))
         self.change(scenario.vehicle)
 
@@ -53,8 +53,7 @@ class Weather:
         L = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self._white = np.stack((L[:, 0, 0], L[:, 1, 0], L[:, 1, 1]), -1) if vehicle.wind else None
         self._gust_mps2 = vehicle.gust_mps2
-        # Chance in a step of an event that comes at a constant rate: exact for any length of a
-        # step.
+        # Probability per step of an event of constant rate: exact for any length of a step.
         self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
@@ -70,20 +69,20 @@ class Weather:
         return self._push
 
     def shove(self, x: Array) -> None:
-        """Add white acceleration's part of that step to a state, in place.
+        """Add the effect of white acceleration over that step to a state, in place.
 
         Args:
             x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
         if self._white is None:
             return
-        # What gusts draw lies between the numbers of two steps.
+        # Gusts draw numbers between those of two steps.
         gusty = self._gust_mps2 != 0.0
         drawn = self._rng.standard_normal(x.shape) if gusty else self._normals.next()
         shoved(x, self._white, drawn)
 
     def _gusts(self) -> None:
-        """Gusts begin and end by chance, each blowing one way all along."""
+        """Start and end gusts at random, each in one constant direction."""
         # Drawn at every step, so that the times of gusts do not depend on their strength.
         chance = self._rng.random()
         if self._gust is not None:
@@ -95,9 +94,8 @@ class Weather:
             self._push = self._pushed()
 
     def _pushed(self) -> Array:
-        """Push of steady wind and gust."""
         if self._gust is None:
             return self._steady_mps
         gust_mps2 = self._gust_mps2 * self._gust / np.linalg.norm(self._gust)
-        # An acceleration a acts like an input τ a under eq. (1).
+        # An acceleration a acts like an input τ a in eq. (1).
         return self._steady_mps + self._tau * gust_mps2

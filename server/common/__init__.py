@@ -1,1 +1,1 @@
-"""What schemes, MPC and missions share: clock map, interface of schemes, desired window."""
+"""Shared by schemes, MPC and missions: clock map, interface of schemes, desired window."""

@@ -1,25 +1,25 @@
-"""Clock map: present step of each vehicle, from the server's clock and the vehicle's stamps.
+"""Clock map: present step of each vehicle, from the server's clock and the vehicle's time stamps.
 
-Neither clock is set; the vehicle's is the time since its step 0. Every observation gives
-F = t2 - t1 (sent by the vehicle, received here) and tells G = t4 - t3 (sent here, received aboard)
-of the newest packet from here. Over the last 20 s
+Neither clock is set; the vehicle's counts from its step 0. Every observation gives F = t2 - t1
+(sent by the vehicle, received here), and contains G = t4 - t3 (sent here, received aboard) of the
+newest packet from here. Over the last 20 s
 
-    offset = (min G - min F) / 2,    bound = (min F + min G) / 2,
+    offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
-vehicle's clock minus server's. Half of any asymmetry of the two smallest delays stays unknown: the
-offset is right to within the bound and no better. Step k begins at k Δt of the vehicle.
+of the vehicle's clock minus the server's. The asymmetry of the two smallest delays cannot be
+measured: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
 
-Beside this estimate stand two bounds that no delay can make false. A delay is never negative, so
-the true offset O is at least -F and at most G at the time of each sample, and until another time
-changes by no more than DRIFT of what has passed:
+Beside this estimate there are two bounds that hold for any delays. A delay is never negative, so
+the true offset O is at least -F and at most G at the time of each sample, and changes by at most
+DRIFT of the elapsed time:
 
     max (-F - DRIFT age) ≤ O ≤ min (G + DRIFT age)
 
-over all samples, however old. They do not depend on the estimate, nor on what it is made of.
+over all samples, however old. They do not depend on the estimate.
 
-What is known from elsewhere narrows these two: an operator's word that the smallest delays of both
-directions differ by no more than so much, and the time of day, where both ends know it. It is held
-against them, and against itself over time. What is contradicted is not believed any more.
+Other knowledge narrows these bounds: the operator's setting that the smallest delays of both
+directions differ by at most so much, and the time of day if both ends know it. It is checked
+against the bounds and against itself over time. What is contradicted is not used any more.
 """
 
 from enum import IntEnum
@@ -35,33 +35,34 @@ from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.model import Array, Indices
 
 BUCKET_NS = SECOND_NS // 2
-"""Length of the half seconds for which minima are kept [ns]."""
+"""Length of an interval for which minima are kept [ns]."""
 BUCKETS = 40
-"""Half seconds for which minima are kept: 20 s."""
+"""Number of intervals for which minima are kept: 20 s."""
 RECENT = 3
-"""Half seconds that are recent, where a step of a clock is looked for; more, up to OLD, of a
-vehicle that says so little that they would hold fewer than STEP_SAMPLES."""
+"""Number of intervals that count as recent when looking for a step of a clock; more, up to OLD, for
+a vehicle that reports so rarely that they hold fewer than STEP_SAMPLES."""
 OLD = 8
-"""Half seconds after which minima are old enough to compare the recent ones with."""
+"""Age in intervals from which on minima are old enough to compare recent ones with."""
 STEP_SAMPLES = 5
-"""Samples that recent and old minima need each before a clock may be said to have stepped."""
+"""Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
-"""Smallest step of a clock: up in one direction, and down by about as much in the other [ns]."""
+"""Smallest detected step of a clock: one direction's delay rises and the other's falls by about as
+much [ns]."""
 
 ECHOES = 4
-"""Number of newest echoes that are kept of a vehicle: how long packets to it take just now."""
+"""Number of newest echoes kept per vehicle: the present delays of packets to it."""
 
-# Two of them added stay within an int64, so that sums of minima need no check.
+# The sum of two of them fits in an int64, so sums of minima need no check.
 UNSEEN = 2**61
-"""Minimum of a half second in which nothing was seen."""
+"""Minimum of an interval without samples."""
 
 
 class Contradiction(IntEnum):
-    """What a sample contradicts that was known of a vehicle's clock."""
+    """What a sample contradicts of the known clock offset of a vehicle."""
 
     NOTHING = 0
     CLOCK = 1
-    """The bounds by delays: a clock was set, or runs wrong."""
+    """The bounds from delays: a clock was set, or runs wrong."""
     ASYMMETRY = 2
     """The operator's bound `link.asymmetry_s` on the difference of the delays each way."""
     TIME_OF_DAY = 3
@@ -76,83 +77,85 @@ class VehicleClock:
     """Record: the clock of one vehicle."""
 
     newest: int
-    """Half second of its newest sample, since our clock's zero."""
+    """Interval of its newest sample, counted from our clock's zero."""
     heard: int
     """`Observation.heard` of its newest observation; -1 before the first."""
     echoes: int
-    """Number of packets of ours that it has told G of."""
+    """Number of our packets for which it has reported G."""
     adopted: int
-    """Offset that is reckoned with, the vehicle's clock minus ours [ns], or UNSEEN."""
+    """Offset in use, the vehicle's clock minus ours [ns], or UNSEEN."""
     low: int
-    """Least that the true offset can be at `bounded` [ns]; -UNSEEN before the first sample."""
+    """Lower bound of the true offset at `bounded` [ns]; -UNSEEN before the first sample."""
     high: int
-    """Most that the true offset can be then [ns]; UNSEEN before the first sample."""
+    """Upper bound of the true offset at `bounded` [ns]; UNSEEN before the first sample."""
     bounded: int
-    """Time of our clock at which these two hold; they widen before and after it [ns]."""
+    """Our time at which these two hold; they widen before and after it [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
     other_low: int
-    """Least that the true offset can be at `other`, as it is known from elsewhere [ns], or
-    -UNSEEN."""
+    """Lower bound of the true offset at `other`, from other knowledge [ns], or -UNSEEN."""
     other_high: int
-    """Most that it can be then [ns], or UNSEEN."""
+    """Upper bound of the true offset at `other`, from other knowledge [ns], or UNSEEN."""
     other: int
-    """Time of our clock at which these two hold [ns]."""
+    """Our time at which these two hold [ns]."""
     doubted: int
-    """1 if the time of day was contradicted; then all counts that anybody says."""
+    """1 if the time of day was contradicted; then the union of all bounds is used."""
     uneven: int
-    """1 if the operator's word on the delays was contradicted; then it does not count."""
+    """1 if the operator's bound on the delays was contradicted; then it is not used."""
 
 
 FORGOTTEN = ("newest", "heard", "echoes", "adopted")
-"""Fields of `VehicleClock` that are forgotten with each session."""
+"""Fields of `VehicleClock` that are reset with each session."""
 
 
 class StepError(NamedTuple):
-    """Error of the step that the server counts for a vehicle, as far as its clock is known."""
+    """Possible error of the step that the server counts for a vehicle."""
 
     early: float
-    """Largest number of steps by which the vehicle is ahead of the step that is counted."""
+    """Largest number of steps by which the vehicle may be ahead of the counted step."""
     late: float
-    """Largest number of steps by which it is behind that."""
+    """Largest number of steps by which it may be behind."""
 
 
 EXACT = StepError(0.0, 0.0)
-"""Error of a step that is known."""
+"""Error of a step that is known exactly."""
 
 
 VEHICLE_CLOCK = record(VehicleClock)
 
 
 class Seen(NamedTuple):
-    """Clock offsets and delays observed for up to `capacity` vehicles."""
+    """Clock samples of up to `capacity` vehicles."""
 
     vehicles: Annotated[NDArray[np.void], records(VEHICLE_CLOCK, 1)]
     """Shape (capacity,)."""
     minimum: I3
-    """Smallest F and G of each half second [ns], a ring; shape (capacity, 2, BUCKETS)."""
+    """Smallest F and G of each interval [ns], as a ring; shape (capacity, 2, BUCKETS)."""
     samples: I2
-    """Number of both in each half second; shape (capacity, BUCKETS)."""
+    """Number of samples in each interval; shape (capacity, BUCKETS)."""
     echoes: I2
-    """Newest G, each of another packet of ours [ns], a ring; shape (capacity, ECHOES)."""
+    """Newest G, one per packet of ours [ns], as a ring; shape (capacity, ECHOES)."""
 
 
 class ClockMap:
-    """Offsets and steps of up to `capacity` vehicles.
+    """Clock offsets and present steps of up to `capacity` vehicles.
 
-    The smallest delays of the two directions over 20 s differ by at most `asymmetry_ns`; 0: nobody
-    knows.
+    The offset in use follows the estimate only when that has moved by more than half a step: a step
+    index that alternates at a boundary would skip and repeat steps needlessly.
 
-    It follows an estimate of the offset only when that has moved by more than half a step: a step
-    index that went back and forth at a boundary would skip and repeat steps for nothing.
+    Args:
+        capacity: largest number of vehicles.
+        dt_ns: length of a step [ns].
+        asymmetry_ns: bound on the difference of the smallest delays of the two directions over 20 s
+            [ns]; 0: unknown.
     """
 
     def __init__(self, capacity: int, dt_ns: int, asymmetry_ns: int = 0) -> None:
         self._dt_ns, self._asymmetry_ns = dt_ns, asymmetry_ns
         self.tick_ns = 0
-        """Time of our clock that steps were counted for last [ns]."""
+        """Our time for which steps were last counted [ns]."""
         self._lives: list[tuple[int, int] | None] = [None] * capacity
-        """Vehicle in each row, and the boot id of its life."""
+        """Vehicle in each row, and the boot id of its client's run."""
         self.seen = Seen(
             vehicles=np.zeros(capacity, dtype=VEHICLE_CLOCK),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
@@ -163,13 +166,12 @@ class ClockMap:
             self.forget(row)
 
     def forget(self, row: int, life: tuple[int, int] | None = None) -> None:
-        """Begin anew with a vehicle, or with a new session of it.
+        """Reset the row for another vehicle, or for a new session.
 
         Args:
-            row: the vehicle.
-            life: its number and the boot id of its life, in all of which its step 0 is the same:
-                bounds that were found earlier in the same life stay true. None where it is not
-                known.
+            row: row of the vehicle.
+            life: its number and the boot id of its client's run, during which its step 0 stays the
+                same: bounds found earlier in the same run remain valid. None if unknown.
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
@@ -195,67 +197,72 @@ class ClockMap:
         now_ns: int,
         is_newest: bool = True,
     ) -> Contradiction:
-        """Take one F and one G of a vehicle, received at `now_ns`; what they contradict.
+        """Add one F and one G of a vehicle, received at `now_ns`; returns what they contradict.
 
         Args:
-            heard: another number for each packet of ours that G is of.
-            is_newest: whether they are of a newer observation than all before: of the echo of an
-                older one it is not known when it was had.
+            row: row of the vehicle.
+            forward_ns: F [ns].
+            backward_ns: G [ns].
+            heard: number that differs for each packet of ours that G is of.
+            now_ns: our time [ns].
+            is_newest: whether the observation is newer than all before: of the echo in an older one
+                it is unknown when it was received.
         """
         sample = forward_ns, backward_ns, heard, is_newest, self._asymmetry_ns, now_ns
         return Contradiction(_observe(self.seen, row, *sample))
 
     def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
-        """Take the offset of a vehicle's clock as it is known from elsewhere; what it contradicts.
+        """Narrow the offset of a vehicle's clock by other knowledge; returns what it contradicts.
 
         Args:
+            row: row of the vehicle.
             offset_ns: the vehicle's clock minus ours [ns].
-            error_ns: largest error of that [ns].
-            now_ns: time of our clock [ns].
+            error_ns: largest error of the offset [ns].
+            now_ns: our time [ns].
         """
         low, high = offset_ns - error_ns, offset_ns + error_ns
-        return Contradiction(_tell(self.seen, row, low, high, self._asymmetry_ns > 0, now_ns))
+        return Contradiction(
+            _narrow_by_time(self.seen, row, low, high, self._asymmetry_ns > 0, now_ns)
+        )
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
-        steps = rows.copy()  # room for them: less work than to make an array of a type
+        steps = rows.copy()  # a copy to write to: cheaper than a new array
         self.tick_ns = now_ns
         _steps(self.seen, rows, now_ns, self._dt_ns, steps)
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
-        # Brings `adopted` up to date; the steps themselves are not needed.
+        # Updates `adopted`; the steps themselves are not needed.
         _steps(self.seen, rows, 0, self._dt_ns, rows.copy())
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of times that a clock was found to have been set, if ever."""
+        """Number of times that a clock was found to have been set; empty if never."""
         steps = int(self.seen.vehicles["steps"].sum())
         return {"clock_steps": steps} if steps else {}
 
     def step_errors(self, rows: Indices, steps: Indices, early: Array, late: Array) -> None:
-        """Fill in the error of the steps that were counted for vehicles last, see `StepError`.
+        """Fill in the possible errors of the latest counted steps, see `StepError`.
 
         Args:
-            rows, steps: as given to and by `steps`; shape (n,).
-            early, late: written to at the rows; shape (capacity,).
+            rows, steps: arguments and result of `steps`; shape (n,).
+            early, late: written at these rows; shape (capacity,).
         """
         _step_errors(self.seen, rows, steps, self.tick_ns, self._dt_ns, early, late)
 
     def bound_ns(self, row: int) -> int:
-        """Half of what the true offset of a vehicle's clock can lie apart, now [ns]."""
+        """Half of the width of the bounds of a vehicle's clock offset, now [ns]."""
         return self.middle_ns(row, self.tick_ns)[1]
 
     def middle_ns(self, row: int, now_ns: int) -> tuple[int, int]:
-        """Middle between the bounds of the offset of a vehicle's clock, and half of what is
-        between them [ns].
-        """
-        found = np.empty(2, dtype=np.int64)
-        _bounds(self.seen, row, now_ns, found)
-        low, high = found.tolist()
+        """Midpoint of the bounds of a vehicle's clock offset, and half of their width [ns]."""
+        bounds = np.empty(2, dtype=np.int64)
+        _bounds(self.seen, row, now_ns, bounds)
+        low, high = bounds.tolist()
         return (high + low) // 2, (high - low) // 2
 
 
@@ -276,7 +283,7 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest of the delays of the newest ECHOES packets to a vehicle, as the map knows it [ns].
+    """Shortest estimated delay of the newest ECHOES packets to a vehicle [ns].
 
     It is negative while there are fewer.
     """
@@ -285,40 +292,42 @@ def shortest_ns(seen: Seen, row: int) -> int:
 
 @part
 def _by_delays(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Least and most that the offset of a vehicle's clock can be, by delays alone [ns]."""
+    """Bounds of a vehicle's clock offset from delays alone [ns]."""
     vehicle = seen.vehicles[row]
-    apart = abs(now - vehicle.bounded) // DRIFT + 1
-    return vehicle.low - apart, vehicle.high + apart
+    drift = abs(now - vehicle.bounded) // DRIFT + 1
+    return vehicle.low - drift, vehicle.high + drift
 
 
 @part
 def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Least and most that the offset of a vehicle's clock can be, as known from elsewhere [ns]."""
+    """Bounds of a vehicle's clock offset from other knowledge [ns]."""
     vehicle = seen.vehicles[row]
-    apart = abs(now - vehicle.other) // DRIFT + 1 if vehicle.other_high < UNSEEN else 0
-    return vehicle.other_low - apart, vehicle.other_high + apart
+    drift = abs(now - vehicle.other) // DRIFT + 1 if vehicle.other_high < UNSEEN else 0
+    return vehicle.other_low - drift, vehicle.other_high + drift
 
 
 @part
 def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Least and most that the offset of a vehicle's clock can be at a time of ours [ns]."""
+    """Bounds of a vehicle's clock offset at a time of ours [ns]."""
     low, high = _by_delays(seen, row, now)
     other_low, other_high = _by_others(seen, row, now)
     if seen.vehicles[row].doubted or max(low, other_low) > min(high, other_high):
-        # One of the two is false, and nobody knows which.
+        # One of the two is wrong, and it is unknown which.
         return min(low, other_low), max(high, other_high)
     return max(low, other_low), min(high, other_high)
 
 
 @kernel
-def _bounds(seen: Seen, row: int, now: int, found: I1) -> None:
-    """Write down `bounds_ns`."""
-    found[0], found[1] = bounds_ns(seen, row, now)
+def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
+    """Store `bounds_ns` in an array."""
+    bounds[0], bounds[1] = bounds_ns(seen, row, now)
 
 
 @part
-def _add(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow what is known from elsewhere; whether that is possible. It is forgotten if not."""
+def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
+    """Narrow the bounds from other knowledge; resets them and returns False if that is
+    contradictory.
+    """
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -331,19 +340,19 @@ def _add(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
 
 
 @kernel
-def _tell(seen: Seen, row: int, low: int, high: int, asymmetric: bool, now: int) -> int:
-    """Take what the time of day says, see `ClockMap.tell`."""
+def _narrow_by_time(seen: Seen, row: int, low: int, high: int, asymmetric: bool, now: int) -> int:
+    """Apply a time of day, see `ClockMap.tell`."""
     vehicle = seen.vehicles[row]
     if vehicle.doubted:
         other_low, other_high = _by_others(seen, row, now)
         vehicle.other_low, vehicle.other_high = min(low, other_low), max(high, other_high)
         vehicle.other = now
         return NOTHING
-    if _add(seen, row, low, high, now):
+    if _narrow(seen, row, low, high, now):
         return NOTHING
     if asymmetric and not vehicle.uneven:
         vehicle.uneven = 1
-        if _add(seen, row, low, high, now):
+        if _narrow(seen, row, low, high, now):
             return ASYMMETRY
     vehicle.doubted = 1
     vehicle.other_low, vehicle.other_high, vehicle.other = low, high, now
@@ -351,17 +360,17 @@ def _tell(seen: Seen, row: int, low: int, high: int, asymmetric: bool, now: int)
 
 
 @part
-def _believe_even(seen: Seen, row: int, asymmetry: int, now: int) -> int:
-    """Take the operator's word that delays differ by at most `asymmetry` [ns]; see `_observe`."""
+def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
+    """Apply the bound on the difference of the delays [ns]; returns what it contradicts."""
     vehicle, samples = seen.vehicles[row], 0
     for slot in range(BUCKETS):
         samples += seen.samples[row, slot]
     if asymmetry == 0 or vehicle.uneven or vehicle.doubted or samples < STEP_SAMPLES:
         return NOTHING
     # The minima are up to 20 s old.
-    room = asymmetry // 2 + BUCKETS * BUCKET_NS // DRIFT
+    margin = asymmetry // 2 + BUCKETS * BUCKET_NS // DRIFT
     middle = (least(seen.minimum[row, 1]) - least(seen.minimum[row, 0])) // 2
-    if _add(seen, row, middle - room, middle + room, now):
+    if _narrow(seen, row, middle - margin, middle + margin, now):
         return NOTHING
     vehicle.uneven = 1
     return ASYMMETRY
@@ -369,31 +378,34 @@ def _believe_even(seen: Seen, row: int, asymmetry: int, now: int) -> int:
 
 @part
 def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> int:
-    """Narrow the bounds of a vehicle's clock offset by F and G [ns]; what these contradict.
+    """Narrow the bounds of a vehicle's clock offset by F and G [ns]; returns what these contradict.
 
     Args:
-        is_new: whether G is of an echo that no observation before has told of.
+        seen: clock samples.
+        row: row of the vehicle.
+        forward, backward: F and G [ns].
+        is_new: whether G is of an echo that no earlier observation contained.
         now: our time [ns].
     """
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # F is as old as the observation, which is no older than the round trip. Of an echo it is known
-    # that the observation before did not tell of it yet, and that of the first one the session has
-    # not ended since.
+    # F is as old as the observation, which is no older than the round trip. An echo is newer than
+    # the previous observation, which did not contain it; the first echo is no older than a session
+    # lasts without packets.
     trip = max(forward + backward, 0) // DRIFT + 1
     since = now - vehicle.bounded if vehicle.high < UNSEEN else SESSION_NS
     low = max(low, -forward - trip)
     if is_new:
         high = min(high, backward + trip + max(since, 0) // DRIFT)
-    found = CLOCK if low > high else NOTHING
-    if found == CLOCK:
-        # Nothing earlier holds any more. By the round trip the newest sample may be one of less
-        # than nothing, of a clock that was set in between.
+    contradiction = CLOCK if low > high else NOTHING
+    if contradiction == CLOCK:
+        # Nothing earlier holds any more. If a clock was set in between, the round trip of the
+        # newest sample may be negative.
         vehicle.steps += 1
         low, high = min(-forward, backward) - trip, max(-forward, backward) + trip
         vehicle.other_low, vehicle.other_high = -UNSEEN, UNSEEN
     vehicle.low, vehicle.high, vehicle.bounded = low, high, now
-    return found
+    return contradiction
 
 
 @kernel
@@ -407,13 +419,13 @@ def _observe(
     asymmetry: int,
     now: int,
 ) -> int:
-    """Take F and G [ns] of a vehicle, received at a time of our clock [ns]; what they
+    """Add F and G [ns] of a vehicle, received at our time `now` [ns]; returns what they
     contradict.
     """
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
     is_new = is_newest and heard != vehicle.heard
-    found = _bound(seen, row, forward, backward, is_new, now)
-    # The same echo told once more is no new sample of the delay.
+    contradiction = _bound(seen, row, forward, backward, is_new, now)
+    # A repeated echo is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
@@ -428,13 +440,13 @@ def _observe(
     seen.minimum[row, 0, slot] = min(seen.minimum[row, 0, slot], forward)
     seen.minimum[row, 1, slot] = min(seen.minimum[row, 1, slot], backward)
     seen.samples[row, slot] += 1
-    uneven = _believe_even(seen, row, asymmetry, now)
-    return found if found != NOTHING else uneven
+    uneven = _narrow_by_asymmetry(seen, row, asymmetry, now)
+    return contradiction if contradiction != NOTHING else uneven
 
 
 @part
 def _change(minimum: I1, newest: int, recently: int) -> int:
-    """Smallest delay of what is recent, less that of what is older than 4 s [ns]."""
+    """Smallest recent delay minus the smallest delay older than 4 s [ns]."""
     recent, old = UNSEEN, UNSEEN
     for age in range(BUCKETS):
         value = minimum[(newest - age) % BUCKETS]
@@ -447,7 +459,7 @@ def _change(minimum: I1, newest: int, recently: int) -> int:
 
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
-    """Forget the minima of before a step of the vehicle's clock or ours, where there was one."""
+    """Forget minima from before a step of the vehicle's clock or ours, if there was one."""
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
@@ -455,13 +467,13 @@ def _drop_stepped(seen: Seen, row: int) -> None:
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
-    # Of a few samples, one that was delayed would look like a step.
+    # With few samples, a single delayed one would look like a step.
     if min(recent, old) < STEP_SAMPLES:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)
     backward = _change(seen.minimum[row, 1], newest, recently)
-    # A clock that steps moves one of the two up and the other down by as much; a network that
-    # changes moves both the same way, or one alone.
+    # A clock step raises one of the two and lowers the other by as much; a change of the network
+    # moves both the same way, or only one.
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(recently, BUCKETS):
@@ -472,7 +484,7 @@ def _drop_stepped(seen: Seen, row: int) -> None:
 
 @kernel
 def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
-    """Fill in k of each vehicle, see `ClockMap.steps`; forgets what came before a clock stepped."""
+    """Fill in k of each vehicle, see `ClockMap.steps`; forgets what came before a clock step."""
     for i in range(len(rows)):
         row = rows[i]
         _drop_stepped(seen, row)
@@ -490,6 +502,6 @@ def _step_errors(seen: Seen, rows: I1, steps: I1, now: int, dt: int, early: F1, 
     """Fill in `ClockMap.step_errors`."""
     for i in range(len(rows)):
         low, high = bounds_ns(seen, rows[i], now)
-        # Less the whole steps first: two times of years in nanoseconds have no digits left.
+        # Subtract whole steps first: as floats, times of years in nanoseconds have too few digits.
         early[rows[i]] = (now + high - steps[i] * dt) / dt
         late[rows[i]] = (steps[i] * dt - now - low) / dt

@@ -1,4 +1,4 @@
-"""Model and rule of flight, compiled: the functions of `shared`, for the server's kernels."""
+"""Model and rule of flight, compiled for the server's kernels."""
 
 from typing import Annotated
 
@@ -12,11 +12,11 @@ from skytether.shared.law.terms import Terms
 
 AXIS = record(Axis)
 Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
-"""A model as kernels take it; shape (axes,)."""
+"""Model as an array for kernels; shape (axes,)."""
 
 
 class AxisLaw(Axis):
-    """Record: what a vehicle flies by on one axis. The fields of `Axis` come first."""
+    """Record: model, bound and feedback of one axis. The fields of `Axis` come first."""
 
     bound: float
     """Bound u_max of the input [m/s]."""
@@ -37,26 +37,26 @@ lead_to, step = shared(rule.lead_to), shared(rule.step)
 
 @inline
 def axis_of(record: Axis) -> Axis:
-    """Model on one axis from a record that has its numbers; as a tuple they stay in registers."""
+    """Model of one axis as a tuple, whose numbers stay in registers."""
     return Axis(record.a01, record.a11, record.b0, record.b1)
 
 
 @inline
 def axis_at(model: Axes, axis: int) -> Axis:
-    """Model on one of its axes."""
+    """Model of one of several axes."""
     return axis_of(model[axis])
 
 
 def axes_of(model: Model) -> Axes:
-    """A model as kernels take it; shape (axes,)."""
+    """Model as an array for kernels; shape (axes,)."""
     return np.array([tuple(axis) for axis in model.axes()], dtype=AXIS)
 
 
 def laws_of(terms: Terms, gain: Array) -> Laws:
-    """Horizon as the vehicle flies it, with K as it will be sent.
+    """Model, bound and feedback of each axis, with K rounded as it will be sent.
 
     Args:
-        terms: the rule of flight.
+        terms: terms of the flight.
         gain: K of feedback aboard, 0 without; shape (axes, 2).
     """
     laws = np.zeros(terms.axes, dtype=AXIS_LAW)

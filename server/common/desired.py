@@ -1,17 +1,16 @@
-"""Desired trajectory as the server knows it: the window that a vehicle is planned along.
+"""Desired trajectory as known to the server: the window of desired states for a plan.
 
-A vehicle at step k is planned for from k + d to k + d + H. How far ahead the server may look is
-`reference.preview`: with "all" it sees the whole window, and otherwise nothing behind the step
-k + preview. What lies beyond is predicted from the desired state there, which goes on at its
-velocity; that of a target turns round at the bounds within which it moves (docs/schemes.md has what
-else was tried). Of a point that is moved in flight only the present is known (`live`), and the same
-for all vehicles.
+A vehicle at step k is planned for from k + d to k + d + H. `reference.preview` limits how far ahead
+the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
+preview. What comes later is extrapolated from the last visible state at its velocity; for a moving
+target with reflection at the bounds of its region (docs/schemes.md has what else was tried). Of a
+point that is moved in flight (`live`) only the present state is known, the same for all vehicles.
 
-A vehicle with a dead time θ is planned for as it will be met by its next input
-(`shared.law.dead_time`), and so along the trajectory θ later, on each axis by its own.
+A vehicle with a dead time θ is planned for in the state in which its next input takes effect
+(`shared.law.dead_time`), and so along the trajectory shifted by θ on each axis.
 
-A trajectory is looked up in pages rather than computed at each step. Where vehicles have
-trajectories of their own, each has pages of its own.
+Trajectories are computed in pages and looked up, not computed at each step. Vehicles with
+trajectories of their own have pages of their own.
 """
 
 from collections.abc import Callable
@@ -29,19 +28,17 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import committed_max
 
 PAGE = 128
-"""Steps of a desired trajectory in a page."""
+"""Number of steps of a desired trajectory in a page."""
 PAGES = 256
-"""Places for pages: more than a block of vehicles can need at once."""
+"""Number of slots for pages: more than a block of vehicles can need at once."""
 EMPTY = -1
-"""Key of a place that holds no page."""
+"""Key of an empty slot."""
 FOUND = -1
-"""Result of a search in which no vehicle's page is missing."""
+"""Result of a search if no vehicle's page is missing."""
 TRAJECTORY = 2**40
-"""Distance between the keys of two trajectories: page p of trajectory t has the key t TRAJECTORY +
-p."""
+"""Stride between the keys of trajectories: page p of trajectory t has the key t TRAJECTORY + p."""
 SPREAD = 31
-"""Number of places from the first page of a trajectory to that of the next; odd, so that no two
-have the same."""
+"""Number of slots between the first pages of successive trajectories; odd, so that all differ."""
 TINY = 1e-9
 """Rounding tolerance of a quotient such as 0.15 / 0.05."""
 
@@ -52,31 +49,31 @@ class Window(NamedTuple):
     """Desired states of a block of vehicles at their steps k + d … k + d + H."""
 
     states: F4
-    """Desired states [m, m/s]; shape (places, axes, stages, 2)."""
+    """Desired states [m, m/s]; shape (slots, axes, stages, 2)."""
     place: I1
-    """Place of each vehicle's states; shape (block,)."""
+    """Slot of each vehicle's states; shape (block,)."""
     first: I1
-    """Stage in that place that is the step k + d; shape (block,)."""
+    """Stage in that slot that is the step k + d; shape (block,)."""
 
 
 class Outlook(NamedTuple):
-    """Length of a page on each axis; shape (axes,)."""
+    """Visible part of the desired trajectory on each axis; shape (axes,)."""
 
     reach: I1
-    """Steps behind k that are seen."""
+    """Number of visible steps after k."""
     rest_s: F1
-    """Time from the last of them to the time that the vehicle is planned for [s]."""
+    """Time from the last of them to the end of the preview plus dead time [s]."""
 
 
 class Desired:
-    """The desired trajectory of every vehicle, as far as the server knows it.
+    """Desired trajectories of all vehicles, as far as the server may see them.
 
     Args:
-        scenario: what to fly, and how far ahead the server may look.
-        terms: the same, as far as both ends agree on it.
-        capacity: number of vehicles there can be.
+        scenario: scenario of the flight, with the preview.
+        terms: its terms.
+        capacity: largest number of vehicles.
         block: number of vehicles that are asked for at a time.
-        references: the trajectory of each vehicle, by its number; left out: the scenario's for all.
+        references: trajectory of each vehicle, by its number; default: the scenario's for all.
     """
 
     def __init__(
@@ -93,21 +90,23 @@ class Desired:
         self._point = _live(scenario) if wanted.shape == "live" else None
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Steps of a page behind its last; unless all is seen, the steps that are."""
+        """Number of steps in a page after its PAGE steps; without a full preview, the visible
+        steps."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             # TINY: 0.15 / 0.05 is 2.9999999999999996.
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
-        """Time from a step to the state kept for it in a page, on each axis [s]; shape (axes,)."""
+        """Time from a step to the state stored for it in a page, on each axis [s]; shape
+        (axes,)."""
         left = (seen_s - self._ahead_s) / terms.dt_s + TINY
         self._outlook = Outlook(left.astype(np.int64), late_s - self._ahead_s)
         left_min = H if self._all else int(self._outlook.reach.min())
         self.seen = max(min(left_min, H), 0)
-        """Steps behind k that are seen on every axis, H at most."""
+        """Number of steps after k that are visible on every axis, H at most."""
         self._bound_m = wanted.radius_m if wanted.shape == "target" else np.inf
-        """Coordinate at which a prediction turns round [m]."""
+        """Coordinate at which the extrapolation is reflected [m]."""
         self._references = references
         self._shared = scenario.make_reference()
         self._number = np.zeros(capacity, dtype=np.int64)
@@ -119,21 +118,21 @@ class Desired:
         rows = 2 * axes if shifts else axes
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
-        """Desired states in each place [m, m/s]; of a live point its present state alone."""
+        """Desired states in each slot [m, m/s]; for a live point only its present state."""
         self._at_once = np.zeros(block, dtype=np.int64)
         """Zeros in place of d, for states from k on; shape (block,)."""
-        self._held = np.full(PAGES, EMPTY, dtype=np.int64)
-        """Key of the page in each place, or EMPTY; shape (PAGES,)."""
+        self._keys = np.full(PAGES, EMPTY, dtype=np.int64)
+        """Key of the page in each slot, or EMPTY; shape (PAGES,)."""
         self._found = Window(
             self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
         )
-        """Place in the pages of the states from a step on."""
+        """Slots and stages of the states from a step on."""
         self._foreseen = Window(
             np.zeros((block, axes, H + 1, 2)),
             np.arange(block),
             np.zeros(block, dtype=np.int64),
         )
-        """Predicted states; not used where everything is seen."""
+        """Extrapolated states; not used if everything is visible."""
 
     def assign(self, row: int, vehicle: int) -> None:
         """Assign a row to a vehicle, whose trajectory is looked up by its number."""
@@ -144,16 +143,16 @@ class Desired:
         return int(self._number[row])
 
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; any other trajectory stays as it is.
+        """Move a live point, see `LivePoint.move`; other trajectories do not change.
 
-        Without a position it goes on from where it is by then.
+        Without a position it continues from its present one.
         """
         if self._point:
-            here = self._point.at(now_ns)[:, 0] if position is None else position
-            self._point.move(here, velocity, now_ns)
+            position = self._point.at(now_ns)[:, 0] if position is None else position
+            self._point.move(position, velocity, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Take note of the time [ns]: a live point has moved on."""
+        """Advance a live point to a time [ns]."""
         if self._point:
             self._pages[0, :, 0] = self._point.at(now_ns)
 
@@ -170,7 +169,8 @@ class Desired:
         return states
 
     def due(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states where inputs of the steps k meet vehicles, as `now` without a dead time.
+        """Desired states when the inputs of the steps k take effect; equal to `now` without a dead
+        time.
 
         Args:
             rows: the vehicles, no more than a block; shape (n,).
@@ -181,7 +181,7 @@ class Desired:
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states of vehicles from k + d on, valid until the next are asked for.
+        """Desired states of vehicles from k + d on, valid until the next call.
 
         Args:
             rows: the vehicles, no more than a block; shape (n,).
@@ -196,93 +196,93 @@ class Desired:
         return self._foreseen
 
     def states(self, rows: Indices, steps: Indices, ahead: Indices) -> Array:
-        """Desired states of a window, see there, in an array of their own [m, m/s]; shape
-        (n, axes, H + 1, 2).
-        """
+        """Copy of the desired states of `window` [m, m/s]; shape (n, axes, H + 1, 2)."""
         states, place, first = self.window(rows, steps, ahead)
         n, stages = len(rows), np.arange(self._foreseen.states.shape[2])
         found: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
         return found.transpose(0, 2, 1, 3)
 
     def _find(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Look up desired states from k + d on, and compute the pages that are missing."""
+        """Look up desired states from k + d on, and compute missing pages."""
         if self._point:
             return self._found
-        held = self._held
-        while (i := _find(held, self._number, rows, steps, ahead, self._found)) != FOUND:
-            # Each search of `_place` ends at a free place at the latest: before the last one is
-            # taken, all pages go. A block of vehicles needs half of PAGES at most.
-            if np.count_nonzero(held == EMPTY) == 1:
-                held[:] = EMPTY
+        keys = self._keys
+        while (i := _find(keys, self._number, rows, steps, ahead, self._found)) != FOUND:
+            # The search of `_place` needs an empty slot to end: before the last one is used, all
+            # pages are dropped. A block of vehicles needs half of PAGES at most.
+            if np.count_nonzero(keys == EMPTY) == 1:
+                keys[:] = EMPTY
             number, page = int(self._number[rows[i]]), int(steps[i] + ahead[i]) // PAGE
             sample = self._references(number) if self._references else self._shared
-            at = plain(_place)(held, number, page)
+            at = plain(_slot)(keys, number, page)
             times_s = (page * PAGE + self._steps) * self._dt_s
             states = sample(times_s).transpose(1, 0, 2)
-            # Where no axis is late both slices are the same rows, and this writes them twice.
+            # If no axis is shifted, both slices are the same rows, written twice.
             self._pages[at, : self._axes] = self._pages[at, -self._axes :] = states
             for axis in np.flatnonzero(self._ahead_s):
                 self._pages[at, axis] = sample(times_s + self._ahead_s[axis])[:, axis]
-            held[at] = number * TRAJECTORY + page
+            keys[at] = number * TRAJECTORY + page
         return self._found
 
 
 def _live(scenario: Scenario) -> LivePoint:
-    """The live point of a scenario, where it is at first."""
+    """Live point of a scenario at its initial position."""
     velocity = scenario.reference.velocity_mps
     start = scenario.given_reference()(np.zeros(()))[:, 0]
     return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 
 @inline
-def _place(held: I1, number: int, page: int) -> int:
-    """Place of a page, or a free place for it; one place at least must be EMPTY."""
+def _slot(keys: I1, number: int, page: int) -> int:
+    """Slot of a page, or an empty slot for it; at least one slot must be EMPTY."""
     at, key = (page + SPREAD * number) % PAGES, number * TRAJECTORY + page
-    while held[at] != key and held[at] != EMPTY:
+    while keys[at] != key and keys[at] != EMPTY:
         at = (at + 1) % PAGES
     return at
 
 
 @kernel
-def _find(held: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
-    """Fill in where states from k + d on are; the first vehicle whose page is missing, or FOUND."""
+def _find(keys: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
+    """Fill in slots and stages from k + d on; returns the first vehicle whose page is missing,
+    or FOUND.
+    """
     for i in range(len(rows)):
         step = steps[i] + ahead[i]
         number, page = numbers[rows[i]], step // PAGE
-        at = _place(held, number, page)
-        if held[at] == EMPTY:
+        at = _slot(keys, number, page)
+        if keys[at] == EMPTY:
             return i
         found.place[i], found.first[i] = at, step - page * PAGE
     return FOUND
 
 
 @inline
-def _led(p: float, v: float, after_s: float, bound_m: float) -> tuple[float, float]:
-    """Position [m] and velocity [m/s] some time later, between walls that turn the velocity."""
+def _extrapolated(p: float, v: float, after_s: float, bound_m: float) -> tuple[float, float]:
+    """Position [m] and velocity [m/s] after a time, reflected at ± bound_m."""
     p += v * after_s
     if abs(p) <= bound_m:
         return p, v
-    p, way = reflected(p, bound_m)
-    return p, way * v
+    p, sign = reflected(p, bound_m)
+    return p, sign * v
 
 
 @kernel
 def _foresee(
-    known: Window, n: int, ahead: I1, outlook: Outlook, dt_s: float, bound_m: float, window: F4
+    visible: Window, n: int, ahead: I1, outlook: Outlook, dt_s: float, bound_m: float, window: F4
 ) -> None:
-    """Fill in the windows of vehicles: what is seen, and what is predicted behind that.
+    """Fill in the windows of vehicles: visible states, and extrapolated ones after them.
 
     Args:
-        known: where the desired states from k on are; none after k + reach is looked at.
+        known: slots and stages of the desired states from k on; nothing after k + reach is used.
         n: number of vehicles.
         ahead: d of each; shape (block,).
-        outlook: how far it is seen.
+        outlook: visible part of the trajectory.
         dt_s: length of a step [s].
-        bound_m: coordinate at which a prediction turns round [m].
-        window: what is filled in [m, m/s]; shape (block, axes, H + 1, 2).
+        bound_m: coordinate at which the extrapolation is reflected [m].
+        window: output [m, m/s]; shape (block, axes, H + 1, 2).
     """
     for i in range(n):
-        states, first = known.states[known.place[i]], known.first[i]
+        states, first = visible.states[visible.place[i]], visible.first[i]
         for axis in range(window.shape[1]):
             reach, rest_s = outlook.reach[axis], outlook.rest_s[axis]
             for stage in range(window.shape[2]):
@@ -290,5 +290,5 @@ def _foresee(
                 seen = first + min(step, reach)
                 p, v = states[axis, seen, 0], states[axis, seen, 1]
                 if step > reach or rest_s > 0.0:
-                    p, v = _led(p, v, max(step - reach, 0) * dt_s + rest_s, bound_m)
+                    p, v = _extrapolated(p, v, max(step - reach, 0) * dt_s + rest_s, bound_m)
                 window[i, axis, stage, 0], window[i, axis, stage, 1] = p, v

@@ -28,9 +28,9 @@ def trajectories(
     rows, back = batch.rows[sent], told.back[sent]
     step = batch.step[sent] - back
     age = step - observed_step[rows]
-    # A motion that is sent again is older than the newest observation, which it was not made from.
-    # Any other may be too, where the server's clock was set and the clock map lags: then the age is
-    # below 0, as a horizon's is, for it has to name an observation that was made.
+    # A motion that is sent again is older than the newest observation, from which it was not
+    # planned; its age is 0. Others have a negative age if the server's clock was set and the clock
+    # map lags, as a horizon has: it must name an existing observation.
     age = np.where(back > 0, np.maximum(age, 0), age)
     columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
     for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
@@ -70,14 +70,14 @@ def inputs_along(
         model: eq. (4).
         bounds: u_max of each axis [m/s]; shape (axes,).
         dt_s: length of a step [s].
-        knots: knots of each, as in `Splines` [m, m/s]; shape (n, axes, 2 KNOTS_MAX).
-        number: number of them; shape (n,).
-        spacing: steps from one to the next; shape (n,).
-        inputs: what is filled in; shape (n, axes, H).
+        knots: knots of each spline, as in `Splines` [m, m/s]; shape (n, axes, 2 KNOTS_MAX).
+        number: number of knots; shape (n,).
+        spacing: steps from one knot to the next; shape (n,).
+        inputs: output; shape (n, axes, H).
     """
     for i in range(len(number)):
         for axis in range(len(bounds)):
-            some = knots[i, axis, : 2 * number[i]]
+            spline_knots = knots[i, axis, : 2 * number[i]]
             for stage in range(inputs.shape[2]):
-                u = along(axis_at(model, axis), some, spacing[i], dt_s, stage)
+                u = along(axis_at(model, axis), spline_knots, spacing[i], dt_s, stage)
                 inputs[i, axis, stage] = bounded(u, bounds[axis])

@@ -1,1 +1,1 @@
-"""Missions: motions of several vehicles that keep apart, and out of zones (docs/together.md)."""
+"""Missions: motions that keep several vehicles apart, and out of zones (docs/together.md)."""

@@ -1,8 +1,8 @@
-"""Motions as kernels see them: where one is at a step, and bounds of how it goes on.
+"""Motions in kernels: state at a step, and bounds of speed and curvature.
 
-Distances along the third axis may count less than those in the plane: all are of coordinates that
-are multiplied by `Metric.scale` first. So a sphere of that metric is an ellipsoid, higher than it
-is wide, as downwash asks for.
+Distances along the third axis may count less than those in the plane: coordinates are multiplied by
+`Metric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as downwash
+requires.
 """
 
 from typing import NamedTuple
@@ -14,30 +14,30 @@ from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 
-class Metric(NamedTuple):
-    """Measure of distances and times."""
+class MotionMetric(NamedTuple):
+    """Scaling of distances, and length of a step."""
 
     scale: F1
-    """Factor of each coordinate before distances are taken; shape (axes,)."""
+    """Factor of each coordinate in distances; shape (axes,)."""
     dt_s: float
     """Length of a step [s]."""
 
 
 class Extent(NamedTuple):
-    """Bounds of how a motion goes on."""
+    """Bounds of the speed and curvature of a motion."""
 
     speed: float
     """Largest speed, scaled [m/s]."""
     bend: float
-    """Largest distance from its straight pieces, SAMPLES an interval, scaled [m]."""
+    """Largest distance from its straight pieces, SAMPLES per interval, scaled [m]."""
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
     """Positions [m] and velocities [m/s] of a motion at steps SPACING apart; see `Motion.at`.
 
     Args:
-        motion: any.
-        begin: the first step.
+        motion: the motion.
+        begin: first step.
         count: number of steps.
         dt_s: length of a step [s].
 
@@ -50,7 +50,7 @@ def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, 
 
 
 def pieces_of(begin: int, end: int) -> Array:
-    """Steps between which motions are taken for straight, until they rest; shape (n,)."""
+    """Steps that divide a motion into nearly straight pieces, until it rests; shape (n,)."""
     count = max(-(-(end - begin) * SAMPLES // SPACING), 1)
     return np.linspace(begin, begin + count * SPACING / SAMPLES, count + 1)
 
@@ -94,11 +94,13 @@ def last_step(motion: Motion) -> int:
 
 
 @part
-def bounding_box(motion: Motion, lands: bool, metric: Metric, low: F1, high: F1) -> None:
-    """Fill in two corners of a box around a motion, and the landing behind it, scaled [m].
+def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, high: F1) -> None:
+    """Fill in two corners of a box around a motion and a landing after it, scaled [m].
 
     Args:
+        motion: the motion.
         lands: whether its vehicle may ever land.
+        metric: scaling of distances.
         low, high: output; shape (axes,).
     """
     position, velocity, scale = motion.position, motion.velocity, metric.scale
@@ -109,7 +111,8 @@ def bounding_box(motion: Motion, lands: bool, metric: Metric, low: F1, high: F1)
             high[x] = max(high[x], position[knot, x])
             if knot:
                 turn = max(turn, abs(velocity[knot, x] - velocity[knot - 1, x]))
-        # Between two knots, T apart, a parabola is off the straight line by Δv T / 8 at most.
+        # Between two knots, T apart, a parabola deviates from the straight line by at most Δv T /
+        # 8.
         bend = turn * SPACING * metric.dt_s / 8.0
         low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
         if x == ALTITUDE and lands:
@@ -117,8 +120,8 @@ def bounding_box(motion: Motion, lands: bool, metric: Metric, low: F1, high: F1)
 
 
 @part
-def extent_of(motion: Motion, metric: Metric) -> Extent:
-    """Bounds of how a motion goes on."""
+def extent_of(motion: Motion, metric: MotionMetric) -> Extent:
+    """Bounds of the speed and curvature of a motion."""
     fastest, turn, scale = 0.0, 0.0, metric.scale
     for knot in range(len(motion.velocity)):
         speed, change = 0.0, 0.0
@@ -128,6 +131,6 @@ def extent_of(motion: Motion, metric: Metric) -> Extent:
             if knot:
                 change += (v - scale[x] * motion.velocity[knot - 1, x]) ** 2
         fastest, turn = max(fastest, speed), max(turn, change)
-    # Over a piece of the time t a parabola is off the straight line by a t² / 8 at most.
+    # Over a piece of duration t a parabola deviates from the straight line by at most a t² / 8.
     piece = SPACING / SAMPLES * metric.dt_s
     return Extent(np.sqrt(fastest), np.sqrt(turn) / (SPACING * metric.dt_s) * piece * piece / 8.0)

@@ -1,10 +1,10 @@
-"""Quadratic programs with few variables and many constraints, solve_qp exactly.
+"""Exact solution of quadratic programs with few variables and many constraints.
 
     min  ½ xᵀ G x - gᵀ x     C x ≥ b,  with equality in the first rows
 
-by the dual active-set method of Goldfarb and Idnani (1983). It begins at the minimum without
-constraints and takes in the constraint that is violated most, one after the other, so its cost
-follows those that matter, and not the number there are.
+by the dual active-set method of Goldfarb and Idnani (1983). It starts at the unconstrained minimum
+and adds the most violated constraint, one after another, so its cost depends on the constraints
+that matter, not on their number.
 """
 
 from typing import Any, NamedTuple
@@ -16,38 +16,38 @@ from skytether.shared.base.kernel import F1, F2, I1, R2, kernel, part
 from skytether.shared.law.model import Array
 
 SOLVED, INFEASIBLE, TOO_MANY_ROUNDS = 0, 1, 2
-"""Outcome of the solve."""
+"""Result of the solver."""
 VIOLATED = 1e-9
 """Violation from which on a constraint counts."""
 DEPENDENT = 1e-12
-"""Square of a step's length below which a constraint depends on those in force."""
+"""Squared length of a step below which a constraint depends on the active ones."""
 ROUNDS = 10
-"""Largest number of constraints taken in, in numbers of variables."""
+"""Largest number of constraints added, as a multiple of the number of variables."""
 
 
-class Workspace(NamedTuple):
-    """Scratch for problems of n variables and m constraints."""
+class DualWorkspace(NamedTuple):
+    """Scratch arrays for problems with n variables and m constraints."""
 
     slack: F1
-    """How far each constraint is from being violated; shape (m,)."""
+    """Slack of each constraint, negative if it is violated; shape (m,)."""
     J: F2
-    """Jᵀ, its first rows those of the constraints in force; shape (n, n)."""
+    """Jᵀ, its first rows those of the active constraints; shape (n, n)."""
     R: F2
-    """Upper triangle with the normals in force as Jᵀ sees them; shape (n, n)."""
+    """Upper triangle: active normals transformed by Jᵀ; shape (n, n)."""
     work: F2
     """Shape (5, n + 1)."""
     active: I1
-    """Constraints in force; shape (n + 1,)."""
+    """Active constraints; shape (n + 1,)."""
 
 
-def workspace(n: int, m: int) -> Workspace:
-    """Scratch for problems of n variables and m constraints."""
+def workspace(n: int, m: int) -> DualWorkspace:
+    """Scratch arrays for problems with n variables and m constraints."""
     J, R = np.zeros((2, n, n))
-    return Workspace(np.zeros(m), J, R, np.zeros((5, n + 1)), np.zeros(n + 1, dtype=np.int64))
+    return DualWorkspace(np.zeros(m), J, R, np.zeros((5, n + 1)), np.zeros(n + 1, dtype=np.int64))
 
 
 class DualActiveSet:
-    """Solver of problems with one Hessian.
+    """Solver of problems with the same Hessian.
 
     Args:
         hessian: G, positive definite; shape (n, n).
@@ -59,58 +59,61 @@ class DualActiveSet:
         self._scratch = workspace(len(hessian), 0)
 
     def solve(self, linear: Array, columns: Array, bounds: Array, equal: int) -> Array | None:
-        """The minimum x; None where there is none.
+        """Minimum x; None if there is none.
 
         Args:
             linear: g; shape (n,).
             columns: Cᵀ; shape (n, m).
             bounds: b; shape (m,).
-            equal: number of constraints, the first ones, that hold with equality.
+            equal: number of equality constraints, which come first.
         """
         x, scratch = np.empty(len(linear)), self._scratch._replace(slack=np.empty(len(bounds)))
         outcome = _solve(self.root, linear, x, columns, bounds, equal, scratch)
         return x if outcome == SOLVED else None
 
 
-# Loops run along what lies side by side in memory, so that the compiler makes SIMD of them: C and J
-# are kept transposed.
+# Inner loops run along contiguous memory, so that the compiler uses SIMD: C and J are stored
+# transposed.
 
 
 @kernel
 def _solve(
-    root: F2, linear: F1, x: F1, columns: R2, bounds: F1, equal: int, scratch: Workspace
+    root: F2, linear: F1, x: F1, columns: R2, bounds: F1, equal: int, scratch: DualWorkspace
 ) -> int:
-    """Fill in x; see `solve_qp`."""
+    """Compiled `solve_qp`."""
     return solve_qp(root, linear, x, columns, bounds, equal, scratch)
 
 
 @part
 def solve_qp(
-    root: F2, linear: F1, x: F1, columns: R2, bounds: F1, equal: int, scratch: Workspace
+    root: F2, linear: F1, x: F1, columns: R2, bounds: F1, equal: int, scratch: DualWorkspace
 ) -> int:
-    """Fill in x: moved from the minimum without constraints, G⁻¹ g, to that with them.
+    """Move x from the unconstrained minimum G⁻¹ g to the constrained one.
 
     Args:
-        root: Jᵀ of the beginning; shape (n, n).
+        root: initial Jᵀ; shape (n, n).
         linear: g; shape (n,).
-        x: shape (n,).
+        x: output; shape (n,).
         columns, bounds, equal: see `DualActiveSet.solve`.
         scratch: see `workspace`.
+
+    Returns:
+        SOLVED, INFEASIBLE or TOO_MANY_ROUNDS.
     """
     slack, J, R, work, active = scratch
     n, q = len(x), 0
     d, z, r, u, normal = work[0], work[1], work[2], work[3], work[4]
     _start_unconstrained(root, linear, x, J)
     for _ in range(ROUNDS * n):
-        # The equality that comes next, or else the constraint that is violated most.
+        # Next equality, or else the most violated inequality.
         at = q if q < equal else _most_violated(columns, bounds, equal, x, slack)
         if at < 0:
             return SOLVED
         margin = -bounds[at]
         for j in range(n):
             margin += columns[j, at] * x[j]
-        # An equality may be violated on either side: turned so that x always has to go along the
-        # normal.
+        # An equality may be violated on either side: its sign is chosen so that x has to move along
+        # the normal.
         sign = -1.0 if at < equal and margin > 0.0 else 1.0
         margin *= sign
         for i in range(n):
@@ -120,13 +123,13 @@ def solve_qp(
             length, gain = _direction(J, R, normal, d, z, r, q)
             dual, dropped = np.inf, -1
             for i in range(q):
-                # Equalities are never let go.
+                # Equalities are never dropped.
                 if active[i] >= equal and r[i] > 0.0 and u[i] / r[i] < dual:
                     dual, dropped = u[i] / r[i], i
-            # A normal that depends on those in force dropped x no way: only letting one go helps.
+            # If the normal depends on the active ones, x cannot move: only dropping one helps.
             primal = np.inf if length <= DEPENDENT else -margin / gain
             step = min(dual, primal)
-            # Neither a step nor a constraint that may leave: no x meets all of them.
+            # No step is possible and no constraint can be dropped: the problem is infeasible.
             if step == np.inf:
                 return INFEASIBLE
             _add_scaled(u, -step, r, q)
@@ -146,14 +149,14 @@ def solve_qp(
 
 @part
 def _add_scaled(to: F1, factor: float, numbers: F1, count: int) -> None:
-    """Add multiples of the first numbers, by a loop: numba takes a second to compile a slice."""
+    """Add multiples of the first numbers, in a loop: a slice takes numba a second to compile."""
     for i in range(count):
         to[i] += factor * numbers[i]
 
 
 @part
 def _start_unconstrained(root: F2, linear: F1, x: F1, J: F2) -> None:
-    """Fill in J, and x with the minimum of the QP without its constraints, J Jᵀ g."""
+    """Fill in J, and x with the unconstrained minimum J Jᵀ g."""
     for i in range(len(x)):
         x[i] = 0.0
         for j in range(len(x)):
@@ -168,7 +171,7 @@ def _start_unconstrained(root: F2, linear: F1, x: F1, J: F2) -> None:
 
 @part
 def _most_violated(columns: R2, bounds: F1, equal: int, x: F1, slack: F1) -> int:
-    """The inequality that is violated most, or -1."""
+    """Most violated inequality, or -1."""
     for i in range(len(bounds)):
         slack[i] = -bounds[i]
     for j in range(len(x)):
@@ -184,10 +187,10 @@ def _most_violated(columns: R2, bounds: F1, equal: int, x: F1, slack: F1) -> int
 
 @part
 def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[float, float]:
-    """Fill in the step of x, z, and of the multipliers, r, that a constraint asks for.
+    """Fill in the steps of x (z) and of the multipliers (r) for a constraint.
 
     Returns:
-        the square of the length of z, and by how much the constraint gains along it.
+        squared length of z, and the constraint's gain along it.
     """
     n, length, gain = len(J), 0.0, 0.0
     for j in range(n):
@@ -211,7 +214,7 @@ def _direction(J: F2, R: F2, normal: F1, d: F1, z: F1, r: F1, q: int) -> tuple[f
 
 @part
 def _add_constraint(J: F2, R: F2, d: F1, q: int) -> None:
-    """Put another constraint behind the q in force; d is its normal as Jᵀ sees it."""
+    """Add a constraint to the q active ones; d is its normal transformed by Jᵀ."""
     for j in range(len(J) - 1, q, -1):
         _rotate(d, J, j)
     for i in range(q + 1):
@@ -220,13 +223,13 @@ def _add_constraint(J: F2, R: F2, d: F1, q: int) -> None:
 
 @part
 def _drop_constraint(J: F2, R: F2, u: F1, active: I1, dropped: int, q: int) -> None:
-    """Remove one of the q constraints in force."""
+    """Drop one of the q active constraints."""
     for i in range(dropped, q - 1):
         active[i], u[i] = active[i + 1], u[i + 1]
         for j in range(q):
             R[j, i] = R[j, i + 1]
     for i in range(dropped, q - 1):
-        # Givens rotations make R a triangle again after the column that left.
+        # Givens rotations make R triangular again without the dropped column.
         one, other = R[i, i], R[i + 1, i]
         size = np.hypot(one, other)
         if size == 0.0:
@@ -242,7 +245,7 @@ def _drop_constraint(J: F2, R: F2, u: F1, active: I1, dropped: int, q: int) -> N
 
 @part
 def _rotate(d: F1, J: F2, j: int) -> None:
-    """Turn rows j - 1 and j so that d[j] becomes 0."""
+    """Rotate rows j - 1 and j so that d[j] becomes 0."""
     one, other = d[j - 1], d[j]
     size = np.hypot(one, other)
     if other == 0.0:

@@ -1,7 +1,7 @@
-"""Half-planes that keep a motion apart from those of other vehicles.
+"""Half-planes that keep a motion away from those of other vehicles.
 
-Each is normal to the line from the nearest point where another vehicle may be at a time to the
-motion in force then.
+Each is normal to the line from the nearest possible position of another vehicle at a time to the
+position of the motion in force at that time.
 """
 
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.common.clock import EXACT, StepError
-from skytether.server.missions.compiled_motion import Metric, position_at
+from skytether.server.missions.compiled_motion import MotionMetric, position_at
 from skytether.server.missions.possible_motions import (
     KNOTS,
     NEVER,
@@ -37,12 +37,12 @@ class HalfPlanes(NamedTuple):
     bound: F1
     """Shape (n,) [m]."""
     other: I1
-    """Index of the motion that is kept apart from; shape (n,)."""
+    """Index of the motion to keep away from; shape (n,)."""
 
     def from_some(self, chosen: Flags) -> "HalfPlanes":
-        """Half-planes that keep apart from the chosen motions alone; shape (motions,)."""
-        some = chosen[self.other]
-        return HalfPlanes._make(each[some] for each in self)
+        """Half-planes of the chosen motions only; `chosen` has shape (motions,)."""
+        selected = chosen[self.other]
+        return HalfPlanes._make(each[selected] for each in self)
 
 
 def half_planes(
@@ -57,25 +57,25 @@ def half_planes(
 ) -> HalfPlanes:
     """Half-planes normal to the lines from the others' motions to the one in force.
 
-    Of a motion whose step is not known exactly it is the nearest point of where it may be then, and
-    the plane is in front of all of that.
+    If the step of another vehicle is not known exactly, the nearest of its possible positions is
+    used, and all of them lie behind the plane.
 
     Args:
-        times: steps in common; shape (n,).
-        in_force: positions of the motion in force then [m]; shape (n, axes).
-        reach_m: distance from there within which the plan stays [m]; shape (n,).
-        row: row of the vehicle, whose own motions do not count.
+        times: common steps; shape (n,).
+        in_force: positions of the motion in force at these steps [m]; shape (n, axes).
+        reach_m: distance from there that the plan cannot exceed [m]; shape (n,).
+        row: row of the vehicle, whose own motions are left out.
         lands: first step at which it may begin to land, or NEVER.
         possible: motions of all vehicles.
-        distance_m: distance that is kept [m]; less where the motion in force is nearer already.
+        distance_m: distance to keep [m]; less if the motion in force is nearer already.
         error: error of the vehicle's own steps.
     """
-    most = len(times) * possible.count
+    capacity = len(times) * possible.count
     planes = HalfPlanes(
-        np.empty(most, dtype=np.int64),
-        np.empty((most, in_force.shape[1])),
-        np.empty(most),
-        np.empty(most, dtype=np.int64),
+        np.empty(capacity, dtype=np.int64),
+        np.empty((capacity, in_force.shape[1])),
+        np.empty(capacity),
+        np.empty(capacity, dtype=np.int64),
     )
     others = possible.arrays, possible.count, possible.metric
     n = _half_planes(times, in_force, reach_m, row, lands, error, *others, distance_m, planes)
@@ -92,15 +92,15 @@ def _half_planes(
     error: StepError,
     others: MotionArrays,
     count: int,
-    metric: Metric,
+    metric: MotionMetric,
     distance: float,
     planes: HalfPlanes,
 ) -> int:
-    """Fill in `half_planes`; the number of them."""
+    """Fill in `half_planes`; returns their number."""
     scale, n, final = metric.scale, 0, len(times) - 1
     axes = len(scale)
     low, high, off, scratch = np.empty((4, axes))
-    # Where the other one may be at a time: corners of its way then.
+    # Possible positions of the other vehicle at a time: corners of a polyline.
     way = np.empty(((KNOTS - 1) * SAMPLES + 4, axes))
     drift = 2.0 * (times[final] - times[0]) / DRIFT
     for x in range(axes):
@@ -112,16 +112,19 @@ def _half_planes(
         if others.row[m] == row or is_beyond(others, m, low, high, keep + reach.max()):
             continue
         other = motion_at(others, m)
-        least, most = shifts(error, other.error, drift)
+        least, capacity = shifts(error, other.error, drift)
         for i in range(len(times)):
-            # At the last time all are at rest, and in the end down that ever land.
+            # At the last time all are at rest, and those that may land have landed in the end.
             descends = times[i] >= lands or (i == final and lands < NEVER)
-            other_descends = times[i] + most >= other.lands or (i == final and other.lands < NEVER)
-            corners = _possible_way(other.motion, times[i], least, most, metric.dt_s, way)
+            other_descends = times[i] + capacity >= other.lands or (
+                i == final and other.lands < NEVER
+            )
+            corners = _possible_way(other.motion, times[i], least, capacity, metric.dt_s, way)
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
             # Out of reach, the constraint could never be active; at the very same place it has no
+            # Out of reach, the constraint could never be active; at the same position it has no
             # direction.
             if away >= keep + reach[i] or away == 0.0:
                 continue
@@ -129,7 +132,7 @@ def _half_planes(
             for x in range(axes):
                 planes.normal[n, x] = scale[x] * off[x] / away
                 own += planes.normal[n, x] * in_force[i, x]
-            # Where two are too near already, the plane runs just behind the motion in force, which
+            # If the two are too near already, the plane runs just behind the motion in force, which
             # so remains a solution.
             ahead = (way[:corners] * planes.normal[n]).sum(axis=1).max()
             planes.time[n], planes.bound[n], planes.other[n] = i, min(ahead + keep, own - 1e-4), m
@@ -141,10 +144,14 @@ def _half_planes(
 def _possible_way(
     other: Motion, step: float, least: float, most: float, dt_s: float, way: F2
 ) -> int:
-    """Fill in corners of the way on which another vehicle may be at a step; their number.
+    """Fill in corners of the polyline on which another vehicle may be at a step; returns their
+    number.
 
     Args:
-        least, most: steps by which it may be further on.
+        other: its motion.
+        step: the step.
+        least, most: bounds of the steps by which it may be ahead.
+        dt_s: length of a step [s].
         way: output [m]; shape (corners, axes).
     """
     first, last = moving_shifts(other, step, step, least, most)
@@ -160,14 +167,15 @@ def _possible_way(
 def _offset_from_way(
     place: F1, way: F2, descends: bool, other_descends: bool, scale: F1, off: F1, scratch: F1
 ) -> float:
-    """Distance of a place from the nearest point of a way, scaled [m].
+    """Distance of a point from the nearest point of a polyline, scaled [m].
 
     Args:
-        place: shape (axes,).
-        way: its corners; shape (n, axes).
-        descends, other_descends: whether who is at the place, and who is on the way, may be
+        place: the point; shape (axes,).
+        way: corners of the polyline; shape (n, axes).
+        descends, other_descends: whether the vehicle at the point, and that on the polyline, may be
             landing.
-        off: output: from that point to the place, scaled [m]; shape (axes,).
+        scale: factors of the coordinates; shape (axes,).
+        off: output: from the nearest point to the point, scaled [m]; shape (axes,).
         scratch: shape (axes,).
     """
     nearest = np.inf
@@ -175,10 +183,10 @@ def _offset_from_way(
         end = min(j + 1, len(way) - 1)
         along, length = 0.0, 0.0
         for x in range(len(scale)):
-            here, there = scale[x] * (place[x] - way[j, x]), scale[x] * (way[end, x] - way[j, x])
-            if x == ALTITUDE and height_above(here, descends, other_descends) == 0.0:
+            offset, side = scale[x] * (place[x] - way[j, x]), scale[x] * (way[end, x] - way[j, x])
+            if x == ALTITUDE and height_above(offset, descends, other_descends) == 0.0:
                 continue
-            along, length = along + here * there, length + there * there
+            along, length = along + offset * side, length + side * side
         t = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
         square = 0.0
         for x in range(len(scale)):

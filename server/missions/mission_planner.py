@@ -1,28 +1,28 @@
-"""Motions that keep vehicles apart, and out of zones, whichever packets are lost.
+"""Mission planner: motions that keep vehicles apart and out of zones, whichever packets are lost.
 
-A motion is where a vehicle is at every time: a spline that ends at rest, and rest from there on. It
-is sent as a trajectory whose knots are all of it, so a vehicle that hears nothing more flies it to
-its end and hovers there. For each vehicle the server keeps every motion that may be flown:
+A motion gives the position of a vehicle at all times: a spline that ends at rest, and rest after
+that. It is sent as a trajectory with all its knots, so a vehicle that hears nothing more flies it
+to its end and hovers there. For each vehicle the server keeps every motion that may be flown:
 
 - the one in force at its newest observation, which acknowledges it; and
-- each that was sent since, as long as a packet may still be taken. Aboard a trajectory is taken no
-  later than `link.join_s` after its first knot, so an observation made later says for certain
-  whether it was.
+- each one sent since, as long as its packet may still be accepted. The vehicle accepts a trajectory
+  no later than `link.join_s` after its first knot, so a later observation shows for certain whether
+  it did.
 
-A new motion is sent only if at every time it keeps the distance
+A new motion is sent only if at all times it keeps the distance
 
     D = separation_m + 2 tube_m
 
-from all that all other vehicles may fly, wherever on these motions they may be by what is known of
-their clocks, with `tube_m` for how far a vehicle is from its motion (wind, tracking); from one that
-was seen outside its tube, as much more as it was. Those were apart already. So whichever of them
-are taken, and whichever packets are lost or late, vehicles are `separation_m` apart, as long as
-each stays in its tube (docs/together.md has the theorem). From zones it keeps `tube_m`. The motion
-in force is always a way out: it needs no packet.
+from all motions that all other vehicles may fly, wherever on these they may be given the errors of
+their clocks. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); a
+vehicle seen outside its tube is kept away from by as much more. Those motions were apart already.
+So whichever are accepted, and whichever packets are lost or late, vehicles are `separation_m` apart
+as long as each stays in its tube (docs/together.md has the theorem). The distance from zones is
+`tube_m`. Staying on the motion in force is always possible: it needs no packet.
 
-`mission_state` has what may be flown, `trajectory_qp` the QP, `separation` and `half_planes` the
-distances, `routes` the ways around zones, `waypoints` what a vehicle flies towards, and `yielding`
-who yields to whom.
+`mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
+`half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a
+vehicle, and `yielding` which vehicle makes way for another.
 """
 
 import math
@@ -62,26 +62,26 @@ from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 
 RESTS_MPS = 0.2
-"""Measured speed up to which a vehicle rests [m/s]."""
+"""Measured speed below which a vehicle counts as at rest [m/s]."""
 ARRIVED_M = 0.02
-"""Distance from the goal at which a motion ends there [m]."""
+"""Distance from the goal within which a motion's end counts as there [m]."""
 ROUNDS = 5
 """Number of times that constraints are added for a waypoint."""
 STUCK = 0.3
-"""Share of the way to a waypoint, 2 m at most, below which a plan is taken for stuck."""
+"""Share of the distance to a waypoint, 2 m at most, below which a plan counts as stuck."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
-"""Directions in which a vehicle that rests within a zone looks for a way out."""
+"""Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
-"""Distance from one place that is looked at to the next [m], and number of these."""
+"""Distance between positions tried on the way out [m], and their number."""
 NEARER_M = 1e-3
 """Distance by which a vehicle may come nearer to the zone that it leaves [m]."""
 ZONE = "a zone"
-"""Reason why a vehicle waits: a zone holds it back."""
+"""Reason for waiting: a zone is in the way."""
 CLOCK_POINTS = 33
-"""Number of steps, of those that a vehicle may be at, that `clock_m` looks at."""
+"""Number of possible steps of a vehicle that `clock_m` evaluates."""
 BINDS_M = 1e-4
-"""Distance from a half-plane up to which it holds a motion back [m]."""
+"""Distance from a half-plane within which it counts as limiting a motion [m]."""
 
 SILENT = np.zeros((), dtype=FIGURES)
 """Figures of a vehicle to which nothing is sent."""
@@ -89,11 +89,11 @@ SILENT["gap"], SILENT["solved"] = 1, True
 
 
 class MissionPlanner(Scheme):
-    """The scheme "trajectory" for missions: motions that keep apart.
+    """Scheme "trajectory" for missions: motions that keep apart.
 
     Args:
-        scenario: what is asked for, as `mission` says it, and the seed of directions.
-        terms: the rule of flight.
+        scenario: scenario with its mission, and the seed of random directions.
+        terms: terms of the flight.
         block: number of vehicles that are decided on at a time.
         state: vehicles, and the motions that each may fly.
     """
@@ -109,7 +109,7 @@ class MissionPlanner(Scheme):
         clearances = self._clearances = scenario.clearances
         self._dt_s = terms.dt_s
         self._kept_steps = -(-terms.join // SPACING) * SPACING
-        """Steps after the first knot from which on a motion differs from the one in force."""
+        """Steps after the first knot up to which a motion equals the one in force."""
         self._resend_after = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
@@ -122,11 +122,10 @@ class MissionPlanner(Scheme):
             stream(scenario.seed, "together"),
         )
         self._repeating: list[VehicleMotions] = []
-        """Vehicles that are sent a motion once more at this step."""
+        """Vehicles whose motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
         self._scale[ALTITUDE:] = scenario.rest_scale
-        """Factors of the coordinates before distances of vehicles at rest are taken; shape
-        (axes,)."""
+        """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
 
     @property
     def left_tube(self) -> list[tuple[int, float]]:
@@ -143,7 +142,7 @@ class MissionPlanner(Scheme):
         self._state.forget(row)
 
     def restart(self, row: int) -> bool:
-        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        """Note that a vehicle's client has restarted; returns whether that is news."""
         return self._state.restart(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
@@ -151,23 +150,23 @@ class MissionPlanner(Scheme):
         return self._state.observe(row, observation)
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
-        """See `Scheme`: what was observed, as it is."""
+        """See `Scheme`; the observed state is used as it is."""
         n = len(rows)
         found.estimate[:n] = found.start[:n] = self._state.state[rows]
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
-        """Plan for vehicles every SPACING steps, not all at the same."""
+        """Plan for each vehicle every SPACING steps, not for all at the same step."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
         figures["expected_gap"][:n] = 0.0
         figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
-        # By their numbers, so that vehicles take turns: a plan reckons with the motions decided
+        # In order of row, so that vehicles take turns: each plan accounts for the motions decided
         # before it.
-        for each in self._repeating:
-            each.repeat = None
+        for vehicle in self._repeating:
+            vehicle.repeat = None
         self._repeating.clear()
-        looked_at = self._state.due[:n].nonzero()[0].tolist()
-        for i in looked_at:
+        due = self._state.due[:n].nonzero()[0].tolist()
+        for i in due:
             row, k = int(rows[i]), int(step[i])
             vehicle = self._state.vehicles[row]
             if self._state.due[i] & REPEAT_DUE:
@@ -175,7 +174,7 @@ class MissionPlanner(Scheme):
                 self._repeating.append(vehicle)
             if self._state.due[i] & PLAN_DUE and self._may_plan(row, vehicle, k):
                 self._plan_to_goal(row, vehicle, k)
-        for i in looked_at:
+        for i in due:
             vehicle = self._state.vehicles[int(rows[i])]
             # A figure above any threshold: a motion that was found has to be sent.
             if vehicle.next or vehicle.repeat:
@@ -185,7 +184,7 @@ class MissionPlanner(Scheme):
         self.planned[:n] = self._state.state[rows]
 
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
-        """See `Scheme`; the knots of what is sent."""
+        """See `Scheme`; fills in the knots of the motions sent."""
         for i in event.nonzero()[0].tolist():
             vehicle, k = self._state.vehicles[int(rows[i])], int(step[i])
             if vehicle.repeat:
@@ -204,8 +203,6 @@ class MissionPlanner(Scheme):
             if not vehicle.repeat:
                 self._state.note_sent(int(rows[i]), k, motion)
 
-    # -- zones -------------------------------------------------------------------------------------
-
     def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
         return trajectories(batch, self.observed_step, head)
@@ -215,15 +212,15 @@ class MissionPlanner(Scheme):
         return sent_splines(batch, self._terms)
 
     def change_zones(self, zones: Zones) -> None:
-        """Keep out of other zones from now on, to which `objection` has nothing to say."""
+        """Use other zones from now on, to which `objection` had no objection."""
         self._zones = zones
         self._waypoints.change_zones(zones)
         for vehicle in self._state.vehicles.values():
-            vehicle.goal = None  # what was learnt about ways to it no longer holds
+            vehicle.goal = None  # what was learnt about paths to it no longer holds
 
     def objection(self, zones: Zones) -> str:
-        """Why there cannot be these zones: where a vehicle may fly into one, or is not known to
-        keep out; empty: there can.
+        """Why these zones are refused: a vehicle may fly into one, or its position is unknown;
+        empty if they are accepted.
         """
         if zones and (number := self._state.unknown()) is not None:
             return f"zones before it is known where vehicle {number} is"
@@ -234,7 +231,7 @@ class MissionPlanner(Scheme):
                 + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
-                # The earliest step that the vehicle may be at.
+                # Earliest step that the vehicle may be at.
                 k = self._state.now + self._state.ahead(row)
                 k -= max(math.ceil(self._state.error(row).late), 0)
                 points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
@@ -248,14 +245,14 @@ class MissionPlanner(Scheme):
         return ""
 
     def waits(self, row: int) -> str:
-        """Reason why a vehicle waits; empty if it does not."""
+        """Why a vehicle waits, in words; empty if it does not."""
         return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
 
     def clock_m(self, row: int) -> float | None:
-        """Distance by which a vehicle may now be elsewhere on its motion than where its step is
-        counted [m]; None of none.
+        """Distance by which the clock error may displace a vehicle along its motion now [m]; None
+        without a motion.
 
-        Others keep as much further away from it, along its way.
+        Others keep this much further away from it, along its path.
         """
         vehicle, error = self._state.vehicles.get(row), self._state.error(row)
         if vehicle is None or vehicle.in_force is None:
@@ -266,36 +263,38 @@ class MissionPlanner(Scheme):
         position, _ = motion.at(steps.clip(motion.first, motion.last), self._dt_s)
         return float(np.linalg.norm(position - position[-1], axis=1).max())
 
-    # -- what is decided ---------------------------------------------------------------------------
+    # -- decisions ---------------------------------------------------------------------------------
 
     def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
-        """Whether another motion may be planned for a vehicle at its step k; sets what it waits
-        for, or the motion in force to be sent again, if not.
+        """Whether a new motion may be planned for a vehicle at its step k; otherwise sets what
+        it waits for, or sends the motion in force again.
         """
         in_force = vehicle.in_force
         assert in_force is not None
-        vehicle.waits_for = self._awaited_of_itself(row, vehicle)
+        vehicle.waits_for = self._own_wait(row, vehicle)
         if vehicle.waits_for:
             return False
-        # A vehicle without a motion is first of all sent the place where it hovers. Another one's
-        # motion would end aboard, and the vehicle drift.
+        # A vehicle without a motion is first sent its hovering position as a motion. A motion too
+        # old to be flown would end aboard, and the vehicle would drift.
         if in_force.step < 0 or k - in_force.step > self._resend_after:
             vehicle.next = in_force.motion
             return False
-        vehicle.waits_for = self._awaited_of_others()
+        vehicle.waits_for = self._common_wait()
         return not vehicle.waits_for
 
-    def _awaited_of_itself(self, row: int, vehicle: VehicleMotions) -> str:
-        """What a vehicle waits for until something is sent to it, in words; empty: nothing."""
+    def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
+        """What a vehicle itself waits for before a motion is sent to it, in words; empty:
+        nothing.
+        """
         if row in self._state.restarted:
             return "its client, which has begun anew"
         if vehicle.sent:
-            return "an acknowledgement"  # until then it is not known which motion it flies
+            return "an acknowledgement"  # until then it is unknown which motion it flies
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0
         return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
 
-    def _awaited_of_others(self) -> str:
-        """What all vehicles wait for until motions are planned, in words; empty: nothing."""
+    def _common_wait(self) -> str:
+        """What all vehicles wait for before motions are planned, in words; empty: nothing."""
         if self._state.absent:
             return f"vehicle {min(self._state.absent)} to begin"
         if self._state.foreign is not None:
@@ -304,7 +303,7 @@ class MissionPlanner(Scheme):
         return ""
 
     def _plan_to_goal(self, row: int, vehicle: VehicleMotions, k: int) -> None:
-        """Find a motion to a vehicle's goal, or to the place where it yields, at its step k."""
+        """Find a motion to a vehicle's goal, or to its yielding position, at its step k."""
         assert vehicle.in_force is not None
         home = self._state.goal(row)
         yields = vehicle.yielding
@@ -334,10 +333,11 @@ class MissionPlanner(Scheme):
             vehicle.zone_blocks = False
 
     def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
-        """Nearest place clear of zones, for a vehicle that rests within one [m]; None of one that
-        is clear.
+        """Nearest position clear of zones, for a vehicle that rests within one [m]; None if it is
+        clear.
 
-        No motion leads there: it was there when the server began, which knew of no zone before.
+        No motion leads into a zone: the vehicle was there when the server started, which knew no
+        earlier zones.
         """
         clearance_m = self._clearances.tube_m
         if not self._zones or self._zones.clearance(place[None]).min() >= clearance_m:
@@ -354,39 +354,39 @@ class MissionPlanner(Scheme):
             clear_m = self._zones.clearance(places).min(axis=1)
             best = int(clear_m.argmax())
             if clear_m[best] >= self._clearances.planned_clear_m:
-                there: Array = places[best]
-                return there
+                way_out: Array = places[best]
+                return way_out
         return None
 
     def _plan_motion(self, row: int, vehicle: VehicleMotions, k: int, goal: Array) -> None:
-        """Find a motion towards a goal, around others that are in the way."""
+        """Find a motion towards a goal, around others in the way."""
         vehicle.next = self._motion_toward(row, vehicle, k, goal)
         self.counts["stuck"] += vehicle.next is None
 
     def _way(self, row: int, goal: Array) -> Array:
-        """Way around zones to a goal from where a vehicle comes to rest, that place first [m]."""
+        """Path around zones from the end of a vehicle's motion to a goal, starting there [m]."""
         in_force = self._state.vehicles[row].in_force
         assert in_force is not None
         place = in_force.motion.position[-1]
         return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
 
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
-        """Whether a vehicle has yet to pass the home of one that yields to it."""
-        way = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
-        (away_m,) = yielding.distance_from_way(home[None] * self._scale, way)
+        """Whether the asking vehicle has yet to pass the goal of the one that yields."""
+        path = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
+        (away_m,) = yielding.distance_from_way(home[None] * self._scale, path)
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
         """Ask the first vehicle that rests at its goal in another vehicle's way to yield;
-        whether it does.
+        returns whether it does.
         """
         keep_m = self._clearances.planned_apart_m
-        ends, homes = list[tuple[int, Array]](), list[int]()
+        rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
             if other == row or each.in_force is None or not self._state.rows.aligned[other]:
                 continue
             motions = each.motions()
-            ends += [(other, motion.position[-1]) for motion in motions]
+            rest_ends += [(other, motion.position[-1]) for motion in motions]
             rests = each.in_force.step >= 0 and len(motions) == 1 and each.yielding is None
             left_m = motions[0].position[-1] - self._state.goal(other)
             if rests and np.abs(left_m).max() < ARRIVED_M:
@@ -395,7 +395,7 @@ class MissionPlanner(Scheme):
         first = yielding.first_on(way * self._scale, places * self._scale, keep_m)
         if first is None:
             return False
-        asked, others = homes[first], [end for other, end in ends if other != homes[first]]
+        asked, others = homes[first], [end for other, end in rest_ends if other != homes[first]]
         free = yielding.place_to_yield(
             places[first],
             way,
@@ -415,12 +415,12 @@ class MissionPlanner(Scheme):
     def _motion_toward(
         self, row: int, vehicle: VehicleMotions, k: int, goal: Array
     ) -> Motion | None:
-        """A motion from the one in force towards a goal, apart from all; None where none is found.
+        """Motion from the one in force towards a goal, away from all others; None if none is found.
 
-        It is added to those that may be flown: the next vehicle's plan reckons with it.
+        It is added to the possible motions, so that the next vehicle's plan accounts for it.
 
-        Only those constraints are added that a solution without them has violated: mostly
-        nothing is near, and the way is straight.
+        Only constraints that a solution without them has violated are added: mostly nothing is
+        near, and the path is straight.
         """
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
@@ -443,20 +443,22 @@ class MissionPlanner(Scheme):
                     break
                 violated |= conflicts
                 planes = planes or self._half_planes(row, base, due)
-            # A plan that hardly moves is taken for stuck, and another waypoint is tried.
+            # A plan that hardly moves counts as stuck, and another waypoint is tried.
             moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(waypoint, p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not conflicts.any():
                 vehicle.waits_for, vehicle.turned_rad = "", max(0.0, vehicle.turned_rad - TURN_BACK)
                 self._state.possible.add(row, planned, vehicle.outside_m)
                 return motion
             if constraints:
-                vehicle.waits_for = vehicle.waits_for or self._blocker(solved, constraints)
+                vehicle.waits_for = vehicle.waits_for or self._limiting_constraint(
+                    solved, constraints
+                )
                 vehicle.zone_blocks |= vehicle.waits_for == ZONE
             self.counts["refused"] += bool(conflicts.any())
         return None
 
     def _half_planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
-        """Half-planes of the others' motions, and behind them those of zones."""
+        """Half-planes of the others' motions, followed by those of zones."""
         qp, ahead = self._qp, self._state.rows.ahead[row]
         times = due + qp.times * SPACING
         in_force, _ = base.at(times, self._dt_s)
@@ -473,7 +475,7 @@ class MissionPlanner(Scheme):
         if not self._zones:
             return planes
         near = self._zones.planes(in_force, qp.reach_m + self._clearances.planned_clear_m)
-        # A vehicle that is nearer to a zone already need only come no nearer.
+        # A vehicle that is too near to a zone already only has to come no nearer.
         bound = np.minimum(self._clearances.planned_clear_m, near.away_m - 1e-4)
         bound += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
@@ -483,8 +485,8 @@ class MissionPlanner(Scheme):
             np.concatenate([planes.other, np.full(len(near.at), self._state.possible.count)]),
         )
 
-    def _blocker(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
-        """Constraint that holds a motion back most, in words."""
+    def _limiting_constraint(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
+        """Constraint that limits a motion most, in words."""
         position = self._qp.at_times(*solved)
         spare_m = np.einsum("ij,ij->i", planes.normal, position[planes.time]) - planes.bound
         binding = planes.other[spare_m < BINDS_M]
@@ -497,12 +499,13 @@ class MissionPlanner(Scheme):
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
-        """Which motions of others one comes too near to, ever, and last whether it does a zone.
+        """Flags of the others' motions that a motion comes too near to at any time; the last flag
+        is for zones.
 
         Args:
             row: row of the vehicle.
             motion: its motion, by its own steps.
-            planned: the same, by the steps in common.
+            planned: the same, by common steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
@@ -520,8 +523,8 @@ class MissionPlanner(Scheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a way through points comes too near to a zone; from one that it begins in, or is
-        too near to already, it may only come out.
+        """Whether a polyline comes too near to a zone; a zone that it starts in or too near to
+        may only be left.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

@@ -1,14 +1,14 @@
-"""Motions that vehicles may be flying, side by side, with what is uncertain of each.
+"""Possible motions of all vehicles in arrays, with their uncertainty.
 
-Where each vehicle is on its motion the server knows to within the error of the step that it counts
-(`clock.StepError`). Between two vehicles only the sum of both counts, and it is that of one number:
-by how many steps the other one is further on its motion, or less far, than the server counts. So
-one of the two is taken at a step, and the other anywhere between two steps: a swept piece of its
-way, which is longer the faster it flies, and a point where it rests.
+The server knows the position of each vehicle on its motion up to the error of the step that it
+counts (`clock.StepError`). Between two vehicles only the sum of both errors matters: the number of
+steps by which the other one may be ahead or behind. So one vehicle is taken at its counted step,
+and the other anywhere between two steps: a swept piece of its path, longer the faster it flies, and
+a point when it rests.
 
-In space a vehicle that hears nothing lands after a while. From the first step at which it may, it
-may be anywhere between its motion, which is at rest by then, and the ground. So in the end any two
-motions have to be apart side by side.
+In three dimensions a vehicle without contact lands after a while. From the first step at which it
+may, it may be anywhere between its motion, which is at rest by then, and the ground. So in the end
+any two motions have to be apart horizontally.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.common.clock import EXACT, StepError
-from skytether.server.missions.compiled_motion import Metric, bounding_box, last_step
+from skytether.server.missions.compiled_motion import MotionMetric, bounding_box, last_step
 from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, making_kernel, making_part, part
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, Motion
@@ -29,17 +29,17 @@ NEVER = 2**62
 
 
 class PossibleMotion(NamedTuple):
-    """Motion that a vehicle may be flying, by the steps that all vehicles have in common."""
+    """Motion that a vehicle may be flying, by common steps."""
 
     motion: Motion
     lands: int = NEVER
     """First step at which the vehicle may begin to land."""
     error: StepError = EXACT
-    """Error of the step that is counted for the vehicle."""
+    """Error of the step counted for the vehicle."""
 
 
 class MotionArrays(NamedTuple):
-    """Possible motions side by side; shapes (capacity, …)."""
+    """Possible motions in arrays; shapes (capacity, …)."""
 
     first: I1
     """Step of the first knot."""
@@ -50,32 +50,32 @@ class MotionArrays(NamedTuple):
     lands: I1
     """First step at which the vehicle may begin to land."""
     extra: F1
-    """Distance kept from this motion beyond that from others [m]."""
+    """Distance to keep from this motion beyond that from others [m]."""
     early: F1
-    """Error of the vehicle's steps, see `clock.StepError`."""
+    """Largest number of steps by which the vehicle is ahead, see `clock.StepError`."""
     late: F1
-    """Error of the vehicle's steps the other way."""
+    """Largest number of steps by which it is behind."""
     position: F3
     """Positions of the knots [m]; shape (capacity, KNOTS, axes)."""
     velocity: F3
     """Velocities of the knots [m/s]; shape (capacity, KNOTS, axes)."""
     low: F2
-    """Corner of a box around the whole motion, scaled [m]; shape (capacity, axes)."""
+    """Lower corner of a box around the whole motion, scaled [m]; shape (capacity, axes)."""
     high: F2
-    """Opposite corner."""
+    """Upper corner of that box."""
 
 
 class PossibleMotions:
-    """All motions that vehicles may be flying. Those of a vehicle are replaced when they change.
+    """All motions that vehicles may be flying; those of a vehicle are replaced when they change.
 
     Args:
-        scale: see `Metric`; shape (axes,).
+        scale: see `MotionMetric`; shape (axes,).
         dt_s: length of a step [s].
     """
 
     def __init__(self, scale: Array, dt_s: float) -> None:
         self.count = 0
-        self.metric = Metric(scale, dt_s)
+        self.metric = MotionMetric(scale, dt_s)
         capacity, axes = 64, len(scale)
         numbers, floats = np.zeros((4, capacity), dtype=np.int64), np.zeros((3, capacity))
         knots, corners = np.zeros((2, capacity, KNOTS, axes)), np.zeros((2, capacity, axes))
@@ -93,7 +93,7 @@ class PossibleMotions:
         Args:
             row: row of the vehicle.
             motion: its motion.
-            extra_m: distance kept from this motion beyond that from others [m].
+            extra_m: distance to keep from this motion beyond that from others [m].
         """
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
@@ -106,7 +106,7 @@ class PossibleMotions:
         """Replace the errors of all vehicles' steps.
 
         Args:
-            early, late: by row, see `clock.StepError`; shape (capacity,).
+            early, late: errors by row, see `clock.StepError`; shape (capacity,).
         """
         n, rows = self.count, self.rows
         self.arrays.early[:n], self.arrays.late[:n] = early[rows], late[rows]
@@ -130,9 +130,14 @@ def motion_at(arrays: MotionArrays, m: int) -> PossibleMotion:
 
 @part
 def write(
-    arrays: MotionArrays, m: int, row: int, motion: PossibleMotion, extra: float, metric: Metric
+    arrays: MotionArrays,
+    m: int,
+    row: int,
+    motion: PossibleMotion,
+    extra: float,
+    metric: MotionMetric,
 ) -> None:
-    """Write a motion at index m, see `PossibleMotions.add`."""
+    """Store a motion at index m, see `PossibleMotions.add`."""
     position, velocity = motion.motion.position, motion.motion.velocity
     n, axes = position.shape
     arrays.first[m], arrays.knots[m], arrays.row[m] = motion.motion.first, n, row
@@ -148,15 +153,22 @@ def write(
 
 @kernel
 def _add(
-    arrays: MotionArrays, m: int, row: int, motion: PossibleMotion, extra: float, metric: Metric
+    arrays: MotionArrays,
+    m: int,
+    row: int,
+    motion: PossibleMotion,
+    extra: float,
+    metric: MotionMetric,
 ) -> None:
-    """Write a motion at index m."""
+    """Compiled `write`."""
     write(arrays, m, row, motion, extra, metric)
 
 
 @making_kernel
-def _remove(arrays: MotionArrays, count: int, row: int, metric: Metric) -> int:
-    """Remove the motions of a vehicle, the last ones taking their places; the number left."""
+def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
+    """Remove the motions of a vehicle by moving the last ones into their places; returns the
+    number left.
+    """
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1
@@ -178,11 +190,11 @@ def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) 
 
 @part
 def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
-    """Height of one vehicle above another that counts, each of which may be on its way down.
+    """Height difference of two vehicles that counts as distance, if each may be landing.
 
     Args:
-        height: of the motion of the first above that of the second; negative below it [m].
-        one_lands, other_lands: whether the first, and the second, may be landing, and so anywhere
+        height: height of the first motion above the second [m]; may be negative.
+        one_lands, other_lands: whether the first or second vehicle may be landing, and so anywhere
             below its motion.
     """
     if (one_lands and height > 0.0) or (other_lands and height < 0.0):
@@ -192,12 +204,12 @@ def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
 
 @part
 def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
-    """Least and most steps by which another vehicle may be further on than it is counted, when one
-    vehicle is where it is counted.
+    """Bounds of the steps by which another vehicle may be ahead, relative to one vehicle's counted
+    step.
 
     Args:
         one, other: errors of their steps.
-        drift: what is added, for the time for which both are looked ahead [steps].
+        drift: added for the drift of the clocks over the time looked ahead [steps].
     """
     return -other.late - one.early - drift, other.early + one.late + drift
 
@@ -206,12 +218,12 @@ def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float
 def moving_shifts(
     other: Motion, begin: float, end: float, least: float, most: float
 ) -> tuple[float, float]:
-    """Part of the shifts from `least` to `most` in which another motion is ever elsewhere.
+    """Part of the shifts from `least` to `most` that changes where another motion is.
 
     Args:
         other: the motion.
-        begin, end: steps between which it is looked at.
-        least, most: steps by which it may be further on.
+        begin, end: steps between which it is evaluated.
+        least, most: bounds of the steps by which it may be ahead.
     """
     last = last_step(other)
     return min(max(least, other.first - end), most), max(min(most, last - begin), least)

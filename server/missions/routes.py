@@ -1,8 +1,8 @@
-"""Ways around zones: the shortest line from a place to a goal that keeps its distance from them.
+"""Routes around zones: the shortest polyline from a position to a goal that keeps its distance.
 
-The nodes of a visibility graph stand off the corners of zones; two that see each other are joined
-by the straight line between them. Shortest ways between all of them are found once (Floyd and
-Warshall). Ways are level: zones wholly above or below a vehicle and its goal are in no way.
+The nodes of a visibility graph lie off the corners of zones; two nodes are joined if the straight
+line between them is clear. Shortest paths between all nodes are computed once (Floyd and Warshall).
+Paths are horizontal: zones entirely above or below both position and goal are ignored.
 """
 
 from functools import lru_cache
@@ -14,21 +14,22 @@ from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.zones import Zones
 
 NODES_MAX = 200
-"""Largest number of nodes; the corners of zones with more are left out, the sharpest last."""
+"""Largest number of nodes; beyond it the corners of further zones are left out, the sharpest
+last."""
 OFF_M = 0.1
-"""Distance of nodes from corners beyond that which is kept [m]."""
+"""Distance of nodes from corners beyond the clearance [m]."""
 GRAPHS_MAX = 64
-"""Largest number of graphs that are kept, each of the zones at some heights."""
+"""Largest number of cached graphs, each for the zones at some heights."""
 TINY_M = 1e-6
 """Rounding tolerance."""
 
 
 class Routes:
-    """Ways around zones.
+    """Routes around zones.
 
     Args:
-        zones: what is in the way.
-        clearance_m: distance that a way keeps from them [m].
+        zones: the zones.
+        clearance_m: distance of routes from zones [m].
     """
 
     def __init__(self, zones: Zones, clearance_m: float) -> None:
@@ -36,10 +37,10 @@ class Routes:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """The shortest way: its corners, and the goal behind them; that alone where there is none.
+        """Shortest route: its corners, then the goal; only the goal if there is no route.
 
         Args:
-            place, goal: shape (axes,).
+            place, goal: positions; shape (axes,).
 
         Returns:
             shape (n, axes); n >= 1.
@@ -52,12 +53,12 @@ class Routes:
         return points
 
     def reaches(self, place: Array, goal: Array) -> bool:
-        """Whether there is a way; shapes (axes,)."""
+        """Whether there is a route; shapes (axes,)."""
         graph = self._graph(self._heights(place, goal))
         return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
 
     def _heights(self, place: Array, goal: Array) -> tuple[bool, ...]:
-        """Flags of the zones at heights between those of two places."""
+        """Flags of the zones at heights between those of two positions."""
         if len(place) < 3:
             return (True,) * len(self._zones.zones)
         low, high = sorted((float(place[2]), float(goal[2])))
@@ -68,9 +69,11 @@ class Routes:
         )
 
     def _make(self, heights: tuple[bool, ...]) -> "Graph":
-        there = zip(self._zones.zones, heights, strict=True)
+        flagged = zip(self._zones.zones, heights, strict=True)
         level = [
-            zone._replace(low_m=-np.inf, high_m=np.inf) for zone, is_there in there if is_there
+            zone._replace(low_m=-np.inf, high_m=np.inf)
+            for zone, is_between in flagged
+            if is_between
         ]
         return Graph(Zones(level), self._clearance_m)
 
@@ -79,8 +82,8 @@ class Graph:
     """Visibility graph in the plane.
 
     Args:
-        zones: what is in the way, of any height.
-        clearance_m: distance that a way keeps from them [m].
+        zones: the zones, taken as infinitely high.
+        clearance_m: distance of routes from zones [m].
     """
 
     def __init__(self, zones: Zones, clearance_m: float) -> None:
@@ -104,11 +107,13 @@ class Graph:
             far = np.where(longer, far[:, [via]] + far[[via]], far)
             after = np.where(longer, after[:, [via]], after)
         self._far, self._after = far, after
-        """Length of the shortest way between two nodes, infinite without one [m], and the node that
-        comes next on it."""
+        """Length of the shortest path between two nodes, infinite without one [m], and the next
+        node on it."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest way between two places; none where there is no way."""
+        """Corners of the shortest path between two positions; empty if there is none or it is
+        straight.
+        """
         here, there, nodes = place[None], goal[None], self._nodes
         if not len(nodes) or self.sees(here, there)[0]:
             return nodes[:0]
@@ -122,18 +127,20 @@ class Graph:
         return nodes[path]
 
     def sees(self, here: Array, there: Array) -> Flags:
-        """Whether straight lines keep their distance; shape (n,), of two of shape (n, 2)."""
+        """Whether straight lines keep their clearance; shape (n,), for points of shape (n, 2)."""
         return are_clear(self._zones, here, there, self._clearance_m - TINY_M)
 
     def _lengths(self, here: Array) -> Array:
-        """Distances of nodes from a place, infinite of those that it does not see; shape (n,)."""
+        """Distances of nodes from a position, infinite if not joined by a clear line; shape
+        (n,).
+        """
         nodes = self._nodes
         sees = self.sees(np.repeat(here, len(nodes), axis=0), nodes)
         return np.where(sees, np.linalg.norm(nodes - here, axis=1), np.inf)
 
 
 def _nodes(zones: Zones, off_m: float) -> Array:
-    """Places off the corners of zones, outward on the line that halves each [m]; shape (n, 2)."""
+    """Positions off the corners of zones, on both sides along the bisector [m]; shape (n, 2)."""
     points = [np.zeros((0, 2))]
     for zone in zones.zones:
         corners = zone.corners
@@ -148,6 +155,6 @@ def _nodes(zones: Zones, off_m: float) -> Array:
         straight = size[:, 0] < 1e-6
         halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
         size[straight] = 1.0
-        # Both ways: one of them is where vehicles may be.
+        # On both sides: vehicles may be on either.
         points += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
     return np.concatenate(points)

@@ -1,4 +1,4 @@
-"""Distances between motions at every time: whether one comes too near to what others may fly."""
+"""Separation: whether a motion comes too near to the motions that others may fly."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from skytether.server.missions.compiled_motion import (
     Extent,
-    Metric,
+    MotionMetric,
     bounding_box,
     extent_of,
     last_step,
@@ -29,7 +29,7 @@ from skytether.shared.law.model import ALTITUDE, Flags
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 NEARER_M = 1e-3
-"""Tolerance of a solver for motions that are too near already: they may come so much nearer [m]."""
+"""Tolerance for motions that are too near already: a solver may bring them nearer by this [m]."""
 
 
 class Pair(NamedTuple):
@@ -37,24 +37,24 @@ class Pair(NamedTuple):
 
     one: PossibleMotion
     other: PossibleMotion
-    metric: Metric
+    metric: MotionMetric
 
 
 class Span(NamedTuple):
-    """Piece of time for which one motion is compared with another."""
+    """Time interval in which one motion is compared with another."""
 
     begin: float
-    """Step at which it begins."""
+    """First step."""
     end: float
-    """Step at which it ends; the same where the one motion rests."""
+    """Last step; equal to the first if the one motion rests."""
     least: float
-    """Least number of steps by which the other one may be further on."""
+    """Least number of steps by which the other one may be ahead."""
     most: float
-    """Most of them."""
+    """Largest number of steps by which it may be ahead."""
     descends: bool
-    """Whether who flies the one motion may be landing."""
+    """Whether the one vehicle may be landing."""
     other_descends: bool
-    """Whether who flies the other one may be landing."""
+    """Whether the other vehicle may be landing."""
 
 
 def too_near(
@@ -65,17 +65,17 @@ def too_near(
     possible: PossibleMotions,
     distance_m: float,
 ) -> Flags:
-    """Possible motions to which a planned one may come too near, from a step on for ever.
+    """Flags of the possible motions to which a planned one may come too near from a step on.
 
     Args:
         planned: the planned motion.
-        in_force: motion of the same vehicle that is in force. Where that is nearer already, and not
-            only by what pieces are off a motion, the planned one need only come no nearer by
+        in_force: motion in force of the same vehicle. If that is too near already (not only by the
+            error of straight pieces), the planned one must come no nearer than it by more than
             NEARER_M: it may always fly away.
-        begin: step from which on.
-        row: row of the vehicle, whose own motions do not count.
+        begin: first step that counts.
+        row: row of the vehicle, whose own motions are left out.
         possible: motions of all vehicles.
-        distance_m: distance that is kept from them [m].
+        distance_m: distance to keep from them [m].
 
     Returns:
         shape (possible.count + 1,); the last, which is for zones, is False.
@@ -93,7 +93,7 @@ def _too_near(
     begin: int,
     row: int,
     others: MotionArrays,
-    metric: Metric,
+    metric: MotionMetric,
     distance: float,
     is_near: B1,
 ) -> None:
@@ -114,16 +114,19 @@ def comes_too_near(
     begin: int,
     others: MotionArrays,
     m: int,
-    metric: Metric,
+    metric: MotionMetric,
     distance: float,
     scratch: F2,
 ) -> bool:
-    """Whether a planned motion comes too near to a possible one; see `too_near`.
+    """Whether a planned motion comes too near to one possible motion; see `too_near`.
 
     Args:
+        planned, in_force, begin: see `too_near`.
         others, m: all possible motions, and the index of this one.
-        scratch: its last two rows are the corners of a box around the planned motion [m]; shape
-            (6, axes).
+        metric: scaling of distances.
+        distance: distance to keep [m].
+        scratch: its last two rows are the corners of a box around the planned motion [m]; shape (6,
+            axes).
     """
     keep, sides = distance + others.extra[m], scratch[:4]
     if is_beyond(others, m, scratch[4], scratch[5], keep):
@@ -132,9 +135,9 @@ def comes_too_near(
     least = _least_distance(Pair(planned, other, metric), begin, keep, sides)
     if least >= keep:
         return False
-    # The bounds of both motions are compared, or they would come nearer by what these are off,
-    # again and again. Where a vehicle may land a bound may be off by more than bends, so one that
-    # only looks nearer has to keep the distance.
+    # The bounds of both motions are compared; otherwise they could come nearer by the error of the
+    # pieces again and again. If a vehicle may land, a bound may be wrong by more than the
+    # curvature, so a motion that only seems to be too near has to keep the distance.
     before = Pair(PossibleMotion(in_force, planned.lands, planned.error), other, metric)
     if least < _least_distance(before, begin, keep, sides) - NEARER_M:
         return True
@@ -145,10 +148,12 @@ def comes_too_near(
 
 @part
 def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
-    """Bound from below of the distance of two motions from a step on, or `limit` if more [m].
+    """Lower bound of the distance of two motions from a step on, at most `limit` [m].
 
     Args:
-        limit: distances above it need not be told apart [m].
+        pair: the motions.
+        begin: first step that counts.
+        limit: largest distance of interest [m].
         sides: scratch; shape (4, axes).
     """
     one, other, metric = pair.one, pair.other, pair.metric
@@ -171,8 +176,8 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
             nearest = min(nearest, within)
             i += 1
             continue
-        # With each piece the middles come no nearer than by what both fly, and what is swept may
-        # grow by a piece: that is less than twice as much.
+        # With each piece the midpoints approach by no more than both fly, and the sweep may grow by
+        # a piece: together less than twice as much.
         skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
         i = max(i + 1, min(i + skipped, pieces))
     return max(nearest, 0.0)
@@ -180,15 +185,15 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
 
 @part
 def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
-    """Bound from above of the distance of two motions from a step on, or `limit` if more [m].
+    """Upper bound of the distance of two motions from a step on, at most `limit` [m].
 
-    It is the least distance at some steps, a piece apart, and for some errors of these: each is one
-    that the two may come to.
+    It is the least distance at some steps, a piece apart, and for some of their errors, each of
+    which is possible.
     """
     one, other, metric = pair.one, pair.other, pair.metric
     least, most = shifts(one.error, other.error, 0.0)
     piece = SPACING / SAMPLES
-    # At the last step both rest, and are down if they ever land.
+    # At the last step both rest, and have landed if they ever do.
     last = max(last_step(one.motion), last_step(other.motion) - least)
     pieces = max(int(np.ceil((last - begin) / piece)), 0) + 1
     nearest = limit
@@ -213,7 +218,7 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
 
 @part
 def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
-    """Difference of two motions on an axis, the other one so many steps further on, scaled [m]."""
+    """Difference of two motions on an axis, the other one shifted by some steps, scaled [m]."""
     dt_s = pair.metric.dt_s
     here = position_at(pair.one.motion, x, step, dt_s)
     return pair.metric.scale[x] * (here - position_at(pair.other.motion, x, step + shift, dt_s))
@@ -221,9 +226,8 @@ def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
 
 @part
 def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float) -> Span:
-    """Piece of time number `i` from a step on: one piece after the other while the one motion
-    lasts, then all the time until the other rests too, and then the time when both have landed that
-    ever do.
+    """Time interval number `i` from a step on: first the pieces until the one motion ends, then
+    all the time until the other rests too, then the time when all that ever land have landed.
     """
     other, lands, other_lands = pair.other.motion, pair.one.lands, pair.other.lands
     last = last_step(other)
@@ -240,10 +244,12 @@ def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float
 
 @part
 def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
-    """Distance of the middles of two motions in a piece of time [m].
+    """Distance of the midpoints of two motions in a time interval [m].
 
     Args:
-        lands: whether any of the two ever does: then heights do not count.
+        pair: the motions.
+        span: the interval.
+        lands: whether either may ever land, so that heights do not count.
     """
     square = 0.0
     middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
@@ -257,26 +263,27 @@ def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
 def _least_distance_within(
     pair: Pair, span: Span, extent: Extent, other_extent: Extent, sides: F2
 ) -> float:
-    """Bound from below of the distance of two motions in a piece of time [m].
+    """Lower bound of the distance of two motions in a time interval [m].
 
-    The shift of the other one goes in slices no longer than a piece. In one of them the difference
-    of the two motions is p + t a + s b + t s c for t and s from -1/2 to 1/2, where c is small: a
-    parallelogram, and |c| / 4 at most off that.
+    The shift of the other one is divided into slices no longer than a piece. In a slice the
+    difference of the two motions is p + t a + s b + t s c for t and s from -1/2 to 1/2, with c
+    small: a parallelogram, with an error of at most |c| / 4.
     """
     swept = span.most - span.least
     slices = max(int(np.ceil(swept * SAMPLES / SPACING)), 1)
     nearest = np.inf
     for j in range(slices):
-        here, there = span.least + swept * j / slices, span.least + swept * (j + 1) / slices
+        shift, next_shift = span.least + swept * j / slices, span.least + swept * (j + 1) / slices
         for x in range(len(pair.metric.scale)):
-            p00 = _difference(pair, span.begin, here, x)
-            p10 = _difference(pair, span.end, here, x)
+            p00 = _difference(pair, span.begin, shift, x)
+            p10 = _difference(pair, span.end, shift, x)
             p01, p11 = p00, p10
             if swept > 0.0:
-                p01 = _difference(pair, span.begin, there, x)
-                p11 = _difference(pair, span.end, there, x)
+                p01 = _difference(pair, span.begin, next_shift, x)
+                p11 = _difference(pair, span.end, next_shift, x)
             if x == ALTITUDE:
-                # Who may pass the height of the other in this piece may do so anywhere in it.
+                # A vehicle that may pass the other's height in this interval may do so anywhere in
+                # it.
                 high, low = max(p00, p10, p01, p11), min(p00, p10, p01, p11)
                 if (span.descends and high > 0.0) or (span.other_descends and low < 0.0):
                     p00, p10, p01, p11 = 0.0, 0.0, 0.0, 0.0
@@ -292,7 +299,7 @@ def _least_distance_within(
 def _distance_from_parallelogram(sides: F2) -> float:
     """Lower bound of the distance from the origin to the points p + t a + s b + t s c.
 
-    Both t and s go from -1/2 to 1/2. The bound is the distance to the parallelogram, less |c| / 4.
+    Both t and s go from -1/2 to 1/2. The bound is the distance to the parallelogram minus |c| / 4.
 
     Args:
         sides: p, a, b and c; shape (4, axes).
@@ -307,7 +314,7 @@ def _distance_from_parallelogram(sides: F2) -> float:
         t, s = (ab * pb - bb * pa) / det, (ab * pa - aa * pb) / det
         if abs(t) <= 0.5 and abs(s) <= 0.5:
             least = pp + t * pa + s * pb
-    # Nearest points of the four sides.
+    # Nearest points on the four sides.
     for end in (-0.5, 0.5):
         s = min(max(-(pb + end * ab) / bb, -0.5), 0.5) if bb > 0.0 else 0.0
         square = pp + end * end * aa + s * s * bb + 2.0 * (end * pa + s * pb + end * s * ab)

@@ -1,20 +1,20 @@
-"""The QP of one motion of a vehicle that keeps apart from others.
+"""Trajectory QP: the QP for one motion of a vehicle that keeps away from others.
 
-Until it differs from the motion in force it is that motion. From there on it is planned over the
+The beginning of the motion equals the motion in force. After that it is planned over the
 accelerations a_n between knots T apart, for n = 0 … N-1,
 
     min  Σ w_n |p_n - g|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
 
-with g what it aims at, and a half-plane for each motion and each zone that is near, and each time,
+with the target g, and a half-plane for each near motion and zone and each time,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
-where q is that motion, or the zone's nearest point, and p̃ the motion in force. It fulfils all of
-them, so there is always a solution.
+where q is that motion, or the zone's nearest point, and p̃ the motion in force. That fulfils all
+constraints, so there is always a solution.
 
-A vehicle that is far from all others has no half-planes, and then no constraint joins two axes:
-`solve_axes` solves one after the other. Its numbers are those of `solve`, to the last bit: there a
-term of another axis only ever adds 0.
+For a vehicle far from all others there are no half-planes, and no constraint couples the axes:
+`solve_axes` solves them one by one. Its result equals that of `solve` to the last bit, where the
+terms of other axes only add 0.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ import numpy as np
 from skytether.server.missions.dual_active_set import (
     SOLVED,
     DualActiveSet,
-    Workspace,
+    DualWorkspace,
     solve_qp,
     workspace,
 )
@@ -35,17 +35,17 @@ from skytether.shared.law.motion import INTERVALS, SPACING
 from skytether.shared.law.terms import Terms
 
 TIMES_PER_INTERVAL = 2
-"""Number of times in each interval at which distances are kept."""
+"""Number of times per interval at which distances are kept."""
 INPUT_SHARE = 0.9
-"""Share of the bound of the input that a motion may use."""
+"""Share of the input bound that a motion may use."""
 ACCELERATION_WEIGHT = 0.05
-"""Weight r on accelerations [s⁴]."""
+"""Weight r of accelerations [s⁴]."""
 LAST_WEIGHT = 5.0
-"""Weight w_N on the last position; the others are 1."""
+"""Weight w_N of the last position; the others are 1."""
 
 
 class QPConstants(NamedTuple):
-    """All QPs of motions have these in common."""
+    """Constants of all motion QPs."""
 
     T: float
     """Time from one knot of a motion to the next [s]."""
@@ -56,15 +56,15 @@ class QPConstants(NamedTuple):
     weights: F1
     """Weights w_n of positions; shape (N,)."""
     to_position: F2
-    """Positions of the knots by accelerations [s²]; shape (N, N)."""
+    """Positions of the knots from accelerations [s²]; shape (N, N)."""
     times: F1
-    """Times at which distances are kept, in intervals; shape (times,)."""
+    """Times at which distances are kept [intervals]; shape (times,)."""
     to_sample: F2
-    """Positions at these times by accelerations [s²]; shape (times, N)."""
+    """Positions at these times from accelerations [s²]; shape (times, N)."""
 
 
 class AxisProblem(NamedTuple):
-    """QPs of single axes, and scratch to solve them."""
+    """QPs of single axes, and scratch arrays for solving them."""
 
     root: F3
     """Jᵀ of each axis, see `DualActiveSet`; shape (axes, N, N)."""
@@ -73,16 +73,16 @@ class AxisProblem(NamedTuple):
     linear: F1
     bounds: F1
     x: F1
-    scratch: Workspace
+    scratch: DualWorkspace
 
 
 class TrajectoryQP:
-    """Solver of the QP of one motion.
+    """Solver of the QP for one motion.
 
     Args:
-        terms: the rule of flight.
+        terms: terms of the flight.
         acceleration_mps2: largest acceleration on an axis, a_max [m/s²].
-        speed_mps: largest speed over all axes [m/s]; 0: as the bound of the input allows.
+        speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
     """
 
     def __init__(self, terms: Terms, acceleration_mps2: float, speed_mps: float) -> None:
@@ -91,14 +91,14 @@ class TrajectoryQP:
         tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
         most = INPUT_SHARE * np.array(terms.u_max) * gain
         if speed_mps:
-            # On each axis alone, so that the constraints stay linear: on the diagonal it is exact,
-            # along an axis cautious.
+            # A bound per axis keeps the constraints linear: exact on the diagonal, cautious along
+            # an axis.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         place = np.arange(n)
         to_velocity = T * np.tril(np.ones((n, n)))
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * TIMES_PER_INTERVAL + 1) / TIMES_PER_INTERVAL
-        """Times at which distances are kept, in intervals from where the plan begins."""
+        """Times at which distances are kept, from the begin of the plan [intervals]."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         hessian = to_position.T @ (weights[:, None] * to_position)
@@ -110,15 +110,14 @@ class TrajectoryQP:
         self.constants = QPConstants(
             T, acceleration_mps2, most, weights, to_position, self.times, to_sample
         )
-        """Numbers that all QPs have in common."""
-        # The input at the end of each interval, and at its begin: v ± within what it can do.
+        # Bounds of the input v + τ a at the end and at the begin of each interval.
         ends = [to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
         before = np.vstack([np.zeros(n), to_velocity[:-1]])
         begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
         both = np.vstack([np.eye(n * axes), _blocks(ends), _blocks(begins)])
         fixed = np.vstack([_blocks([to_velocity[-1:]] * axes), both, -both])
         self._fixed = np.ascontiguousarray(fixed.T)
-        """Columns of the constraints that are always there."""
+        """Columns of the constraints that are always present."""
         self._axes = axes
         of_axis = [range(x * n, (x + 1) * n) for x in range(axes)]
         # In the order of `_fill_axis`.
@@ -139,18 +138,18 @@ class TrajectoryQP:
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
-        """Largest distance between two motions from one state at those times [m]."""
+        """Largest distance at these times between two motions from the same state [m]."""
 
     def solve(
         self, kept_p: Array, kept_v: Array, goal: Array, planes: HalfPlanes | None = None
     ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots, those of the motion in force first; None without a
-        solution.
+        """Positions and velocities of the knots, starting with those of the motion in force; None
+        without a solution.
 
         Args:
-            kept_p, kept_v: knots of the motion in force, the last one where the plan begins
-                [m, m/s]; shape (kept, axes).
-            goal: what it aims at, g [m]; shape (axes,).
+            kept_p, kept_v: knots of the motion in force up to the begin of the plan [m, m/s]; shape
+                (kept, axes).
+            goal: target g [m]; shape (axes,).
             planes: constraints on positions at `times`.
         """
         kept = len(kept_p)
@@ -170,18 +169,17 @@ class TrajectoryQP:
     def problem(
         self, p0: Array, v0: Array, goal: Array, planes: HalfPlanes | None
     ) -> tuple[Array, Array, Array]:
-        """The QP of `DualActiveSet`: linear term, columns of the constraints, and their bounds.
+        """QP for `DualActiveSet`: linear term, columns of the constraints, and their bounds.
 
         Args:
-            p0, v0: state where the plan begins [m, m/s]; shape (axes,).
+            p0, v0: state at the begin of the plan [m, m/s]; shape (axes,).
             goal, planes: see `solve`.
         """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
         bounds = np.empty(fixed + (len(planes.time) if planes else 0))
         _fill_qp(self.constants, p0, v0, goal, linear, bounds)
-        # The constraints that are always there are kept as columns, and half-planes are put behind
-        # them.
+        # Half-planes follow the constraints that are always present.
         if planes and len(planes.time):
             columns = np.empty((variables, len(bounds)))
             columns[:, :fixed] = self._fixed
@@ -189,7 +187,7 @@ class TrajectoryQP:
         return linear, columns, bounds
 
     def at_times(self, position: Array, velocity: Array) -> Array:
-        """Positions at `times` of knots that `solve` returned [m]; shape (times, axes)."""
+        """Positions at `times` of knots returned by `solve` [m]; shape (times, axes)."""
         position, velocity = position[-INTERVALS - 1 :], velocity[-INTERVALS - 1 :]
         accelerations = np.diff(velocity, axis=0) / self.constants.T
         drifting = position[0] + self.times[:, None] * self.constants.T * velocity[0]
@@ -199,7 +197,7 @@ class TrajectoryQP:
 
 @kernel
 def _fill_qp(constants: QPConstants, p0: F1, v0: F1, goal: F1, linear: F1, bounds: F1) -> None:
-    """Fill in the linear term, and the bounds of the constraints that are always there."""
+    """Fill in the linear term, and the bounds of the constraints that are always present."""
     axes = len(p0)
     for x in range(axes):
         _fill_axis(constants, x, p0[x], v0[x], goal[x], linear, bounds, x, axes)
@@ -217,13 +215,13 @@ def _fill_axis(
     at: int,
     axes: int,
 ) -> None:
-    """Fill in linear term and bounds of axis x, number `at` of the axes of a QP."""
+    """Fill in linear term and bounds of axis x, which is number `at` of a QP's axes."""
     n, a, most = len(constants.weights), constants.acceleration, constants.most[x]
     bounds[at] = -v
     for i in range(n):
         linear[at * n + i] = 0.0
-        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and at the begins
-        # of intervals, each from below and then from above.
+        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and begins of
+        # intervals, each lower and then upper bound.
         for group, limit in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
             bounds[axes + (group * axes + at) * n + i] = limit
     for j in range(n):
@@ -237,13 +235,13 @@ def _fill_axis(
 def solve_axes(
     constants: QPConstants, problem: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
 ) -> bool:
-    """Fill in the knots of a motion that nothing is near; whether there is one.
+    """Fill in the knots of a motion without half-planes; returns whether there is a solution.
 
     Args:
         constants, problem: see `TrajectoryQP`.
-        kept: number of knots that are given, those of the motion in force.
-        goal: what it aims at, g [m]; shape (axes,).
-        position, velocity: the knots, those that are given first [m, m/s]; shape (kept + N, axes).
+        kept: number of given knots, those of the motion in force.
+        goal: target g [m]; shape (axes,).
+        position, velocity: knots, the given ones first [m, m/s]; shape (kept + N, axes).
     """
     linear, bounds = problem.linear, problem.bounds
     for x in range(len(goal)):
@@ -266,17 +264,17 @@ def _integrate_axis(
     position: F2,
     velocity: F2,
 ) -> None:
-    """Fill in the knots of an axis by its accelerations, which begin at `first`."""
+    """Fill in the knots of an axis from its accelerations, which begin at index `first`."""
     n = len(constants.weights)
     p0, v0 = position[kept - 1, x], velocity[kept - 1, x]
     gained, moved = 0.0, 0.0
     for i in range(n):
         knot = kept + i
         gained += constants.T * accelerations[first + i]
-        # The last velocity is 0 to within the tolerance of the solver, and a motion has to end at
+        # The last velocity is 0 only within the solver's tolerance, but a motion has to end at
         # rest.
         velocity[knot, x] = v0 + gained if i < n - 1 else 0.0
-        # Positions of what is flown: that velocity, whatever the solver's tolerance has left.
+        # Positions follow from these velocities, whatever error the solver's tolerance has left.
         moved += 0.5 * constants.T * (velocity[knot, x] + velocity[knot - 1, x])
         position[knot, x] = p0 + moved
 
@@ -285,7 +283,7 @@ def _integrate_axis(
 def _append_half_planes(
     constants: QPConstants, p0: F1, v0: F1, planes: HalfPlanes, columns: F2, bounds: F1
 ) -> None:
-    """Fill in the last columns and bounds, those of half-planes."""
+    """Fill in the columns and bounds of half-planes, which come last."""
     n, fixed = len(constants.weights), len(bounds) - len(planes.time)
     for m in range(len(planes.time)):
         at = planes.time[m]
@@ -302,25 +300,25 @@ def _append_half_planes(
 def _integrate(
     constants: QPConstants, accelerations: F1, kept: int, position: F2, velocity: F2
 ) -> None:
-    """Fill in the knots behind those that are kept, by the accelerations."""
+    """Fill in the planned knots from the accelerations."""
     n = len(constants.weights)
     for x in range(position.shape[1]):
         _integrate_axis(constants, accelerations, x * n, x, kept, position, velocity)
 
 
 def _positions(times: Array, place: Indices, T: float) -> Array:
-    """Position by accelerations of intervals at times, in intervals [s²]; shape (times, n)."""
+    """Positions from accelerations of intervals, at times in intervals [s²]; shape (times, n)."""
     into = np.clip(times[:, None] - place, 0.0, None)
     inside = np.minimum(into, 1.0)
     moved: Array = T * T * (0.5 * inside**2 + inside * (into - inside))
     return moved
 
 
-def _blocks(parts: list[Array]) -> Array:
-    """Matrix with these along its diagonal."""
-    rows, columns = (sum(each.shape[axis] for each in parts) for axis in (0, 1))
+def _blocks(blocks: list[Array]) -> Array:
+    """Block-diagonal matrix."""
+    rows, columns = (sum(block.shape[axis] for block in blocks) for axis in (0, 1))
     whole, row, column = np.zeros((rows, columns)), 0, 0
-    for each in parts:
-        whole[row : row + len(each), column : column + each.shape[1]] = each
-        row, column = row + len(each), column + each.shape[1]
+    for block in blocks:
+        whole[row : row + len(block), column : column + block.shape[1]] = block
+        row, column = row + len(block), column + block.shape[1]
     return whole

@@ -1,4 +1,4 @@
-"""Distances of straight lines from zones, compiled."""
+"""Clearance of straight lines from zones, compiled."""
 
 import numpy as np
 
@@ -12,23 +12,24 @@ is_near = shared(outlines.is_near)
 
 
 def comes_near(zones: Zones, points: Array, clearance_m: float) -> bool:
-    """Whether straight lines from point to point come nearer to a zone than this, or touch one.
+    """Whether straight lines from point to point come nearer to a zone than a clearance, or touch
+    one.
 
     Args:
-        zones: may be none.
+        zones: may be empty.
         points: at least two [m]; shape (n, axes).
-        clearance_m: distance that is to be kept [m].
+        clearance_m: distance to keep [m].
     """
     return _comes_near(zones.outlines, points, clearance_m)
 
 
 def are_clear(zones: Zones, here: Array, there: Array, clearance_m: float) -> Flags:
-    """Whether straight lines in the plane keep this distance from zones, of any height.
+    """Whether straight lines in the plane keep a clearance from zones, of any height.
 
     Args:
-        zones: may be none.
-        here, there: where they begin and end [m]; shape (n, 2).
-        clearance_m: distance that is to be kept [m].
+        zones: may be empty.
+        here, there: start and end of each line [m]; shape (n, 2).
+        clearance_m: distance to keep [m].
 
     Returns:
         shape (n,).
@@ -40,7 +41,7 @@ def are_clear(zones: Zones, here: Array, there: Array, clearance_m: float) -> Fl
 
 @kernel
 def _comes_near(outlines: Outlines, points: F2, clearance: float) -> bool:
-    """See `comes_near`."""
+    """Compiled `comes_near`."""
     for i in range(len(points) - 1):
         if _line_comes_near(outlines, points[i], points[i + 1], clearance):
             return True

@@ -321,7 +321,7 @@ class Raid:
         self._servers += 1
         entropy = stream(self._scenario.seed, "entropy", self._servers).bytes
         boot_id, room = BOOT_ID + self._servers, len(self._goals.vehicles)
-        self._server = Server(self._kept, boot_id=boot_id, entropy=entropy, room=room)
+        self._server = Server(self._kept, boot_id=boot_id, entropy=entropy, capacity=room)
         self._running = Running(self._server, self._kept)
         return self._server
 

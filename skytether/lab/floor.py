@@ -108,7 +108,7 @@ def fly_aboard(scenario: Scenario) -> Rows:
         known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
         spline = SplineFollower(constants, desired[k : k + 2].swapaxes(0, 1), 1, 1)
         wanted, told = spline.input_at(0, known.predicted, known.disturbance, u).tolist()
-        flown = clamped(wanted, u.tolist(), terms.u_max, change_max, told=told)
+        flown = clamped(wanted, u.tolist(), terms.u_max, change_max, without_feedback=told)
         assert flown is not None
         u = np.array(flown)
         row["state"], row["measured"] = flies.truth(), known.measured

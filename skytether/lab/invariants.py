@@ -20,7 +20,7 @@ from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
 from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
-from skytether.server.gate import Call, Gate, WayBack
+from skytether.server.gate import Call, Gate, ReplyPath
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import ALTITUDE, Array
@@ -138,12 +138,12 @@ class _Noted:
 
     __slots__ = ("_life", "_up", "_vehicle", "inner")
 
-    def __init__(self, line: WayBack, vehicle: int, life: int, up: Ledger) -> None:
+    def __init__(self, line: ReplyPath, vehicle: int, life: int, up: Ledger) -> None:
         self.inner = line
         self._vehicle, self._life, self._up = vehicle, life, up
 
     def seal(self, payload: bytes) -> bytes:
-        """See `WayBack`."""
+        """See `ReplyPath`."""
         self._up.seal(self._vehicle, payload, self._life)
         return self.inner.seal(payload)
 

@@ -324,7 +324,7 @@ class Torture:
             boot_id=self._boot_id(),
             entropy=entropy,
             gate=self._gate,
-            room=len(self._keyring),
+            capacity=len(self._keyring),
         )
         return Steady(self._server)
 

@@ -256,7 +256,7 @@ class Run:
         failure = next((client.failure for client in self._clients if client.failure), None)
         if failure:
             failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
-        told = {str(each.vehicle - self._before): each.told() for each in self._clients}
+        told = {str(each.vehicle - self._before): each.vehicle_figures() for each in self._clients}
         figures = {
             "server": server_figures,
             "netem": self.netem.figures(),
@@ -330,7 +330,7 @@ def _fly(
         boot_id=BOOT_ID,
         entropy=entropy,
         gate=_gate(keyring, entropy),
-        room=len(seeds) * vehicles,
+        capacity=len(seeds) * vehicles,
         recorder=recorder,
         plans=plans,
         stopwatch=stopwatch,

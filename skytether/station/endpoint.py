@@ -179,7 +179,7 @@ class Station(Endpoint):
             case "STATUSTEXT" if text := self._texts.take(message):
                 shown = "".join(each if each.isprintable() else "?" for each in text)
                 if message.severity <= dialect.MAV_SEVERITY_WARNING:
-                    launch.heard_words(shown)
+                    launch.hear_text(shown)
                 self._events.append(
                     AutopilotText(vehicle=VEHICLE, text=shown, severity=message.severity)
                 )

@@ -63,7 +63,7 @@ def flown(count: int, *, together: bool) -> Rows:
     # Ticks 7 ms into the vehicles' steps: no horizon comes at the very instant that a step begins.
     server = world.add(
         "server",
-        Server(GUSTY, boot_id=1, entropy=stream(1, "entropy").bytes, room=count),
+        Server(GUSTY, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=count),
         clock=Clock(13_000_000),
     )
     netem = world.add("netem", Proxy(GUSTY, server=server))

@@ -317,7 +317,7 @@ def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> 
     for _ in range(3):
         server.wake()
     assert server.rows()["age_ns"].tolist() == [-1, *(n * server.dt_ns for n in (1, 2, 3))]
-    assert server.client.told()["age_ms"] == 150.0
+    assert server.client.vehicle_figures()["age_ms"] == 150.0
 
 
 def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(

@@ -665,7 +665,7 @@ def test_the_last_clamp_bounds_value_and_change(
     wanted: list[float], flown: list[float] | None
 ) -> None:
     """From 0.8 and 0.2 m/s, at most 1.6 m/s, and 1 m/s a step; nothing of what is not finite."""
-    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, told=wanted) == flown
+    assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, without_feedback=wanted) == flown
 
 
 def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
@@ -674,7 +674,7 @@ def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
     def slowed(wanted: list[float], speed_max: float) -> list[float] | None:
         """Input without feedback, after slowing down."""
         at_rest, loose = [0.0, 0.0], [9.0, 9.0]
-        return clamped(wanted, at_rest, loose, 9.0, told=wanted, speed_max=speed_max)
+        return clamped(wanted, at_rest, loose, 9.0, without_feedback=wanted, speed_max=speed_max)
 
     assert slowed([3.0, 4.0], 2.5) == pytest.approx([1.5, 2.0])
     assert slowed([3.0, 4.0], 5.0 - 1e-12) == [3.0, 4.0]
@@ -686,10 +686,10 @@ def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
     stays.
     """
     loose = [0.0, 0.0], [9.0, 9.0], 9.0
-    flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
+    flown = clamped([2.0, 4.0], *loose, without_feedback=[3.0, 4.0], speed_max=2.5)
     assert flown == pytest.approx([0.5, 2.0])
-    assert clamped([2.0, 4.0], *loose, told=[0.0, 0.0], speed_max=0.0) == [2.0, 4.0]
-    assert clamped([2.0, 4.0], *loose, told=[np.nan, 0.0], speed_max=0.0) is None
+    assert clamped([2.0, 4.0], *loose, without_feedback=[0.0, 0.0], speed_max=0.0) == [2.0, 4.0]
+    assert clamped([2.0, 4.0], *loose, without_feedback=[np.nan, 0.0], speed_max=0.0) is None
 
 
 @pytest.mark.parametrize("clamps", [True, False])

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lives import Lives, Restart
-from skytether.client.memory import FlownMotion, Kept, Memory, age_max_ns, recall
-from skytether.client.vehicle import Frame
+from skytether.client.memory import ClientMemory, FlownMotion, SavedState, age_max_ns, recall
+from skytether.client.vehicle import VehicleMemory
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import BegunAnew, ModeChanged
@@ -24,12 +24,12 @@ TERMS = SWAP.terms()
 NOW_NS = 50 * SECOND_NS
 KNOTS = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
 MOTION = FlownMotion(step=200, observed=180, spacing=10, numbers=KNOTS.tobytes())
-KEPT = Kept(
+KEPT = SavedState(
     boot_id=2**64 - 1,
     began_ns=38 * SECOND_NS,
     heard_ns=49 * SECOND_NS,
     motion=MOTION,
-    frame=Frame(armed=True, origin=(20.0, -12.0, 0.5), boot_ms=61_000, at_ns=NOW_NS),
+    frame=VehicleMemory(armed=True, origin=(20.0, -12.0, 0.5), boot_ms=61_000, at_ns=NOW_NS),
 )
 
 
@@ -75,7 +75,7 @@ def test_without_its_memory_two_vehicles_come_nearer_than_asked_for() -> None:
 def test_what_is_kept_comes_back_as_it_was_by_whichever_clock_it_was_written() -> None:
     """Times are kept relative to that of writing."""
     for written_ns in (0, NOW_NS, 10**6 * NOW_NS):
-        found = Kept.decode(KEPT.after(written_ns).encode(written_ns), NOW_NS, axes=2)
+        found = SavedState.decode(KEPT.after(written_ns).encode(written_ns), NOW_NS, axes=2)
         assert found == KEPT.after(NOW_NS)
     assert (MOTION.knots(2) == KNOTS).all()
 
@@ -88,13 +88,13 @@ def test_what_was_kept_too_long_ago_counts_as_lost_but_for_the_vehicles_own_part
     content = KEPT.encode(NOW_NS)
     assert recall(content, NOW_NS, NOW_NS, TERMS) == KEPT
     lost = recall(content, NOW_NS, NOW_NS + passed_ns, TERMS)
-    assert lost == Kept(frame=KEPT.frame)
+    assert lost == SavedState(frame=KEPT.frame)
 
 
 def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_armed() -> None:
     """Its clock has begun anew, so neither step 0 nor the age of the origin is known."""
     lost = recall(KEPT.encode(NOW_NS), None, NOW_NS, TERMS)
-    assert lost == Kept(frame=Frame(armed=True))
+    assert lost == SavedState(frame=VehicleMemory(armed=True))
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,8 @@ def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_
         {"motion": msgspec.structs.replace(MOTION, numbers=b"\xff" * 48)},
         {"motion": msgspec.structs.replace(MOTION, spacing=0)},
         {"motion": msgspec.structs.replace(MOTION, step=-1)},
-        {"frame": Frame(origin=(float("nan"), 0.0, 0.0))},
-        {"frame": Frame(origin=(1e9, 0.0, 0.0))},
+        {"frame": VehicleMemory(origin=(float("nan"), 0.0, 0.0))},
+        {"frame": VehicleMemory(origin=(1e9, 0.0, 0.0))},
     ],
 )
 def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object]) -> None:
@@ -119,19 +119,19 @@ def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object
     if wrong == {"boot_id": 2**64}:
         return  # msgpack cannot hold it
     with pytest.raises(ValueError, match=r".+"):
-        Kept.decode(wrong_kept.encode(0), 0, axes=2)
+        SavedState.decode(wrong_kept.encode(0), 0, axes=2)
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused_or_are_something_kept(content: bytes) -> None:
     """No other exception comes out of them."""
     with contextlib.suppress(ValueError):
-        assert isinstance(Kept.decode(content, 0, axes=2), Kept)
+        assert isinstance(SavedState.decode(content, 0, axes=2), SavedState)
 
 
 def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
     """Else it would forget a motion that the next life follows."""
-    memory = Memory(TERMS, 1, None)
+    memory = ClientMemory(TERMS, 1, None)
     assert memory.may_tell(KEPT, now_ns=NOW_NS)  # there is nothing yet that would be followed
     assert memory.keep(KEPT, now_ns=NOW_NS) is not None
     memory.kept()
@@ -146,7 +146,7 @@ def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
 
 def test_a_disk_that_fails_keeps_a_vehicle_silent_only_until_the_file_on_it_is_too_old() -> None:
     """From then on no next life would follow it."""
-    memory = Memory(TERMS, 1, KEPT)
+    memory = ClientMemory(TERMS, 1, KEPT)
     assert memory.boot_id == KEPT.boot_id
     newer = msgspec.structs.replace(KEPT, motion=None)
     assert memory.may_tell(KEPT, now_ns=NOW_NS)
@@ -157,7 +157,7 @@ def test_a_disk_that_fails_keeps_a_vehicle_silent_only_until_the_file_on_it_is_t
 
 def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_each_step() -> None:
     """Twice a minute, where the bound is 60 s."""
-    memory, writes = Memory(TERMS, 1, None), 0
+    memory, writes = ClientMemory(TERMS, 1, None), 0
     for step in range(60 * 20):
         now_ns = NOW_NS + step * TERMS.dt_ns
         heard = msgspec.structs.replace(KEPT, heard_ns=now_ns)

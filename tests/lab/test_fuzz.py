@@ -90,7 +90,7 @@ def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> N
     assert dropped >= {Drop.UNKNOWN_SESSION, Drop.FOR_ANOTHER_LIFE}
     assert dropped & {Drop.FROM_THE_FUTURE, Drop.OBSERVATION, Drop.TOO_OLD}
     assert dropped & set(IMPLAUSIBLE.values())
-    assert flight.client.told()["step"] > 20
+    assert flight.client.vehicle_figures()["step"] > 20
 
 
 def test_strangers_are_kept_out_at_every_place() -> None:
@@ -101,7 +101,7 @@ def test_strangers_are_kept_out_at_every_place() -> None:
     assert {*at_server} >= {Drop.NOT_SEALED, Drop.LENGTH, Drop.FORGED, Drop.REPLAYED}
     assert {*at_server} >= {Drop.UNKNOWN_CHANNEL, Drop.UNKNOWN_KEY, Drop.NOT_FOR_A_SERVER}
     assert {*at_newcomer} >= {Drop.UNASKED, Drop.LENGTH, Drop.NOT_FOR_A_CLIENT}
-    assert strangers.client.told()["step"] > 20
+    assert strangers.client.vehicle_figures()["step"] > 20
 
 
 def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
@@ -111,7 +111,10 @@ def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
     holder, rng, came = Holder(), Random(1), set()
     for _ in range(400):
         holder(holder.next(rng))
-        came |= {bool(holder.server.sessions.coming), holder.client._session.number is not None}
+        came |= {
+            bool(holder.server.sessions.welcomed_vehicles),
+            holder.client._session.number is not None,
+        }
     dropped = {*holder.server.dropped, *holder.client.dropped}
     assert came == {False, True}
     assert dropped >= {Drop.FORGED, Drop.OUT_OF_PLACE, Drop.FIELD}

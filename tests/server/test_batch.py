@@ -232,7 +232,7 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     def crowded(self: Desired, *given: Any) -> None:
         """Room for two pages."""
         init(self, *given)
-        self._held[3:] = 2**62
+        self._keys[3:] = 2**62
         made.append(self)
 
     monkeypatch.setattr(Desired, "__init__", crowded)
@@ -244,7 +244,7 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
         simulation={"compute_s": 0.0},
     )
     assert_as_alone(flown, (1, 2))
-    assert [2**62 in each._held for each in made] == [False] * 3
+    assert [2**62 in each._keys for each in made] == [False] * 3
 
 
 def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:

@@ -132,7 +132,7 @@ def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
         expected = [truth(start) for start in (steps + ahead).tolist()]
         np.testing.assert_array_equal(window(desired, steps, ahead), expected)
         pages |= set(((steps + ahead) // PAGE).tolist())
-        assert EMPTY in desired._held
+        assert EMPTY in desired._keys
     assert len(pages) > 2 * PAGES
 
 
@@ -337,7 +337,7 @@ def test_each_vehicle_has_a_trajectory_of_its_own(preview: float | str) -> None:
         for row in rows.tolist():
             expected = truth(k + row % 5, straight(BLOCK - row))
             np.testing.assert_allclose(found[row], expected, rtol=0, atol=1e-9)
-        assert EMPTY in desired._held
+        assert EMPTY in desired._keys
 
 
 def test_a_row_that_another_vehicle_takes_has_its_trajectory() -> None:

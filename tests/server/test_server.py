@@ -77,7 +77,11 @@ class Vehicles:
         self.sink = io.BytesIO()
         recorder = Recorder(server_columns(flown.model.axes, flown.control.scheme), self.sink)
         self.server = Server(
-            flown, boot_id=boot_id, entropy=stream(1, "entropy").bytes, room=room, recorder=recorder
+            flown,
+            boot_id=boot_id,
+            entropy=stream(1, "entropy").bytes,
+            capacity=room,
+            recorder=recorder,
         )
         # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
@@ -462,7 +466,7 @@ def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
     awake = [tick for tick in range(60) if tick not in slept]
     found = []
     for tick in awake:
-        assert grid.take(tick * dt_ns) == tick * dt_ns
+        assert grid.next_tick(tick * dt_ns) == tick * dt_ns
         found += [tick] * grid.degraded
     assert found == degraded
     assert grid.missed == sum(late.values())
@@ -622,7 +626,7 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
                 sessions.expire(now_ns)
         for session in sessions:
             assert not keeps or kept.setdefault(session.row, session.vehicle) == session.vehicle
-        assert len(sessions) + len(sessions.coming) <= 3
+        assert len(sessions) + len(sessions.welcomed_vehicles) <= 3
         assert len(sessions.rows) == len(sessions)
 
 
