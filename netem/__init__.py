@@ -1,1 +1,1 @@
-"""Network emulator: the bad network between the two, a UDP proxy that never reads its packets."""
+"""Network emulator: a UDP proxy that delays, loses and reorders packets without reading them."""

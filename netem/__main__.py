@@ -24,8 +24,8 @@ from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
-"""Number of new objects after which garbage is collected: packets under way are no garbage, and the
-default of 700 objects looks through all of them many times a second."""
+"""Number of new objects after which garbage is collected: queued packets are no garbage, and the
+default of 700 would scan all of them many times a second."""
 
 
 @dataclass(frozen=True)
@@ -33,33 +33,32 @@ class NetemOptions(ProcessOptions):
     """Options of `skytether netem`."""
 
     bind: str = "127.0.0.1:47000"
-    """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host stands in brackets,
-    as in [::1]:47000; its socket hears IPv6 alone, even that of [::]. A name means its IPv4
-    address, if it has one."""
+    """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
+    brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
+    address if it has one."""
     server: str = "127.0.0.1:47001"
-    """HOST:PORT of the server, of the same family as the clients' addresses or not."""
+    """HOST:PORT of the server; its address family may differ from the clients'."""
     uplink: str | None = None
-    """Impairments of packets from the server to clients: impairments joined by &, as in
-    "constant(0.05) & loss(0.1)", see `skytether impairments`. In place of the scenario's; where
-    only one of uplink and downlink is given, the other passes everything at once."""
+    """Impairments of packets from the server to clients, joined by &, as in "constant(0.05) &
+    loss(0.1)", see `skytether impairments`. They replace the scenario's; if only one of uplink and
+    downlink is given, the other has no impairments."""
     downlink: str | None = None
     """Impairments of packets from clients to the server, written as for uplink."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
-    """Most clients at once, each of which takes a socket: 512 unless given, or as many as the
-    system allows."""
+    """Largest number of clients at once, each of which takes a socket; by default 512, or as many
+    as the system allows."""
 
 
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
 
-    It carries any UDP. Clients send to --bind in place of the server, and need to know no more:
+    It carries any UDP. Clients send to --bind instead of the server:
 
         skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --uplink "constant(0.05)"
             --downlink "gamma(0.02, 0.08, 0.03) & loss(0.05) & rate(125000, queue=30000)"
 
-    SIGUSR1 prints the counters so far; they are also printed at the end. With --control,
-    `skytether set` changes directions meanwhile. Without --uplink and
-    --downlink the network is the scenario's.
+    SIGUSR1 prints the counters so far; they are also printed at the end. With --control, `skytether
+    set` changes the impairments meanwhile. Without --uplink and --downlink they are the scenario's.
     """
     gc.set_threshold(COLLECT_AFTER)
     options = _with_directions(
@@ -81,38 +80,38 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     Raises:
         ConfigError: the scenario cannot be flown with it.
     """
-    laid = options.config
+    config = options.config
     if not (options.uplink is None and options.downlink is None):
         directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
-        laid = reading.with_directions(laid, directions)
+        config = reading.with_directions(config, directions)
     source = f"{options.scenario} and the command line"
-    return replace(options, config=reading.check(reading.to_table(laid), source))
+    return replace(options, config=reading.check(reading.to_table(config), source))
 
 
 def _check_server(server: Address, bind: Address) -> None:
-    """Refuse a server that is netem itself.
+    """Refuse netem itself as the server.
 
     Raises:
         CommandError: packets would circulate.
     """
-    with suppress(OSError):  # an address that cannot be found is reported when it is used
+    with suppress(OSError):  # an unknown host is reported when it is used
         if leads_back(server, bind):
             at = address_text(*server)
             said = f"--server: got {at}, which is netem itself; expected the address of a server"
             raise command.CommandError(said, command.CONFIGURATION)
 
 
-def _flows(given: int | None) -> int:
-    """Largest number of clients at once; smaller than FLOWS_MAX, and printed, where the system
-    allows no more.
+def _flows(requested: int | None) -> int:
+    """Largest number of clients at once; if the system allows fewer than FLOWS_MAX, this is
+    printed.
 
     Raises:
-        CommandError: so many cannot be.
+        CommandError: the system does not allow the given number.
     """
-    flows = max(1, min(FLOWS_MAX, sockets_max())) if given is None else given
+    flows = max(1, min(FLOWS_MAX, sockets_max())) if requested is None else requested
     command.check_count("--flows", flows, 65_536)
     command.check_sockets("--flows", flows)
-    if given is None and flows < FLOWS_MAX:
+    if requested is None and flows < FLOWS_MAX:
         print(
             f"netem: room for {flows} clients instead of {FLOWS_MAX}: {files_max()} files may be "
             "open here (ulimit -n)",

@@ -1,8 +1,7 @@
-"""A bottleneck: packets of all flows go through a finite rate one after the other, and wait.
+"""Bottleneck: packets of all flows pass a finite rate one after another, and queue for it.
 
-It is a server of one packet at a time, driven by time: a packet that enters goes at once where
-nobody is served, and else waits in a queue of so many bytes. Sizes are those on the wire, with the
-headers of IP and UDP.
+It serves one packet at a time: a packet that enters is served at once if it is idle, otherwise it
+waits in a queue of limited bytes. Sizes include the headers of IP and UDP.
 """
 
 from bisect import bisect_left
@@ -17,10 +16,10 @@ from skytether.shared.scenario.air.queues import Deliveries, Queued
 from skytether.shared.scenario.air.traces import DELIVERY_BYTES
 
 QUANTUM_BYTES = 300
-"""Bytes that each flow may send in its turn, where flows are served fairly [B]: a few small
-packets; a longer one waits some turns for it."""
+"""Bytes that each flow may send per turn under fair queueing [B]: a few small packets; a larger
+packet waits for several turns."""
 TARGET_NS, INTERVAL_NS = 5 * MILLISECOND_NS, 100 * MILLISECOND_NS
-"""CoDel's parameters: time in the queue that is fine, and time to react to more (RFC 8289) [ns]."""
+"""CoDel's parameters: acceptable time in the queue, and time to react to more (RFC 8289) [ns]."""
 
 T = TypeVar("T")
 
@@ -31,14 +30,16 @@ class Waiting(Generic[T]):
 
     item: T
     size: int
-    """Bytes on the wire [B]."""
+    """Bytes including headers [B]."""
     flow: int
     entered_ns: int
 
 
 @dataclass(slots=True)
 class Codel:
-    """Controlled delay, RFC 8289: drops packets that have waited, ever faster, until waits fall."""
+    """Controlled delay, RFC 8289: drops packets that waited too long, increasingly often, until
+    waits fall.
+    """
 
     above_ns: int = 0
     """Time at which waits will have been too long for INTERVAL_NS; 0 while they are not."""
@@ -52,7 +53,8 @@ class Codel:
         """Whether to drop the packet at the front.
 
         Args:
-            is_fine: whether it has not waited too long, or nearly nothing waits behind it.
+            now_ns: time now.
+            is_fine: whether it has not waited too long, or hardly anything waits behind it.
         """
         late = False
         if is_fine:
@@ -71,8 +73,7 @@ class Codel:
             self.drop_ns += round(INTERVAL_NS / sqrt(self.count))
             return True
         self.dropping = True
-        # Soon after the last drops it goes on at about the rate that was reached there, as RFC 8289
-        # says.
+        # Shortly after the last drops it continues at about the drop rate reached there (RFC 8289).
         recent = now_ns - self.drop_ns < 16 * INTERVAL_NS
         self.count = max(1, self.count - self.last_count) if recent else 1
         self.last_count = self.count
@@ -81,8 +82,8 @@ class Codel:
 
 
 @dataclass(slots=True)
-class WaitingLine(Generic[T]):
-    """Packets that wait in one line: all of a direction, or those of a flow."""
+class FlowQueue(Generic[T]):
+    """Queue of a direction, or of one flow under fair queueing."""
 
     packets: "deque[Waiting[T]]" = field(default_factory=deque)
     bytes: int = 0
@@ -95,33 +96,36 @@ class Bottleneck(Generic[T]):
     """Serves packets at a finite rate.
 
     Args:
-        queue: rate, room and order of serving.
+        queue: rate, capacity and discipline.
     """
 
     def __init__(self, queue: Queued) -> None:
         self._queue = queue
         self._is_fair = queue.serve == "fair"
-        self._lines: OrderedDict[int, WaitingLine[T]] = OrderedDict()
-        """Lines in which packets wait, that whose turn it is first."""
+        self._lines: OrderedDict[int, FlowQueue[T]] = OrderedDict()
+        """Queues with waiting packets, the next to be served first."""
         self._served: Waiting[T] | None = None
         self._done_ns = 0
-        """Time at which the packet that is served has passed."""
+        """Time at which the packet being served has passed."""
         self._largest = 0
         self.waiting = 0
-        """Number of packets that wait, without the one that is served."""
+        """Number of waiting packets, without the one being served."""
         self.waiting_bytes = 0
-        """Size of these packets on the wire [B]."""
+        """Size of the waiting packets, headers included [B]."""
         self.dropped: list[T] = []
-        """Dropped packets; the caller that counts them takes them out."""
+        """Dropped packets; the caller counts and removes them."""
         self._pace: _Rate | _Deliveries = (
             _Deliveries(queue) if isinstance(queue, Deliveries) else _Rate(queue.bytes_per_s)
         )
 
-    def take(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
-        """Take a packet that enters; call `give` for the packets that passed before it first.
+    def accept(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
+        """Add a packet; call `release` for the packets that passed before it first.
 
         Args:
-            size: its bytes on the wire [B].
+            item: the packet.
+            size: its bytes including headers [B].
+            flow: number of its flow.
+            now_ns: time now.
         """
         packet = Waiting(item, size, flow, now_ns)
         self._largest = max(self._largest, size)
@@ -129,20 +133,20 @@ class Bottleneck(Generic[T]):
             self._serve(packet, now_ns)
             return
         key = flow if self._is_fair else 0
-        line = self._lines.get(key)
-        if line is None:
-            line = self._lines[key] = WaitingLine(credit=QUANTUM_BYTES)
-        line.packets.append(packet)
+        queue = self._lines.get(key)
+        if queue is None:
+            queue = self._lines[key] = FlowQueue(credit=QUANTUM_BYTES)
+        queue.packets.append(packet)
         self._count(key, packet, 1)
         while self.waiting_bytes > self._queue.room_bytes:
-            # The flow that fills the room loses its newest packet, and no other flow pays for it.
-            longest = max(self._lines, key=lambda each: self._lines[each].bytes)
+            # The flow with the longest queue loses its newest packet, at no other flow's expense.
+            longest = max(self._lines, key=lambda flow_key: self._lines[flow_key].bytes)
             last = self._lines[longest].packets.pop()
             self._count(longest, last, -1)
             self.dropped.append(last.item)
 
-    def give(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
-        """Packets that have passed by now, each with the time at which it has [ns]."""
+    def release(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
+        """Packets that have passed by now, each with the time at which it did [ns]."""
         while self._served is not None and self._done_ns <= now_ns:
             item, at_ns = self._served.item, self._done_ns
             self._served = None
@@ -156,8 +160,8 @@ class Bottleneck(Generic[T]):
         return None if self._served is None else self._done_ns
 
     def drain(self) -> Iterator[Waiting[T]]:
-        """All packets within, in order of entry; the bottleneck is empty then."""
-        lines = [packet for line in self._lines.values() for packet in line.packets]
+        """Remove and return all packets, in order of entry."""
+        lines = [packet for queue in self._lines.values() for packet in queue.packets]
         served = [] if self._served is None else [self._served]
         self._lines.clear()
         self._served, self.waiting, self.waiting_bytes = None, 0, 0
@@ -168,74 +172,74 @@ class Bottleneck(Generic[T]):
         self._done_ns = self._pace.done_ns(now_ns, packet.size)
 
     def _next(self, now_ns: int) -> Waiting[T] | None:
-        """The packet to serve next, without those that CoDel drops before it."""
+        """Next packet to be served, after those that CoDel drops."""
         while self.waiting:
-            key, line = next(iter(self._lines.items()))
-            # Deficit round robin: a line that has used up its credit goes to the end, with a new
+            key, queue = next(iter(self._lines.items()))
+            # Deficit round robin: a queue that has used up its credit goes to the end with a new
             # quantum.
-            if self._is_fair and line.credit <= 0:
-                line.credit += QUANTUM_BYTES
+            if self._is_fair and queue.credit <= 0:
+                queue.credit += QUANTUM_BYTES
                 self._lines.move_to_end(key)
                 continue
-            packet = line.packets.popleft()
-            line.credit -= packet.size
+            packet = queue.packets.popleft()
+            queue.credit -= packet.size
             self._count(key, packet, -1)
-            if self._queue.drop == "tail" or not self._is_late(line, packet, now_ns):
+            if self._queue.drop == "tail" or not self._is_late(queue, packet, now_ns):
                 return packet
             self.dropped.append(packet.item)
         return None
 
-    def _is_late(self, line: WaitingLine[T], packet: Waiting[T], now_ns: int) -> bool:
-        """Whether CoDel drops a packet that was next in its line."""
+    def _is_late(self, queue: FlowQueue[T], packet: Waiting[T], now_ns: int) -> bool:
+        """Whether CoDel drops the packet at the front of a queue."""
         waited_ns = now_ns - packet.entered_ns
-        # At a low rate one packet alone takes longer than 5 ms, and would be dropped for it.
+        # At a low rate a single packet takes longer than 5 ms, and would be dropped for it.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
-        # With a packet or less behind it, dropping would leave the line idle.
-        is_fine = waited_ns < target_ns or line.bytes <= self._largest
-        return line.codel.drops(now_ns, is_fine=is_fine)
+        # With at most one packet behind it, dropping would leave the bottleneck idle.
+        is_fine = waited_ns < target_ns or queue.bytes <= self._largest
+        return queue.codel.drops(now_ns, is_fine=is_fine)
 
     def _count(self, key: int, packet: Waiting[T], one: int) -> None:
-        """Count a packet that has entered a line (1) or left it (-1)."""
-        line = self._lines[key]
-        line.bytes += one * packet.size
+        """Count a packet that entered (1) or left (-1) a queue."""
+        queue = self._lines[key]
+        queue.bytes += one * packet.size
         self.waiting_bytes += one * packet.size
         self.waiting += one
-        # Its credit goes with it: a flow cannot save up turns while it is silent.
-        if self._is_fair and not line.packets:
+        # Its credit is lost: a silent flow cannot save up turns.
+        if self._is_fair and not queue.packets:
             del self._lines[key]
 
 
 class _Rate:
-    """Pace of a constant rate [B/s]."""
+    """Constant rate [B/s]."""
 
     def __init__(self, bytes_per_s: float) -> None:
         self._bytes_per_s = bytes_per_s
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet has passed that is served from now on."""
+        """Time at which a packet has passed whose service starts now."""
         return now_ns + round(size / self._bytes_per_s * SECOND_NS)
 
 
 class _Deliveries:
-    """Pace of a file of mahimahi, over and over, from the first packet on.
+    """Rate of a mahimahi file, repeated, starting with the first packet.
 
-    Packets share the bytes of a delivery; what nobody waits for is lost.
+    Packets share the bytes of a delivery opportunity; unused bytes are lost.
     """
 
     def __init__(self, queue: Deliveries) -> None:
         self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in queue.times_s]
         self._began_ns: int | None = None
         self._used_bytes = 0
-        """Bytes of the deliveries so far that are used, or lost."""
+        """Bytes of the deliveries so far that were used or lost."""
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet has passed that is served from now on."""
+        """Time at which a packet has passed whose service starts now."""
         if self._began_ns is None:
             self._began_ns = now_ns
         times_ns = self._times_ns
         rounds, at_ns = divmod(now_ns - self._began_ns, times_ns[-1])
         before = rounds * len(times_ns) + bisect_left(times_ns, at_ns)
-        # Deliveries that passed while nobody waited are lost, as in mahimahi.
+        # Deliveries that passed while nothing waited are lost, as in mahimahi.
         self._used_bytes = max(self._used_bytes, before * DELIVERY_BYTES) + size
         rounds, last = divmod(ceil(self._used_bytes / DELIVERY_BYTES) - 1, len(times_ns))
         return max(now_ns, self._began_ns + rounds * times_ns[-1] + times_ns[last])

@@ -1,14 +1,14 @@
-"""Fates of packets: how long each is delayed, which are lost, and what else befalls them.
+"""Fates of packets: delay, loss, and other impairments of each packet.
 
-Each direction has a list of impairments (`shared.scenario.air`), which write into the fate of a
-packet one after the other. A fate depends on the seed, the direction, the flow and the slot in
-which the packet enters, and on nothing that was sent before: so two controllers meet the same
-network, however often each of them sends. Of packets that enter in one slot each has a fate of its
-own, by its rank among them: the three CLOSEs that are sent at once are not lost all together.
-Control traffic is so sparse that nearly every packet is the first of its slot.
+Each direction has a list of impairments (`shared.scenario.air`), which modify the fate of a packet
+one after another. A fate depends on the seed, the direction, the flow and the time slot in which
+the packet enters, but not on earlier packets: so two controllers meet the same network, however
+often each of them sends. Packets that enter in the same slot have different fates, by their rank in
+it: three CLOSEs sent at once are not all lost together. Control traffic is so sparse that nearly
+every packet is the first of its slot.
 
-An impairment of a plug-in that raises an exception, or asks for what cannot be, changes nothing: a
-mistake in it ends no flight.
+An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect: an
+error in it ends no flight.
 """
 
 import traceback
@@ -22,9 +22,9 @@ from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import DirectionConfig
 
 DELAY_MAX_NS = 86_400 * SECOND_NS
-"""Largest delay that a plug-in may ask for [ns]."""
+"""Largest delay that a plug-in may set [ns]."""
 COPIES_MAX = 100
-"""Largest number of copies that a plug-in may ask for."""
+"""Largest number of copies that a plug-in may set."""
 
 
 class Fates:
@@ -42,15 +42,15 @@ class Fates:
         packets = Stream(*at, "packets")
         self._impairments: list[tuple[Impairment, Draws]] = []
         self.fault = ""
-        """Traceback of the first mistake of a plug-in's, or empty."""
+        """Traceback of the first error of a plug-in, or empty."""
         self._guarded = False
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
         for name_, each in direction.path.impairments:
             kinds[each.kind] += 1
             names[name_] += 1
-            # The first delay and the first loss share a pair, so that they keep their numbers
-            # whatever else is added or changed.
+            # The first delay and the first loss use fixed streams, so that their numbers do not
+            # change when others are added or changed.
             if each.kind != "other" and kinds[each.kind] == 1:
                 moments = "moments" if each.kind == "loss" else "moments of the delay"
                 draws = Draws(packets, int(each.kind == "loss"), (*at, moments))
@@ -64,21 +64,21 @@ class Fates:
         """Fate of a packet.
 
         Args:
-            slot: slot in which it enters.
-            rank: number of the packets of the flow that have entered in that slot before it.
+            slot: time slot in which it enters.
+            rank: number of packets of the flow that entered in that slot before it.
         """
         fate = Fate(slot, rank)
-        # Ours are trusted: the copies that guard against a plug-in would be made for every packet.
+        # Our own are trusted: guarding against a plug-in takes a copy per impairment and packet.
         if self._guarded:
-            return self._tried(fate)
+            return self._guarded_fate(fate)
         for impairment, draws in self._impairments:
             impairment(fate, draws)
         return fate
 
-    def _tried(self, fate: Fate) -> Fate:
-        """A fate without what impairments get wrong."""
+    def _guarded_fate(self, fate: Fate) -> Fate:
+        """Fate with the effects of faulty plug-ins left out."""
         for impairment, draws in self._impairments:
-            # A copy: a plug-in that fails half-way has changed nothing.
+            # On a copy: a plug-in that fails half-way must have no effect.
             tried = replace(fate)
             try:
                 impairment(tried, draws)
@@ -89,10 +89,10 @@ class Fates:
 
 
 def _possible(fate: Fate) -> Fate:
-    """Check a fate that a plug-in has changed.
+    """Check a fate after a plug-in.
 
     Raises:
-        ValueError, TypeError: something in it cannot be.
+        ValueError, TypeError: it contains an impossible value.
     """
     if not 0 <= fate.delay_ns <= DELAY_MAX_NS:
         raise ValueError(f"got delay_ns = {fate.delay_ns}, expected 0 to {DELAY_MAX_NS}")
@@ -100,5 +100,5 @@ def _possible(fate: Fate) -> Fate:
         raise ValueError(f"got copies = {fate.copies}, expected 0 to {COPIES_MAX}")
     if fate.flipped is not None and not 0.0 <= fate.flipped < 1.0:
         raise ValueError(f"got flipped = {fate.flipped}, expected a share below 1")
-    # A plug-in may leave a float; the heap of the link compares integers.
+    # A plug-in may set a float; the heap of the link compares integers.
     return replace(fate, delay_ns=int(fate.delay_ns), copies=int(fate.copies))

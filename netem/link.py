@@ -1,6 +1,6 @@
-"""A link: one direction of the network, a bounded queue of packets by due time, and statistics.
+"""Link: one direction of the network, with a bounded queue of packets by due time, and statistics.
 
-packet → bottleneck, where the direction has a finite rate → lost, or delayed → out
+packet → bottleneck, if the direction has a finite rate → lost, or delayed → out
 """
 
 from dataclasses import dataclass, field
@@ -17,19 +17,20 @@ from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 
 QUEUE_MAX = 65536
-"""Largest number of packets under way in one direction; further ones are dropped, not "lost"."""
+"""Largest number of packets queued in one direction; further ones are dropped, and not counted as
+lost."""
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
-"""Largest UDP payload under way in one direction, whatever `network.mtu` lets pass [B]: with both
-directions full, and what Python takes for each packet, netem stays below 256 MiB."""
+"""Largest UDP payload queued in one direction, whatever `network.mtu` allows [B]: with both
+directions full, and Python's overhead, netem stays below 256 MiB."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
-"""Width of the bins in which delays are counted [ns]: the lattice of the paper's delay."""
+"""Bin width of the histogram of delays [ns]: the grid of the paper's delay."""
 DELAY_EDGES_MS = (20, 40, 60, 80, 100, 140, 200, 300, 400, 500, 600, 800, 1000, 2000)
-"""Edges between which delays are counted for those who draw them over time [ms]."""
+"""Bin edges of the coarse histogram of delays for plots over time [ms]."""
 ERROR_BIN_NS = MILLISECOND_NS // 50
-"""Width of the bins in which errors of delays are counted [ns]."""
+"""Bin width of the histogram of delay errors [ns]."""
 QUEUEING_BIN_NS = MILLISECOND_NS
-"""Width of the bins in which times in a queue are counted [ns]."""
+"""Bin width of the histogram of queueing times [ns]."""
 SLICE_BITS = 17
 """Length of a slice of the queue as a power of two [ns]: 0.13 ms, in which 13 of 100 000 packets a
 second are due."""
@@ -42,23 +43,22 @@ class Lane:
     flow: int
     """Number of the flow, from 0."""
     fates: Fates
-    """Fates of its packets."""
     began_ns: int
     """Time at which the flow began [ns]."""
     slot: int = -1
-    """Slot in which its newest packet has entered, counted from when the flow began."""
+    """Time slot of its newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Rank of that packet among those of its slot."""
+    """Rank of that packet in its slot."""
     taken: int = 0
     """Number of packets so far, lost ones included."""
     newest_out: int = -1
     """Highest number of a packet that has left, or -1."""
     latest_ns: int = 0
-    """Time at which the last of its packets is due."""
+    """Due time of the last of its packets."""
 
 
 class Entered(NamedTuple):
-    """A packet that has entered, and waits to pass a finite rate."""
+    """Packet that waits at the bottleneck."""
 
     datagram: Datagram
     lane: Lane
@@ -73,79 +73,79 @@ class Counts:
     """Statistics of one direction."""
 
     packets: int = 0
-    """Packets that entered, whatever became of them."""
+    """Packets that entered."""
     bytes: int = 0
     """UDP payload of these [B]."""
     forwarded: int = 0
     """Packets that have left."""
     lost: int = 0
-    """Packets whose fate was to be lost."""
+    """Packets lost by impairments."""
     reordered: int = 0
     """Packets overtaken by a later one of their flow."""
     oversized: int = 0
     """Packets dropped because they were longer than `network.mtu`."""
     overflowed: int = 0
-    """Packets dropped because QUEUE_MAX or QUEUE_BYTES_MAX were under way."""
+    """Packets dropped because QUEUE_MAX or QUEUE_BYTES_MAX was reached."""
     dropped: int = 0
-    """Packets that the queue of a finite rate has dropped."""
+    """Packets dropped by the bottleneck's queue."""
     duplicated: int = 0
     """Copies of packets."""
     corrupted: int = 0
-    """Packets of which a bit was flipped."""
+    """Packets with a flipped bit."""
     depth_max: int = 0
-    """Largest number of packets that were under way at once."""
+    """Largest number of packets queued at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
     """Delays of forwarded packets, as drawn."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
-    """Times by which forwarded packets left later than drawn."""
+    """Lateness of forwarded packets beyond the drawn delay."""
     queueing: Histogram = field(default_factory=lambda: Histogram(QUEUEING_BIN_NS))
-    """Times that packets took to pass a finite rate, from when they entered."""
+    """Times that packets took to pass the bottleneck."""
 
 
-Held = tuple[int, int, Datagram, int, Lane, int, int, bool]
-"""Packet that is held: due time [ns], order of entry, packet, its size [B], lane, number in the
-lane, delay [ns], and whether it is a copy. The order of entry decides between equal times, so that
-no datagrams are ever compared."""
+QueuedPacket = tuple[int, int, Datagram, int, Lane, int, int, bool]
+"""Queued packet: due time [ns], order of entry, packet, its size [B], lane, number in the lane,
+delay [ns], and whether it is a copy. The order of entry breaks ties, so that datagrams are never
+compared."""
 
 
 class Queue:
-    """Held packets, the one that is due first in front.
+    """Queued packets, earliest due time first.
 
-    One heap of all would be deep and spread over memory: of 44 000 packets, each entry and exit
-    touches a dozen of them. So packets wait unordered in slices of time, and only the first slice
-    is a heap.
+    A single heap would be deep and spread over memory: with 44 000 packets, each entry and exit
+    touches a dozen of them. So packets are kept unordered in slices of time, and only the first
+    slice is a heap.
     """
 
     def __init__(self) -> None:
-        self.front: list[Held] = []
-        """Heap of the first packets; empty only if no packets are held."""
+        self.front: list[QueuedPacket] = []
+        """Heap of the first packets; empty only if the queue is empty."""
         self._slice = 0
-        """Number of the slice in front; packets of earlier ones are in front as well."""
-        self._later: dict[int, list[Held]] = {}
-        """Packets of later slices."""
+        """Number of the first slice; packets of earlier ones are in `front` as well."""
+        self._later: dict[int, list[QueuedPacket]] = {}
+        """Packets of later slices by number."""
         self._slices: list[int] = []
         """Heap of the numbers of later slices."""
         self.size = 0
-        """Number of held packets."""
+        """Number of queued packets."""
 
-    def push(self, held: Held) -> None:
-        """Hold a packet."""
+    def push(self, queued: QueuedPacket) -> None:
+        """Queue a packet."""
         self.size += 1
-        number = held[0] >> SLICE_BITS
+        number = queued[0] >> SLICE_BITS
         if number <= self._slice and self.front:
-            heappush(self.front, held)
+            heappush(self.front, queued)
         elif not self.front:
             self._slice = number
-            self.front.append(held)
+            self.front.append(queued)
         elif number in self._later:
-            self._later[number].append(held)
+            self._later[number].append(queued)
         else:
-            self._later[number] = [held]
+            self._later[number] = [queued]
             heappush(self._slices, number)
 
-    def take_due(self, now_ns: int) -> list[Held]:
-        """Packets that are due, in their order, which are held no longer."""
-        due: list[Held] = []
+    def take_due(self, now_ns: int) -> list[QueuedPacket]:
+        """Remove and return the due packets, in order."""
+        due: list[QueuedPacket] = []
         front = self.front
         while front and front[0][0] <= now_ns:
             if (self._slice + 1) << SLICE_BITS <= now_ns:
@@ -163,13 +163,13 @@ class Queue:
 
 
 class Link:
-    """Holds packets until they are due.
+    """Delays, loses and reorders packets of one direction.
 
     Args:
         direction: UPLINK or DOWNLINK, for the record.
         mtu: longest UDP payload that passes [B].
-        recorder: takes one row a packet, where there is one.
-        path: order and finite rate of the direction.
+        recorder: receives one row per packet; may be None.
+        path: impairments, order and finite rate of the direction.
     """
 
     def __init__(
@@ -188,24 +188,24 @@ class Link:
         self.counts = Counts()
 
     def change(self, path: Path, *, now_ns: int) -> None:
-        """Take another order and rate; packets that wait for a rate are queued anew if they fit."""
+        """Change order and rate; packets waiting at the bottleneck are queued again if they fit."""
         self._pass(now_ns)
-        was, self._path, self._is_ordered = self._path, path, path.is_ordered
-        if path.queue is was.queue:
+        previous, self._path, self._is_ordered = self._path, path, path.is_ordered
+        if path.queue is previous.queue:
             return
         before, self._bottleneck = self._bottleneck, _bottleneck(path)
         for waiting in before.drain() if before else ():
             self._wait(waiting.item, now_ns)
 
-    def take(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> bool:
-        """Take a packet that enters, addressed to where it is to come out.
+    def accept(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> bool:
+        """Accept a packet, addressed to its destination.
 
         Returns:
             whether something may be due because of it: most packets are delayed.
         """
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
-        # Packets of one slot have a rank, for else they would all meet one fate.
+        # Packets in the same slot have a rank; otherwise they would all have the same fate.
         lane.rank = lane.rank + 1 if slot == lane.slot else 0
         lane.slot = slot
         fate = lane.fates.at(slot, lane.rank)
@@ -223,7 +223,7 @@ class Link:
         return True
 
     def _wait(self, entered: Entered, now_ns: int) -> None:
-        """Put a packet into the bottleneck, or delay it at once where there is none."""
+        """Put a packet into the bottleneck, or delay it at once if there is none."""
         bottleneck, size = self._bottleneck, len(entered.datagram.payload)
         if bottleneck is None:
             self._delay(*entered, now_ns)
@@ -231,15 +231,15 @@ class Link:
             self.counts.overflowed += 1
         else:
             flow = entered.lane.flow
-            bottleneck.take(entered, size + HEADER_BYTES, flow, now_ns=now_ns)
+            bottleneck.accept(entered, size + HEADER_BYTES, flow, now_ns=now_ns)
             self._count_dropped(bottleneck)
 
     def _pass(self, now_ns: int) -> None:
-        """Take on what has passed the bottleneck by now."""
+        """Delay the packets that have passed the bottleneck by now."""
         bottleneck = self._bottleneck
         if bottleneck is None:
             return
-        for entered, passed_ns in bottleneck.give(now_ns=now_ns):
+        for entered, passed_ns in bottleneck.release(now_ns=now_ns):
             self.counts.queueing.add(passed_ns - entered.entered_ns)
             self._delay(*entered, passed_ns)
         self._count_dropped(bottleneck)
@@ -259,15 +259,15 @@ class Link:
         entered_ns: int,
         now_ns: int,
     ) -> None:
-        """Lose a packet, or hold it until it is due; it has passed a finite rate now, if any."""
+        """Lose a packet, or queue it until it is due; it has passed the bottleneck by now."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
-        # Behind the bottleneck: a packet that is lost on the way has used the rate all the same.
+        # After the bottleneck: a packet that is lost has used the rate nevertheless.
         if fate.lost:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
-            # In order: what would overtake waits for the packet before it.
+            # In order: a packet that would overtake waits for the one before it.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -288,7 +288,7 @@ class Link:
             is_copy = True
 
     def _is_full(self, size: int) -> bool:
-        """Whether there is no room for another packet of this size."""
+        """Whether a packet of this size does not fit any more."""
         if self._bottleneck is None:
             return self._queue.size >= QUEUE_MAX or self._bytes + size > QUEUE_BYTES_MAX
         return self.depth() >= QUEUE_MAX or self.depth_bytes() + size > QUEUE_BYTES_MAX
@@ -301,17 +301,17 @@ class Link:
                 self._direction, lane.flow, number, size, entered_ns, delay_ns, True, False
             )
 
-    def give(self, *, now_ns: int) -> list[Datagram]:
-        """Remove the packets that are due, and return them."""
+    def release(self, *, now_ns: int) -> list[Datagram]:
+        """Remove and return the packets that are due."""
         self._pass(now_ns)
         queue, counts, recorder = self._queue, self.counts, self._recorder
         out: list[Datagram] = []
         delays_ns: list[int] = []
         errors_ns: list[int] = []
         rows: list[bytes] = []
-        way, pack = self._direction, recorder.pack if recorder else None
-        for held in queue.take_due(now_ns):
-            due_ns, _, datagram, size, lane, number, delay_ns, is_copy = held
+        direction, pack = self._direction, recorder.pack if recorder else None
+        for queued in queue.take_due(now_ns):
+            due_ns, _, datagram, size, lane, number, delay_ns, is_copy = queued
             self._bytes -= size
             overtaken = number < lane.newest_out
             if overtaken:
@@ -322,9 +322,11 @@ class Link:
             errors_ns.append(now_ns - due_ns)
             if pack is not None and not is_copy:
                 flow, entered_ns = lane.flow, due_ns - delay_ns
-                rows.append(pack(way, flow, number, size, entered_ns, delay_ns, False, overtaken))
+                rows.append(
+                    pack(direction, flow, number, size, entered_ns, delay_ns, False, overtaken)
+                )
             out.append(datagram)
-        # Together: a call for each packet would take longer than what it does.
+        # At once: a call per packet would take longer than its work.
         counts.forwarded += len(out)
         counts.delay.add_all(delays_ns)
         counts.error.add_all(errors_ns)
@@ -338,7 +340,7 @@ class Link:
         return due_ns is not None and due_ns <= now_ns
 
     def next_due_ns(self) -> int | None:
-        """Time at which the next packet is due, or has passed the bottleneck, or None."""
+        """Time at which the next packet is due, or passes the bottleneck, or None."""
         front = self._queue.front
         due_ns = front[0][0] if front else None
         if self._bottleneck is None:
@@ -349,16 +351,16 @@ class Link:
         return due_ns
 
     def depth(self) -> int:
-        """Number of packets under way, but for the one that a finite rate is serving."""
+        """Number of packets in queue and bottleneck, without the one being served."""
         waiting = self._bottleneck.waiting if self._bottleneck else 0
         return self._queue.size + waiting
 
     def depth_bytes(self) -> int:
-        """UDP payload under way, of packets that wait with their headers [B]."""
+        """UDP payload in queue and bottleneck, with headers in the latter [B]."""
         return self._bytes + (self._bottleneck.waiting_bytes if self._bottleneck else 0)
 
     def figures(self) -> dict[str, Any]:
-        """Statistics by name, as in `Endpoint.figures`."""
+        """Statistics by name, see `Endpoint.figures`."""
         counts = self.counts
         return {
             "packets": counts.packets,
@@ -390,7 +392,7 @@ def _bottleneck(path: Path) -> Bottleneck[Entered] | None:
 
 
 def _flipped(payload: bytes, place: float) -> bytes:
-    """A payload with one bit flipped, at a share of its length below 1."""
+    """Payload with one bit flipped, at a share of its length below 1."""
     bit = int(place * 8 * len(payload))
     changed = bytearray(payload)
     changed[bit // 8] ^= 1 << bit % 8

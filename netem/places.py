@@ -1,19 +1,20 @@
-"""Places of netem: the flows that hold one, and the order in which they give way to new clients.
+"""Places of netem: the flows that have one, and the order in which they are replaced by new
+clients.
 
 netem reads no payload, so it cannot tell a vehicle from somebody who repeats a vehicle's packets.
-It can count. An exchange is a packet of the client's followed by one of the server's, and
-EXCHANGES of them earn a flow its place for EARNED_NS. One answer earns nothing, because anybody can
-provoke it. Where no place is free, the first of these gives way to a new client:
+But it can count. An exchange is a packet of the client followed by one of the server, and EXCHANGES
+of them earn a flow its place for EARNED_NS. A single answer earns nothing, because anybody can
+provoke it. If no place is free, the first of these is replaced by a new client:
 
-    1. the oldest flow that is not earned, if it is unused for IDLE_NS
-    2. the oldest that is not earned of the new client's own host, if that has more than HOST_FLOWS
-    3. where fewer than one place of TRIALS is not earned: the oldest flow of another host that has
+    1. the oldest unearned flow, if it is unused for IDLE_NS
+    2. the oldest unearned flow of the new client's own host, if that has more than HOST_FLOWS
+    3. if fewer than one place in TRIALS is unearned: the oldest flow of another host that has
        earned more than HOST_FLOWS places
-    4. the oldest that is not earned of a host with more than HOST_FLOWS such flows
-    5. the oldest that is not earned
+    4. the oldest unearned flow of a host with more than HOST_FLOWS such flows
+    5. the oldest unearned flow
 
-So who holds a place must go on exchanging packets at the rate of a slow vehicle in each of them,
-and who has one address keeps no more than HOST_FLOWS from others.
+So to keep a place one must exchange packets at the rate of a slow vehicle in each flow, and a
+single host can keep at most HOST_FLOWS from others.
 """
 
 from collections import OrderedDict
@@ -29,12 +30,12 @@ EXCHANGES = 8
 EARNED_NS = 10 * SECOND_NS
 """Time for which a place is earned [ns]."""
 IDLE_NS = 5 * SECOND_NS
-"""Time without a packet after which a flow gives way before those of a crowded host [ns]."""
+"""Time without a packet after which a flow is replaced before those of a crowded host [ns]."""
 HOST_FLOWS = 64
-"""Largest number of flows of a host that do not give way before those of other hosts."""
+"""Number of flows of a host above which they are replaced before those of other hosts."""
 TRIALS = 8
-"""Divisor of the number of places: so large a part of them is not kept from new clients by a host
-with more than HOST_FLOWS."""
+"""Share of the places, as a divisor, that a host with more than HOST_FLOWS cannot keep from new
+clients."""
 
 
 @dataclass(slots=True)
@@ -51,19 +52,19 @@ class Flow:
     host: str
     """Host of the client, see `shared.core.endpoint.host_of`."""
     order: "Order"
-    """Flows among which it stands: those that have earned their place, or the others."""
+    """Flows among which it is ordered: earned ones, or the others."""
     laps: int
-    """Number of times that the packet which opened it had passed from other addresses before."""
+    """Number of other addresses from which its first packet had come before."""
     asks: bool = False
-    """Whether a packet of the client's has come since the newest exchange."""
+    """Whether a packet of the client has come since the newest exchange."""
     exchanges: int = 0
-    """Number of exchanges since it earned its place last."""
+    """Number of exchanges since it last earned its place."""
     earned_ns: int = 0
-    """Time at which it earned its place last."""
+    """Time at which it last earned its place."""
 
 
 class Order:
-    """Flows in an order, the oldest first, all together and by host."""
+    """Flows in order, oldest first, all together and by host."""
 
     def __init__(self) -> None:
         self.flows: OrderedDict[Address, Flow] = OrderedDict()
@@ -74,14 +75,14 @@ class Order:
         """Hosts with more than HOST_FLOWS flows."""
 
     def append(self, flow: Flow) -> None:
-        """Put a flow in as the newest."""
+        """Add a flow as the newest."""
         of_host = self._hosts.setdefault(flow.host, OrderedDict())
         self.flows[flow.client] = of_host[flow.client] = flow
         if len(of_host) > HOST_FLOWS:
             self._crowded[flow.host] = None
 
     def remove(self, flow: Flow) -> None:
-        """Take a flow out."""
+        """Remove a flow."""
         of_host = self._hosts[flow.host]
         del self.flows[flow.client], of_host[flow.client]
         if len(of_host) <= HOST_FLOWS:
@@ -89,7 +90,7 @@ class Order:
         if not of_host:
             del self._hosts[flow.host]
 
-    def renew(self, flow: Flow) -> None:
+    def touch(self, flow: Flow) -> None:
         """Make a flow the newest."""
         self.flows.move_to_end(flow.client)
         self._hosts[flow.host].move_to_end(flow.client)
@@ -99,21 +100,21 @@ class Order:
         return len(self._hosts.get(host, ()))
 
     def oldest(self, host: str = "") -> Flow | None:
-        """Oldest flow of all, or of one host; None where there is none."""
+        """Oldest flow of all, or of one host; None if there is none."""
         flows = self._hosts.get(host) if host else self.flows
         return next(iter(flows.values())) if flows else None
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
-        """Oldest flow of a host with more than HOST_FLOWS; None where there is none.
+        """Oldest flow of a host with more than HOST_FLOWS; None if there is none.
 
         Args:
-            but: host that does not count.
+            but: host that is left out.
         """
         return next((self.oldest(host) for host in self._crowded if host != but), None)
 
 
 class Places:
-    """Flows that hold a place.
+    """Flows that have a place.
 
     Args:
         count: number of places.
@@ -121,11 +122,11 @@ class Places:
 
     def __init__(self, count: int) -> None:
         self._trials = count // TRIALS
-        """Number of places that a host with more than HOST_FLOWS does not keep from others."""
+        """Number of places that a host with more than HOST_FLOWS cannot keep from others."""
         self._earned = Order()
-        """Flows that have earned their place, in the order in which they last did."""
+        """Flows that have earned their place, by the time at which they last did."""
         self.others = Order()
-        """All other flows, in the order of their last packets."""
+        """All other flows, by the time of their last packets."""
 
     def find(self, client: Address) -> Flow | None:
         """Flow of a client, or None."""
@@ -137,7 +138,7 @@ class Places:
         Args:
             flow: the flow.
             now_ns: time now.
-            is_answer: whether the server has sent it, and not the client.
+            is_answer: whether the server sent it, not the client.
         """
         flow.used_ns = now_ns
         if is_answer and flow.asks:
@@ -147,10 +148,12 @@ class Places:
             flow.exchanges, flow.earned_ns = 0, now_ns
             self._put(flow, self._earned)
         elif flow.order is self.others:
-            flow.order.renew(flow)
+            flow.order.touch(flow)
 
-    def gives_way(self, host: str, now_ns: int) -> Flow | None:
-        """Flow that gives way to a new client of a host, now without a place; None if none does."""
+    def replace(self, host: str, now_ns: int) -> Flow | None:
+        """Remove and return the flow that a new client of a host replaces; None if there is
+        none.
+        """
         earned, others = self._earned, self.others
         while (last := earned.oldest()) and now_ns - last.earned_ns >= EARNED_NS:
             self._put(last, others)
@@ -162,7 +165,7 @@ class Places:
         return flow
 
     def _crowding(self, host: str) -> Flow | None:
-        """Flow of a host with more than HOST_FLOWS that gives way to a new client of a host."""
+        """Flow of a host with more than HOST_FLOWS that a new client of a host replaces."""
         earned, others = self._earned, self.others
         if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
             return others.oldest(host)

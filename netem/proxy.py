@@ -1,12 +1,12 @@
-"""UDP proxy that stands for the network and never decodes what it carries.
+"""UDP proxy that emulates the network and never decodes packets.
 
 Clients send to netem's bound socket. Each client address is a flow with a socket of its own towards
-the server, so that the server's answers find their way back. Uplink is server to client, downlink
-is client to server, as in the paper.
+the server, so that the server's answers are sent back to the right client. As in the paper, uplink
+is server to client, downlink is client to server.
 
-Where no place is free for a new client, `places` says which flow gives way. A server address that
-leads back here is found out as well: until the server has sent its first packet, a packet that has
-come from LAPS_MAX new addresses, one after the other, opens no further flow.
+If no place is free for a new client, `places` says which flow it replaces. A server address that
+leads back to netem is detected: until the server has sent its first packet, a packet that has come
+from LAPS_MAX new addresses, one after another, opens no further flow.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Largest number of clients at once by default; packets of others are dropped and counted."""
+"""Default largest number of clients at once; packets of others are dropped and counted."""
 LAPS_MAX = 16
 """Largest number of flows that one packet opens, each from another address, while the server has
 never answered."""
@@ -41,10 +41,10 @@ class Proxy(Endpoint):
     """Delays, reorders and loses datagrams between clients and one server.
 
     Args:
-        scenario: `network` and `seed` of it are used.
+        scenario: uses `network` and `seed`.
         server: address of the server.
-        flows: most clients at once, a socket each.
-        recorder: takes one row a packet.
+        flows: largest number of clients at once, a socket each.
+        recorder: receives one row per packet.
     """
 
     changeable = keys_of(InFlight.IMPAIRMENT)
@@ -72,19 +72,20 @@ class Proxy(Endpoint):
         self._is_answered = False
         """Whether the server has ever sent a packet."""
         self._is_looped = False
-        """Whether it was told that packets come back."""
+        """Whether a loop of packets was reported."""
         self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
-        """While it has not: most laps of each of the newest packets, and the client that it came
-        from then, by a digest of the packet."""
+        """Until the server answers: laps of each of the newest packets, and its latest client, by
+        digest of the packet."""
         self._faults: set[str] = set()
-        """Tracebacks of mistakes in plug-ins that were reported."""
+        """Tracebacks of plug-ins' errors that were reported."""
         self.refused = 0
-        """Packets of clients for which there is no flow, and of strangers at a flow's socket."""
+        """Number of packets from clients without a flow, and from others than the server at a
+        flow's socket."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Take a packet that enters the network."""
+        """Process a packet that enters the network."""
         payload, peer, socket = datagram
-        # Socket 0 is the one that clients send to.
+        # Clients send to socket 0.
         if socket == 0:
             flow = self._places.find(peer) or self._open(datagram, now_ns)
             if flow is None:
@@ -93,25 +94,25 @@ class Proxy(Endpoint):
             if not self._is_answered:
                 self._note(payload, flow)
             onward = make_datagram((payload, self._server, flow.socket))
-            may_leave = self.downlink.take(onward, flow.downlink, now_ns=now_ns)
+            may_leave = self.downlink.accept(onward, flow.downlink, now_ns=now_ns)
         else:
             flow = self._by_socket.get(socket)
-            # A flow's socket is open to anybody, and only the server may answer through it.
+            # Anybody can send to a flow's socket, but only the server may answer through it.
             if flow is None or peer != self._server:
                 self.refused += 1
                 return
             onward = make_datagram((payload, flow.client, 0))
-            may_leave = self.uplink.take(onward, flow.uplink, now_ns=now_ns)
+            may_leave = self.uplink.accept(onward, flow.uplink, now_ns=now_ns)
             self._is_answered = True
             self._passed.clear()
         if flow.uplink.fates.fault or flow.downlink.fates.fault:
-            self._tell_faults(flow)
+            self._report_faults(flow)
         self._places.hear(flow, now_ns, is_answer=socket != 0)
-        # What is not delayed leaves now, and not a wake later.
+        # A packet without delay leaves now, not at the next wake.
         if may_leave:
             self._forward(now_ns)
 
-    def _tell_faults(self, flow: Flow) -> None:
+    def _report_faults(self, flow: Flow) -> None:
         for lane in (flow.uplink, flow.downlink):
             if lane.fates.fault and lane.fates.fault not in self._faults:
                 self._faults.add(lane.fates.fault)
@@ -124,7 +125,7 @@ class Proxy(Endpoint):
     def _forward(self, now_ns: int) -> None:
         for link in (self.uplink, self.downlink):
             if link.is_due(now_ns):
-                self._out += link.give(now_ns=now_ns)
+                self._out += link.release(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
         """Time at which the next packet is due."""
@@ -134,18 +135,18 @@ class Proxy(Endpoint):
         return up_ns
 
     def _open(self, datagram: Datagram, now_ns: int) -> Flow | None:
-        """Open a flow for the sender of a packet; None where there is no place for it."""
+        """Open a flow for the sender of a packet; None if there is no place."""
         client = host, port = datagram.peer
         laps = self._laps(datagram)
         if laps > LAPS_MAX:
             return None
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
-            # Sockets are never closed: a flow that gives way leaves its own to the next.
-            gone = self._places.gives_way(host_of(client), now_ns)
-            if gone is None:
+            # Sockets are never closed: a new flow takes over the one of the flow that it replaces.
+            replaced = self._places.replace(host_of(client), now_ns)
+            if replaced is None:
                 return None
-            socket = gone.socket
+            socket = replaced.socket
         number = self._opened
         self._opened += 1
         flow = Flow(
@@ -164,9 +165,10 @@ class Proxy(Endpoint):
         return flow
 
     def _laps(self, datagram: Datagram) -> int:
-        """Number of flows, each of another address, that a packet has passed by one after another.
+        """Number of flows, each from another address, through which a packet has passed one after
+        another.
 
-        Without a server that answers, such a packet is one of our own that has come back.
+        If no server answers, such a packet is one of our own that has come back.
         """
         passed = self._passed.get(_digest(datagram.payload)) if not self._is_answered else None
         if passed is None:
@@ -178,7 +180,7 @@ class Proxy(Endpoint):
         return laps
 
     def _note(self, payload: bytes, flow: Flow) -> None:
-        """Note that a packet passes by a flow."""
+        """Note that a packet passes through a flow."""
         digest = _digest(payload)
         laps, client = self._passed.pop(digest, (0, flow.client))
         self._passed[digest] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)
@@ -186,7 +188,6 @@ class Proxy(Endpoint):
             self._passed.popitem(last=False)
 
     def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
-        """Fates of the packets of a flow in one direction."""
         direction: DirectionConfig = getattr(self._scenario.network, name)
         return Fates(direction, self._scenario.seed, name, flow)
 
@@ -197,7 +198,7 @@ class Proxy(Endpoint):
         *,
         now_ns: int,
     ) -> None:
-        """See `Endpoint`; packets that are under way keep their fate."""
+        """See `Endpoint`; queued packets keep their fate."""
         self._scenario = scenario
         self.uplink.change(scenario.network.uplink.path, now_ns=now_ns)
         self.downlink.change(scenario.network.downlink.path, now_ns=now_ns)
@@ -216,5 +217,5 @@ class Proxy(Endpoint):
 
 
 def _digest(payload: bytes) -> bytes:
-    """Digest of a packet, by which it is known again."""
+    """Digest that identifies a packet."""
     return hashlib.blake2s(payload, digest_size=16).digest()

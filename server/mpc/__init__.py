@@ -1,1 +1,1 @@
-"""The MPC of the paper: problem (5)-(9), solvers (10), and the hierarchy of (14) and (15)."""
+"""The MPC of the paper: problem (5)-(9), solvers (10), and the hierarchy (14), (15)."""

@@ -1,4 +1,4 @@
-"""Begin of a plan, and its appraisal once it is solved; `server.mpc.hierarchical` calls both."""
+"""Appraisal of plans: where a plan starts, and its costs once it is solved."""
 
 from typing import NamedTuple
 
@@ -10,49 +10,48 @@ from skytether.server.mpc.problem import MPC, Inputs, add_cost
 from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes
 
 GENERATOR, TRACKER = 0, 1
-"""First index of what both MPCs have."""
+"""Index of each of the two MPCs in arrays."""
 
 
 class PlanMemory(NamedTuple):
-    """Memory of both MPCs for every vehicle."""
+    """Latest plans of both MPCs for every vehicle."""
 
-    # A thousand vehicles' memory is 0.8 MB like this. With float64, and with the states X(k-1) that
-    # the inputs lead to, it was four times as large, and no core's own cache held it.
+    # Inputs are float32, and states are computed from them anew: 0.8 MB for a thousand vehicles.
+    # With float64 and the states stored it was four times as large, and exceeded the cache of a
+    # core.
     inputs: S4
-    """U(k-1), the horizon computed last [m/s], rounded as it is sent; shape
-    (2, capacity, axes, H)."""
+    """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
     start: F3
-    """State that the generator's horizon begins at [m, m/s]; shape (capacity, axes, 2)."""
+    """Initial state of the generator's plan [m, m/s]; shape (capacity, axes, 2)."""
     step: I1
-    """Step that they were computed for, or -1; shape (capacity,)."""
+    """Step of the plans, or -1; shape (capacity,)."""
     bounded: B1
     """Whether an input was at its bound; shape (capacity,)."""
 
 
 class Draft(NamedTuple):
-    """The plans of a block of vehicles in the making."""
+    """Plans being computed for a block of vehicles."""
 
     planned: F3
-    """Planned state x_p(k|k-1), where the generator starts [m, m/s]; shape (block, axes, 2)."""
+    """Planned state x_p(k|k-1), the generator's initial state [m, m/s]; shape (block, axes, 2)."""
     gradient: F3
-    """Gradient g of the problem to be solved, and then the slope at its answer; shape (block, axes,
-    H)."""
+    """Gradient g of the QP, later the slope at its solution; shape (block, axes, H)."""
     guess: F3
-    """Horizon of the step before, shifted [m/s]; shape (block, axes, H)."""
+    """Shifted plan of the previous step [m/s]; shape (block, axes, H)."""
     inputs: S4
-    """U(k) of both MPCs, rounded: planning goes on with what the vehicle will really be told
-    [m/s]; shape (2, block, axes, H)."""
+    """Inputs U(k) of both MPCs, rounded: planning continues with what is really sent [m/s]; shape
+    (2, block, axes, H)."""
     distance: F1
-    """Scratch: squares of distances [m²]; shape (H + 1,)."""
+    """Scratch: squared distances [m²]; shape (H + 1,)."""
 
 
 @inline
 def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
-    """Note what a plan starts from, in its record of FIGURES, and whether it begins anew."""
+    """Fill in where a plan starts, and whether it is fresh."""
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True
-    # Behind a gap longer than H nothing of the last plan is left to go on from (E17).
+    # After a gap longer than H nothing of the previous plan is left (E17).
     plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
 
 
@@ -60,7 +59,8 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
 def planned_state(
     mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
 ) -> tuple[float, float]:
-    """Planned state x_p(k|k-1) on one axis: where the generator's last plan leads at `plan.gap`.
+    """Planned state x_p(k|k-1) on one axis: that of the generator's previous plan after `plan.gap`
+    steps.
 
     Source: eq. (14).
     """
@@ -81,11 +81,17 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add the squares of how far `held` leads away from the generator's last plan on one axis.
+    """Add the squared deviations of flying on with `held` from the generator's previous plan on one
+    axis.
 
     Args:
-        distance: what is added to, stage by stage, as far as that plan goes and a new one would be
-            flown [m²]; shape (H + 1,).
+        mpc: the problem.
+        memory: previous plans.
+        found: predictions for the vehicles.
+        plan: record of the vehicle's plan.
+        i: index of the vehicle in the block.
+        axis: the axis.
+        distance: sum to which each stage adds, as far as both are flown [m²]; shape (H + 1,).
     """
     held, flown = found.held[i, axis], found.flown[i]
     model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
@@ -113,19 +119,22 @@ def _add_gap(
     change: F1,
     cost: float,
 ) -> float:
-    """Add to `cost` what flying on with other inputs costs above the optimum, twice, on one axis.
+    """Add to `cost` twice the excess cost of other inputs over the optimal ones on one axis.
 
     Args:
-        x: by how much the state at stage 0 is another then [m, m/s].
+        mpc: the problem.
+        axis: the axis.
+        x: difference of the state at stage 0 [m, m/s].
         held: the other inputs [m/s]; shape (H,).
-        u: the optimal ones [m/s]; shape (H,).
-        steep: `slope` there, by which the cost rises where a bound is active; shape (H,).
-        change: scratch, as long as inputs are compared; shape (flown,).
+        u: the optimal inputs [m/s]; shape (H,).
+        steep: `slope` at the optimum, nonzero where a bound is active; shape (H,).
+        change: scratch, one entry per compared input; shape (flown,).
+        cost: the sum so far.
     """
     for stage in range(len(change)):
-        # The slope is 0 but where a bound is active, and there every change that is allowed costs
-        # more: less than 0 is rounding. Without this term the gap was wrong in 68 % of the tests of
-        # a flight in wind 0.3.
+        # The slope is nonzero only where a bound is active, and there every allowed change
+        # increases the cost: a negative product is rounding. Without this term the gap was wrong in
+        # 68 % of the tests of a flight in wind 0.3.
         change[stage] = held[stage] - u[stage]
         cost += 2.0 * max(0.0, steep[stage] * change[stage])
     return add_cost(mpc, axis, x, change, cost)
@@ -133,7 +142,7 @@ def _add_gap(
 
 @lanes
 def copy(numbers: Inputs, to: Inputs) -> None:
-    """Put numbers into the beginning of an array."""
+    """Copy numbers to the beginning of an array."""
     for i in range(len(numbers)):
         to[i] = numbers[i]
 
@@ -149,13 +158,13 @@ def conclude(
     plan: PlanFigures,
     i: int,
 ) -> None:
-    """Appraise the plan of vehicle `i`, with V(k) among its figures, and remember it.
+    """Fill in the figures of vehicle `i`'s plan, with V(k), and store the plan.
 
     Source: eq. (16).
     """
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
     row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
-    # Beyond that a plan is never flown: what was sent would seem to end too early at every step.
+    # Later inputs are never flown, so the old plan must not seem to end too early because of them.
     change = draft.guess[i, 0, : found.flown[i]]
     distance, furthest = draft.distance, 0.0
     sure, doubted = 1.0, 0.0
@@ -197,5 +206,5 @@ def conclude(
             copy(draft.inputs[which, i, axis], memory.inputs[which, row, axis])
         memory.start[row, axis, 0] = draft.planned[i, axis, 0]
         memory.start[row, axis, 1] = draft.planned[i, axis, 1]
-    # A first plan that failed is no plan to go on from.
+    # A failed first plan is not a previous plan.
     memory.step[row] = plan.start if plan.solved or not plan.fresh else -1

@@ -1,16 +1,16 @@
-"""Exact solver of the QPs of `mpc`: an active set, and a Riccati pass for each guess of it.
+"""Exact solver of the QPs of `mpc`: an active-set method with a Riccati recursion per iteration.
 
 A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the optimal control problem
 
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0
 
-so that, with the set of inputs at their bound given, a backward pass over 2 x 2 matrices solves it
-in O(H), where a factorisation of 𝓗 takes O(H³). The forward pass finds the input v that each stage
-would choose for itself: beyond the bound it belongs into the set, within it belongs out. A set that
-finds itself again is the optimum. From the shifted horizon of the step before that takes one or two
-rounds. A set can wander in a circle instead (long steps, a tiny R, corners of the reference); then
-only the input that is furthest on the wrong side changes it, a round for each. What even that does
-not end goes to DAQP, a dual active-set method, and its answer is believed once it meets the
+So with a given set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in
+O(H), where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of
+each stage: beyond the bound the stage belongs in the set, otherwise it does not. A set that
+reproduces itself is optimal. From the shifted plan of the previous step this takes one or two
+iterations. The set may cycle instead (long steps, a tiny R, corners of the reference); then only
+the input with the largest violation changes, one per iteration. If that does not converge either,
+DAQP, a dual active-set method, solves the QP, and its answer is used only if it meets the
 optimality conditions.
 """
 
@@ -35,30 +35,30 @@ from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lan
 from skytether.shared.law.model import Array, Axis, Flags
 
 ROUNDS_MAX = 8
-"""Rounds in which the whole set may change; five have been the most on recorded flights."""
+"""Number of iterations in which the whole set may change; recorded flights needed five at most."""
 PIVOTS_MAX = 200
-"""Further rounds, in which one input enters the set or leaves it."""
+"""Number of further iterations, in which one input enters or leaves the set."""
 SNAP = 1e-12
-"""Distance from its bound at which DAQP may leave an input that belongs on it [m/s]."""
+"""Distance from its bound within which DAQP's input is moved onto it [m/s]."""
 RESIDUAL_MAX = 1e-7
-"""Largest residual of the optimality conditions, relative to the gradient, of an answer of DAQP."""
+"""Largest relative residual of the optimality conditions, by the gradient, of an answer of DAQP."""
 
-# A stage of a backward pass: what depends on the active set alone. The cost to go from the stage is
-# ½ c u² + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
+# Quantities of a stage that depend on the active set alone. The cost to go from the stage is ½ c u²
+# + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
 K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
-"""Columns of `Workspace.free`: k = s / c, 1 / c and F = A - B k."""
+"""Columns of `RiccatiWorkspace.free`: k = s / c, 1 / c and F = A - B k."""
 
 
-class Workspace(NamedTuple):
-    """Tables and scratch memory of a solver, reused from problem to problem."""
+class RiccatiWorkspace(NamedTuple):
+    """Tables and scratch arrays of a solver."""
 
     free: F4
-    """Backward passes with every input free, for FIRST and LATER weights and each axis; shape
-    (2, axes, H, 7)."""
+    """Backward passes with every input free, for FIRST and LATER weights and each axis; shape (2,
+    axes, H, 7)."""
     memory: F3
-    """Scratch of a single vehicle, see `mpc.simd_memory`."""
+    """Scratch for a single vehicle, see `mpc.simd_memory`."""
     together: F3
-    """Scratch of WIDTH vehicles."""
+    """Scratch for WIDTH vehicles."""
 
 
 Three = tuple[float, float, float]
@@ -67,12 +67,12 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 @part
 def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, Three]:
-    """A stage of a backward pass: its columns from S0 to F11, and P before W is added.
+    """One stage of a backward pass: its columns from S0 to F11, and P before W is added.
 
     Args:
         model: eq. (4) on one axis.
         rho: weight of the input.
-        after: P of the stage behind, as (P00, P01, P11).
+        after: P of the next stage, as (P00, P01, P11).
         free: whether the input is free, not at its bound.
     """
     a01, a11, b0, b1 = model.a01, model.a11, model.b0, model.b1
@@ -83,7 +83,7 @@ def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, T
     k0, k1 = s0 * inverse, s1 * inverse
     e01, e11 = p00 * a01 + p01 * a11, p01 * a01 + p11 * a11
     p01, p11 = e01, a01 * e01 + a11 * e11
-    # Chosen, not branched to, so that stages of several vehicles are computed side by side.
+    # Conditional expressions instead of branches, so that several vehicles are computed with SIMD.
     p00 = p00 - s0 * k0 if free else p00
     p01 = p01 - s0 * k1 if free else p01
     p11 = p11 - s1 * k1 if free else p11
@@ -93,13 +93,13 @@ def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, T
 
 @inline
 def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> float:
-    """Input that a stage would choose for itself at x = 0 [m/s]."""
+    """Unconstrained choice of a stage at x = 0 [m/s]."""
     return -(model.b0 * q0 + model.b1 * q1 + g) * inverse
 
 
 @lanes
 def _first_set(bound: float, simd: SimdBatch) -> None:
-    """Fill in the first active set: that of the horizon before. Sum up the gradient."""
+    """Fill in the first active set from the previous plan, and the sum of the gradient."""
     near, L = NEAR * bound, len(simd.p)
     side, held, total = simd.side, simd.held, simd.total
     g, previous = simd.gradient, simd.previous
@@ -116,10 +116,12 @@ def _first_set(bound: float, simd: SimdBatch) -> None:
 
 @lanes
 def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
-    """Make a round in which every input of every vehicle is free.
+    """One iteration with every input of every vehicle free.
 
     Args:
-        stages: the backward pass of that; shape (H, 7).
+        mpc, axis: the problem.
+        simd: the vehicles.
+        stages: its backward pass; shape (H, 7).
     """
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1 = model.b0, model.b1
@@ -156,10 +158,10 @@ def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
 
 @lanes
 def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
-    """Make the backward pass of a round with an active set of each vehicle's own.
+    """Backward pass with each vehicle's active set.
 
-    The passes for the matrices and for the vectors go together: what only the latter needs of a
-    stage is then never stored.
+    Matrices and vectors are computed together, so that quantities needed only once are never
+    stored.
     """
     model, bound, W, L = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(simd.p)
     a01, a11 = model.a01, model.a11
@@ -192,10 +194,12 @@ def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @lanes
 def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
-    """Make the forward pass of a round: what each stage would choose is its verdict on the set.
+    """Forward pass: each stage's unconstrained choice decides on the active set.
 
     Args:
-        singly: whether only the input that is furthest on the wrong side may change the set.
+        mpc, axis: the problem.
+        simd: the vehicles.
+        singly: whether only the input with the largest violation may change the set.
     """
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
@@ -210,13 +214,13 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
             own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
             chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
             verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
-            # An input that would leave its bound stays at it for this round.
+            # An input that would leave its bound stays there for this iteration.
             stays = at if at != 0.0 or singly else verdict
             value = chosen if stays == 0.0 else stays * bound
             then_p, then_v = advance(model, p_, v_, value)
             free_p = f00[i, lane] * p_ + f01[i, lane] * v_ + b0 * own_
             free_v = f10[i, lane] * p_ + f11[i, lane] * v_ + b1 * own_
-            # Closed loop, x ← F x + B own: the chain of stages does not wait for `chosen`.
+            # Closed loop, x ← F x + B own: the recursion does not have to wait for `chosen`.
             x0[lane] = free_p if stays == 0.0 else then_p
             x1[lane] = free_v if stays == 0.0 else then_v
             u[i, lane] = value
@@ -232,7 +236,7 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
 
 @lanes
 def _change_worst(simd: SimdBatch) -> None:
-    """Let the input that is furthest on the wrong side enter or leave each vehicle's active set."""
+    """Let the input with the largest violation enter or leave each vehicle's active set."""
     for lane in range(len(simd.p)):
         i = int(simd.worst_at[lane])
         if i >= 0:
@@ -242,11 +246,11 @@ def _change_worst(simd: SimdBatch) -> None:
 
 @lanes
 def _any(number: F1) -> bool:
-    """Whether a number is above 0 for any vehicle."""
-    found = False
+    """Whether a number is positive for any vehicle."""
+    is_any = False
     for lane in range(len(number)):
-        found |= number[lane] > 0.0
-    return found
+        is_any |= number[lane] > 0.0
+    return is_any
 
 
 @part
@@ -256,13 +260,12 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
     Args:
         mpc, axis: the problem.
         which: FIRST or LATER weights.
-        simd: gradient and previous are read, whose active set is the first; inputs are filled in
-            [m/s].
-        free: of `Workspace`.
-        settled: set to False for a vehicle without an answer; shape (L,).
+        simd: reads gradient and previous, whose active set is the first; fills in inputs [m/s].
+        free: of `RiccatiWorkspace`.
+        settled: set to False for a vehicle without a solution; shape (L,).
 
     Returns:
-        number of rounds.
+        number of iterations.
 
     Source: eqs. (6), (8), (10).
     """
@@ -272,13 +275,13 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
     while rounds < ROUNDS_MAX + PIVOTS_MAX:
         singly = rounds >= ROUNDS_MAX
         rounds += 1
-        # Where no vehicle has an input at its bound, one table of stages serves all of them.
+        # If no vehicle has an input at its bound, one table of stages serves all of them.
         if singly or _any(simd.held):
             _backward(mpc, axis, which, simd)
             _forward(mpc, axis, simd, singly)
         else:
             _round_free(mpc, axis, simd, free[which, axis])
-        # A vehicle whose set is right finds the same again, to the last bit.
+        # A correct set is reproduced exactly.
         if not _any(changed):
             break
         if singly:
@@ -290,7 +293,7 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
 
 
 @kernel
-def _table(mpc: MPC, work: Workspace) -> None:
+def _table(mpc: MPC, work: RiccatiWorkspace) -> None:
     """Fill in the backward passes with every input free."""
     W = mpc.weights.states
     for which in range(2):
@@ -306,9 +309,11 @@ def _table(mpc: MPC, work: Workspace) -> None:
 
 @kernel
 def _solve(
-    mpc: MPC, which: int, work: Workspace, gradient: F3, guess: F3, inputs: F3, settled: B1
+    mpc: MPC, which: int, work: RiccatiWorkspace, gradient: F3, guess: F3, inputs: F3, settled: B1
 ) -> None:
-    """Fill in inputs (n, axes, H) of n vehicles, and which are right, (axes n,); `active_sets`."""
+    """Fill in inputs (n, axes, H) of n vehicles and which are solved, (axes n,); see
+    `active_sets`.
+    """
     alone, together, n = simd_batch(work.memory), simd_batch(work.together), len(gradient)
     for axis in range(len(mpc.model)):
         first = 0
@@ -325,16 +330,16 @@ def _solve(
             first += L
 
 
-def workspace(mpc: MPC) -> Workspace:
-    """A workspace for the problems of an MPC."""
+def workspace(mpc: MPC) -> RiccatiWorkspace:
+    """Workspace for the problems of an MPC."""
     axes, H = len(mpc.model), len(mpc.weights.states)
-    work = Workspace(np.empty((2, axes, H, 7)), simd_memory(H, 1), simd_memory(H, WIDTH))
+    work = RiccatiWorkspace(np.empty((2, axes, H, 7)), simd_memory(H, 1), simd_memory(H, WIDTH))
     _table(mpc, work)
     return work
 
 
 class ExactSolver:
-    """See `server.mpc.solver.Solver`; the answer depends on the problem alone, to rounding.
+    """See `server.mpc.solver.Solver`; the answer depends on the problem alone, up to rounding.
 
     Source: eq. (10).
     """
@@ -366,16 +371,16 @@ class ExactSolver:
         problem = self._problem
         hessian = problem.hessian[axis]
         bound = np.full(len(gradient), problem.mpc.bounds[axis])
-        # Without rows here, DAQP takes the bounds as simple bounds, which cost it least.
+        # Without general constraints, DAQP uses the cheaper simple bounds.
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
         )
-        # It may leave an input that is at its bound a rounding error inside.
+        # It may leave an input short of its bound by a rounding error.
         answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
         inputs: Array = np.clip(answer, -bound, bound)
         slope = hessian @ inputs + gradient
-        # Optimal: no slope inside, and none back inside at a bound.
+        # Optimal: slope zero inside, and not pointing inwards at a bound.
         slope = np.where(np.abs(inputs) >= bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
         if not np.abs(slope).max() <= RESIDUAL_MAX * (1.0 + np.abs(gradient).max()):
             raise SolverFailed(f"DAQP status {status}", info["iterations"])

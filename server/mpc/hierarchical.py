@@ -1,13 +1,13 @@
 """Hierarchical MPC of section 4.1: trajectory generator, eq. (14), then tracker, eq. (15).
 
-Both are the MPC of eq. (9), one after the other: each starts from its own horizon of the step
-before. The generator plans from its own last prediction and never looks at the UAV (E17); the
-tracker leads the UAV's estimated state along the generator's plan. On the way the new plan is
-compared with what was sent: V of eq. (16), and the cost and the deviation of flying on with that.
+Both are the MPC of eq. (9), one after the other, each warm-started from its own previous plan. The
+generator plans from its own last prediction and never uses the vehicle's state (E17); the tracker
+controls the vehicle's estimated state along the generator's plan. The new plan is compared with
+what was sent: V of eq. (16), and cost and deviation of flying on with the old plan.
 
-With the exact solver, all of that is one compiled pass over several vehicles side by side, or over
-one (`server.mpc.problem`). Another solver, or one that has to help out, is asked in between: pose
-the generator's problem, solve; pose the tracker's, solve; conclude.
+With the exact solver all of this is one compiled pass for one or several vehicles
+(`server.mpc.problem`). Any other solver is called in between: pose the generator's QP, solve; pose
+the tracker's, solve; conclude.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from skytether.server.mpc.appraisal import (
     conclude,
     planned_state,
 )
-from skytether.server.mpc.exact import ExactSolver, Workspace, active_sets
+from skytether.server.mpc.exact import ExactSolver, RiccatiWorkspace, active_sets
 from skytether.server.mpc.problem import (
     FIRST,
     LATER,
@@ -54,50 +54,48 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 
-class Batch(NamedTuple):
-    """A block of vehicles, and all that their plans are made of."""
+class PlanBatch(NamedTuple):
+    """Arguments of the planning kernels for a block of vehicles."""
 
     mpc: MPC
-    """The problem."""
     terminal_weight: F1
-    """P, on position and velocity; shape (2,)."""
+    """Terminal weight P on position and velocity; shape (2,)."""
     compares: bool
-    """Whether what was sent before is known, so that a plan can be compared with it."""
+    """Whether the inputs sent before are known, so that a plan is compared with them."""
     memory: PlanMemory
-    """Memory of all vehicles."""
+    """Previous plans of all vehicles."""
     draft: Draft
-    """The plans in the making."""
+    """Plans being computed."""
     desired: Window
-    """The desired trajectory, as far as plans go."""
+    """Desired states along the plans."""
     found: Foresight
-    """Predicted states of the vehicles."""
+    """Predictions for the vehicles."""
     figures: Figures
     """Costs of their plans."""
     together: F3
-    """Scratch of WIDTH vehicles side by side, see `mpc.simd_memory`."""
+    """Scratch for WIDTH vehicles, see `mpc.simd_memory`."""
     alone: F3
-    """Scratch of one vehicle."""
+    """Scratch for one vehicle."""
     single: I1
-    """Scratch: one vehicle by its place in the block; shape (1,)."""
+    """Scratch: index of one vehicle in the block; shape (1,)."""
     picked: I1
-    """Scratch: vehicles by their places in the block, in the order in which they are planned for;
-    shape (block,)."""
+    """Scratch: indices of vehicles in the block, in the order of planning; shape (block,)."""
     settled: B1
-    """Scratch: whether the plan of each is found; shape (WIDTH,)."""
+    """Scratch: whether each plan is solved; shape (WIDTH,)."""
 
 
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
-    """The solver that a scenario names."""
+    """Solver named by a scenario."""
     if control.solver == "exact":
         return ExactSolver(problem)
-    # OSQP brings scipy, which takes 0.2 s and 40 MB.
+    # OSQP needs scipy, which takes 0.2 s and 40 MB.
     from skytether.server.mpc.osqp_solver import OsqpSolver
 
     return OsqpSolver(problem)
 
 
 class Planner:
-    """Trajectory generator and tracker of up to `capacity` vehicles, `block` of them at a time."""
+    """Trajectory generator and tracker of up to `capacity` vehicles, in blocks of `block`."""
 
     def __init__(
         self,
@@ -117,7 +115,7 @@ class Planner:
         self.solvers = [
             make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]
-        """Solvers of a vehicle's first plan, and of later ones; others may take their places."""
+        """Solvers for a vehicle's first plan and for later ones; may be replaced."""
         self._stopwatch = stopwatch
         self._memory = PlanMemory(
             inputs=np.zeros((2, capacity, axes, H), dtype=np.float32),
@@ -137,27 +135,26 @@ class Planner:
         self._picked = np.zeros(block, dtype=np.int64)
         self._settled = np.zeros(WIDTH, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """Costs of the last plans; those of a block come first."""
+        """Costs of the latest plans; those of a block come first."""
         self.planned = self._draft.planned
-        """Planned states x_p(k+d|k-1) of the last plans [m, m/s]; shape (block, axes, 2)."""
+        """Planned states x_p(k+d|k-1) of the latest plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
-        """U of the last plan of each vehicle [m/s]; shape (capacity, axes, H)."""
-        self._batch: Batch | None = None
-        """Batch of the last plans."""
+        """Latest planned inputs U of each vehicle [m/s]; shape (capacity, axes, H)."""
+        self._batch: PlanBatch | None = None
         self.solve_ns = -1
-        """Time that planning for the last block took [ns], or -1 where nobody measures it."""
+        """Time taken to plan for the last block [ns], or -1 if not measured."""
 
     def forget(self, row: int) -> None:
         """Make the next plan of this vehicle its first."""
         self._memory.step[row] = -1
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Plan for vehicles: generator, then tracker; `found.horizons` and `figures` are filled in.
+        """Plan for vehicles: generator, then tracker; fills in `found.horizons` and `figures`.
 
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
-            found: what is foreseen of them.
+            found: their predictions.
 
         Source: eqs. (14), (15).
         """
@@ -166,8 +163,8 @@ class Planner:
         if batch is None or batch.desired is not window or batch.found is not found:
             batch = self._batch = self._batch_of(window, found)
         solver, undone = self.solvers[LATER], len(rows)
-        # No isinstance: a solver derived from it may solve otherwise, and the compiled pass would
-        # not ask it.
+        # Not isinstance: a derived solver may override `solve`, which the compiled pass would not
+        # call.
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
         if undone:
@@ -175,9 +172,11 @@ class Planner:
         took_ns = self._stopwatch.lap("plan")
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
-    def _batch_of(self, window: Window, found: Foresight) -> Batch:
-        """Arguments of the planning kernels in one tuple, of the same arrays at every step."""
-        return Batch(
+    def _batch_of(self, window: Window, found: Foresight) -> PlanBatch:
+        """Arguments of the planning kernels in one tuple; it refers to the same arrays at every
+        step.
+        """
+        return PlanBatch(
             mpc=self._mpc,
             terminal_weight=self._terminal_weight,
             compares=self._compares,
@@ -193,8 +192,12 @@ class Planner:
             settled=self._settled,
         )
 
-    def _plan_with_solvers(self, batch: Batch, rows: Indices, step: Indices, undone: int) -> None:
-        """Plan with the solvers for all vehicles, or for those `undone` that the pass has left."""
+    def _plan_with_solvers(
+        self, batch: PlanBatch, rows: Indices, step: Indices, undone: int
+    ) -> None:
+        """Plan with the solvers for all vehicles, or for those that the compiled pass left
+        unsolved.
+        """
         left = np.arange(len(rows))
         if undone < len(rows):
             left = np.flatnonzero(~self.figures["solved"][: len(rows)])
@@ -204,7 +207,7 @@ class Planner:
         _conclude_all(batch, left)
 
     def _solve(self, tier: int, left: Indices) -> None:
-        """Solve the problems posed in the draft for some vehicles of the block, by index."""
+        """Solve the QPs in the draft for some vehicles of the block, by index."""
         draft = self._draft
         fresh = self.figures["fresh"][left]
         for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
@@ -215,8 +218,8 @@ class Planner:
 
 
 @part
-def _pose_generator(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
-    """Pose the generator's problem on one axis for some vehicles, by their places in the block.
+def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+    """Set up the generator's QP on one axis for some vehicles, by index in the block.
 
     Source: eq. (14).
     """
@@ -235,7 +238,7 @@ def _pose_generator(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: i
         if not plan.fresh:
             x = planned_state(mpc, memory, plan, axis)
         draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-        # The generator plans for no vehicle in particular, and so for no disturbance.
+        # The generator does not use the vehicle's state, and so no disturbance either.
         simd.p[lane], simd.v[lane], simd.w[lane] = x[0], x[1], 0.0
         set_target(desired.states[page, axis, first : first + H + 1], simd, lane)
         before = memory.inputs[GENERATOR, plan.row, axis]
@@ -245,8 +248,8 @@ def _pose_generator(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: i
 
 
 @part
-def _pose_tracker(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
-    """Pose the tracker's problem on one axis, with the generator's answer in `simd.inputs`.
+def _pose_tracker(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+    """Set up the tracker's QP on one axis, with the generator's solution in `simd.inputs`.
 
     Source: eq. (15).
     """
@@ -265,8 +268,8 @@ def _pose_tracker(batch: Batch, simd: SimdBatch, some: I1, which: int, axis: int
 
 
 @part
-def _keep(batch: Batch, simd: SimdBatch, some: I1, tier: int, axis: int) -> None:
-    """Keep the answers of generator or tracker on one axis, as they are sent."""
+def _keep(batch: PlanBatch, simd: SimdBatch, some: I1, tier: int, axis: int) -> None:
+    """Store the solutions of generator or tracker on one axis, rounded as sent."""
     for lane in range(len(some)):
         i = some[lane]
         batch.memory.bounded[batch.figures[i].row] |= simd.held[lane] > 0.0
@@ -274,13 +277,13 @@ def _keep(batch: Batch, simd: SimdBatch, some: I1, tier: int, axis: int) -> None
 
 
 @part
-def _plan_some(batch: Batch, memory: F3, some: I1, which: int, work: Workspace) -> int:
-    """Plan for some vehicles, side by side, which have begun; how many are not solved.
+def _plan_some(batch: PlanBatch, memory: F3, some: I1, which: int, work: RiccatiWorkspace) -> int:
+    """Plan for some vehicles at once, after `begin`; returns how many are not solved.
 
     Args:
         batch: the block.
-        memory: of a `SimdBatch` of as many vehicles.
-        some: the vehicles, by their places in the block; shape (L,).
+        memory: of a `SimdBatch` for as many vehicles.
+        some: indices of the vehicles in the block; shape (L,).
         which: weights of all of them, FIRST or LATER.
         work: of the exact solver.
     """
@@ -310,8 +313,8 @@ def _plan_some(batch: Batch, memory: F3, some: I1, which: int, work: Workspace) 
 
 
 @part
-def _conclude(batch: Batch, i: int) -> None:
-    """Appraise the plan of a vehicle, and remember it."""
+def _conclude(batch: PlanBatch, i: int) -> None:
+    """Compute the figures of a vehicle's plan, and store it."""
     conclude(
         batch.mpc,
         batch.terminal_weight,
@@ -325,21 +328,22 @@ def _conclude(batch: Batch, i: int) -> None:
 
 
 @kernel
-def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
-    """Plan for vehicles with the exact solver, see `Planner.plan`; how many have to be left.
+def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
+    """Plan for vehicles with the exact solver, see `Planner.plan`; returns how many are not solved.
 
-    Those have no `solved` in their figures, and are as they were.
+    The unsolved ones are not `solved` in their figures, and are left unchanged.
     """
     memory, found, figures = batch.memory, batch.found, batch.figures
     picked, undone = batch.picked, 0
-    # A round without a bound takes a third of the time of one with a bound for any vehicle, so
-    # those that were at a bound share theirs: the others are picked from the front, these from the
+    # An iteration without any input at its bound takes a third of the time, so vehicles that were
+    # at a bound are planned for together: the others are collected from the front, these from the
     # back.
     waiting, last = 0, len(rows)
     for i in range(len(rows)):
         begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
-            # All in a batch have the same weights; a first plan has others (E8), and is rare.
+            # Vehicles planned for together need the same weights; a first plan has other ones (E8),
+            # and is rare.
             batch.single[0] = i
             undone += _plan_some(batch, batch.alone, batch.single, FIRST, work)
         elif memory.bounded[rows[i]]:
@@ -355,7 +359,7 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
     while waiting - first >= WIDTH:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
-    # Too few are left for a whole batch; alone each gets the same bits
+    # Too few are left for a full batch; alone each gets the same bits
     # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
@@ -363,8 +367,8 @@ def _plan(batch: Batch, rows: I1, steps: I1, work: Workspace) -> int:
 
 
 @kernel
-def _pose(batch: Batch, rows: I1, steps: I1, left: I1, tier: int) -> None:
-    """Pose the generator's or the tracker's problems of those `left` for another solver."""
+def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
+    """Set up the generator's or tracker's QPs of the vehicles `left` for another solver."""
     draft, simd, single = batch.draft, simd_batch(batch.alone), batch.single
     for i in left:
         plan, single[0] = batch.figures[i], i
@@ -382,8 +386,8 @@ def _pose(batch: Batch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 
 @kernel
-def _conclude_all(batch: Batch, left: I1) -> None:
-    """Appraise and remember the plans of those `left`, which another solver has solved."""
+def _conclude_all(batch: PlanBatch, left: I1) -> None:
+    """Compute figures and store plans of the vehicles `left`, solved by another solver."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

@@ -1,10 +1,9 @@
-"""Nominal motion of a vehicle: the plan that a trajectory is made from where the server sees ahead.
+"""Nominal MPC: the plan from which trajectories are made if the server sees the reference ahead.
 
-It is the MPC of eq. (9) for an undisturbed vehicle, from where it is led at step k along the
-desired trajectory, as far as the server sees that, within the bounds of the input, eq. (6). Its
-states are what the vehicle is told to follow, so a trajectory asks for nothing that the vehicle
-cannot fly: it begins to turn before a turn that is too sharp, and smooths one that is not worth the
-effort.
+It is the MPC of eq. (9) for an undisturbed vehicle, starting from the reference state at step k,
+along the desired trajectory as far as the server sees it, within the input bounds of eq. (6). The
+vehicle is told to follow its states, so a trajectory never demands what the vehicle cannot fly: it
+turns early before a sharp corner, and smooths one that is not worth the effort.
 """
 
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.common.compiled import advance, axis_at
-from skytether.server.mpc.exact import Workspace, active_sets, workspace
+from skytether.server.mpc.exact import RiccatiWorkspace, active_sets, workspace
 from skytether.server.mpc.problem import (
     FIRST,
     MPC,
@@ -30,22 +29,22 @@ from skytether.shared.scenario.schema import ControlConfig
 
 
 class Nominal(NamedTuple):
-    """The problem, and what is remembered of every vehicle to begin the next search with."""
+    """The problem, and the previous plans of all vehicles for warm starts."""
 
     mpc: MPC
-    """The problem of eq. (9), without S-term."""
-    work: Workspace
+    """Problem of eq. (9), without S-term."""
+    work: RiccatiWorkspace
     """Scratch of the solver."""
     inputs: F3
-    """Inputs planned last [m/s]; shape (capacity, axes, H)."""
+    """Latest planned inputs [m/s]; shape (capacity, axes, H)."""
     step: I1
-    """Step that they were planned at, or -1; shape (capacity,)."""
+    """Step of these plans, or -1; shape (capacity,)."""
     settled: B1
-    """Scratch: whether a plan is found; shape (1,)."""
+    """Scratch: whether a plan is solved; shape (1,)."""
 
 
 def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal:
-    """The problem of a scenario, for up to `capacity` vehicles."""
+    """Problem of a scenario, for up to `capacity` vehicles."""
     mpc, H = make_mpc(terms, control), terms.horizon
     return Nominal(
         mpc=mpc,
@@ -58,13 +57,15 @@ def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal
 
 @part
 def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) -> bool:
-    """Fill in the nominal states of a vehicle from k on; False where no plan is found.
+    """Fill in the nominal states of a vehicle from k on; False if the QP is not solved.
 
     Args:
-        row: of the vehicle.
+        nominal: the problem.
+        row: row of the vehicle.
+        k: present step.
         desired: states from k on [m, m/s]; shape (axes, H + 1 or more, 2).
-        states: what is filled in, behind the first stage, which is where the vehicle is led at k
-            [m, m/s]; shape (axes, H + 1 or fewer, 2).
+        states: output, after the first stage, which is the given reference state at k [m, m/s];
+            shape (axes, H + 1 or fewer, 2).
     """
     mpc, settled, simd = nominal.mpc, nominal.settled, simd_batch(nominal.work.memory)
     gap, H = k - nominal.step[row], nominal.inputs.shape[2]

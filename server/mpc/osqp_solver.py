@@ -1,8 +1,8 @@
-"""OSQP as a solver of the QPs of `server.mpc.problem`, the reference to compare the exact one with.
+"""OSQP as a solver of the QPs of `server.mpc.problem`, a reference for the exact solver.
 
-OSQP's interface checks little: a wrong length gives NaN, one NaN stays in its warm start for good,
-and an iteration limit does not raise. So everything is checked here, before and after, and each
-solve states its own warm start, so that an answer depends on its problem and its guess alone.
+OSQP's interface checks little: a wrong length gives NaN, a NaN stays in its warm start for ever,
+and an iteration limit does not raise. So everything is checked here before and after, and each
+solve sets its own warm start, so that an answer depends on its problem and guess alone.
 """
 
 import numpy as np
@@ -15,7 +15,8 @@ from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Tolerance of both residuals: inputs are right to about 1e-8 m/s, in 30 iterations, not 20."""
+"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, at the cost of 30 iterations,
+not 20."""
 RHO_PER_CURVATURE = 2.5
 """OSQP's step size over the mean curvature of the Hessian: fewest iterations in the worst case."""
 
@@ -47,11 +48,11 @@ class OsqpSolver:
         return inputs, solved
 
     def _solve_axis(self, axis: int, gradient: Array, guess: Array) -> Array:
-        # One NaN would stay in OSQP's warm start for all vehicles after this one.
+        # A NaN would stay in OSQP's warm start for all later vehicles.
         if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
             raise SolverFailed("problem not finite")
         problem, bound = self._axes[axis], self._u_max[axis]
-        # Multipliers that make the guess stationary where it is at its bound, and nowhere else.
+        # Multipliers that make the guess stationary where it is at its bound, and zero elsewhere.
         slope = self._hessian[axis] @ guess + gradient
         multipliers = np.where(np.abs(guess) >= NEAR * bound, -slope, 0.0)
         problem.update(q=gradient)
@@ -79,7 +80,7 @@ def _set_up(hessian: Array, bound: float) -> osqp.OSQP:
         eps_rel=TOLERANCE,
         max_iter=ITERATIONS_MAX,
         rho=RHO_PER_CURVATURE * float(np.trace(hessian)) / H,
-        # A step size that adapted would carry one vehicle's past into the next one's answer.
+        # An adaptive step size would make an answer depend on the problems solved before.
         adaptive_rho=False,
         scaling=0,
         check_termination=5,

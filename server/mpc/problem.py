@@ -5,15 +5,14 @@ each axis,
 
     minimise  ½ Uᵀ 𝓗 U + gᵀ U   subject to  |U| ≤ u_max,
 
-whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradient g follows the state, the
-target and the horizon before. W holds Q at the stages 1 … H-1 and P at H.
+whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradient g depends on the state,
+the target and the previous plan. W holds Q at the stages 1 … H-1 and P at H.
 
-What is done at every step is done in O(H), by recursion along the horizon, on one axis, and for
-several vehicles side by side. Each pass is a chain in which every stage waits for the one before,
-about ten cycles a stage, while the processor could do many times as much: so the innermost loop
-goes over vehicles, which the compiler turns into vector instructions. A single vehicle is a batch
-of one. Vehicles do not mix, and a vehicle gets the same bits alone as in a batch, which BLAS,
-multiplying by Γ, does not promise.
+The work of a step is done in O(H), by recursion along the horizon, on one axis, for several
+vehicles at once. In a recursion every stage waits for the previous one, about ten cycles, while the
+processor could do many times as much: so the innermost loop runs over vehicles, and the compiler
+turns it into vector instructions. A single vehicle is a batch of one. Vehicles are independent, and
+a vehicle gets the same bits alone as in a batch, which a BLAS product with Γ does not guarantee.
 """
 
 from dataclasses import dataclass
@@ -28,45 +27,44 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 Inputs = F1 | S1
-"""Inputs of a horizon, as they are computed or as they are sent [m/s]; shape (H,)."""
+"""Inputs of a horizon, in float64 or in float32 as sent [m/s]; shape (H,)."""
 
 
 class Weights(NamedTuple):
-    """The weights of eq. (9), for the first step of a flight and for all later ones.
+    """Weights of eq. (9), for the first step of a flight and for all later ones.
 
-    Without a horizon before there is no S-term (E8): the first of two rows leaves it out.
+    Without a previous plan there is no S-term (E8): the first of two rows leaves it out.
     """
 
     states: F2
     """W, diagonal; shape (H, 2)."""
     inputs: F2
-    """R + S, of all that weighs the input itself; shape (2, H)."""
+    """R + S, all weights of the input itself; shape (2, H)."""
     changes: F2
     """S of the stages 0 … H-2, and 0 of the last; shape (2, H)."""
     input: float
     """R."""
     target: F1
-    """Weight of the desired velocity: R / g where the input has a target of its own (E7), for it
-    takes the input v / g to fly at v, else 0; shape (axes,)."""
+    """Weight of the desired velocity: R / g if the input has a target of its own (E7), since flying
+    at v takes the input v / g; otherwise 0; shape (axes,)."""
 
 
 FIRST, LATER = 0, 1
-"""Rows of `Weights`: at the first step of a flight, and afterwards."""
+"""Rows of `Weights`: first step of a flight, and later ones."""
 
 
 class MPC(NamedTuple):
-    """The problem of eq. (9), but for what changes: state, target and horizon before."""
+    """Constant part of the problem of eq. (9), without state, target and previous plan."""
 
     model: Axes
     """Model, eq. (4); shape (axes,)."""
     bounds: F1
     """Bound u_max of the input [m/s]; shape (axes,)."""
     weights: Weights
-    """Q, P, R and S."""
 
 
 def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
-    """The problem of a scenario.
+    """Problem of a scenario.
 
     Source: eqs. (5), (6), (9).
     """
@@ -75,7 +73,7 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
     states = np.tile(np.array(control.state_weight), (H, 1))
     states[-1] = control.terminal_weight
     changes = np.zeros((2, H))
-    # Eq. (9) sums S up to H - 2 only: the last input has no counterpart in the horizon before.
+    # Eq. (9) sums S up to H - 2 only: the last input has no counterpart in the previous plan.
     changes[LATER, :-1] = control.change_weight
     weights = Weights(
         states=states,
@@ -89,10 +87,9 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Solver set-up that all QPs with one Hessian share."""
+    """Data shared by all QPs with the same Hessian."""
 
     model: Model
-    """Model, eq. (4)."""
     mpc: MPC
     """Weights, bounds and model of the QPs."""
     which: int
@@ -102,53 +99,56 @@ class Problem:
 
 
 def pose(model: Model, mpc: MPC, which: int) -> Problem:
-    """The QPs for the FIRST step or for LATER ones.
+    """QPs for the FIRST step or for LATER ones.
 
     Source: eqs. (5), (9).
     """
     axes, H = len(model.b0), len(mpc.weights.states)
     forced = np.zeros((axes, H, 2, H))
-    """Γ: what the inputs add to the states 1 … H."""
+    """Γ: effect of the inputs on the states 1 … H."""
     response = model.B
     for stage in range(H):
         for later in range(stage, H):
             # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
-    # In full, for it is made twice a flight; what every step needs is done in O(H) below.
+    # As a full matrix, since it is computed twice a flight only; every step's work is O(H), see
+    # below.
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
 
 
-# -- passes along the horizon, side by side -------------------------------------------------------
+# -- recursions along the horizon, for several vehicles at once -----------------------------------
 
 WIDTH = 16
-"""Vehicles that are planned for side by side: LLVM makes no vectors of shorter loops."""
+"""Number of vehicles planned for at once: LLVM does not vectorise shorter loops."""
 
 
 class SimdBatch(NamedTuple):
-    """Scratch of some vehicles' problems on one axis; L = WIDTH or 1 vehicles, the last index."""
+    """Scratch for the problems of several vehicles on one axis; L = WIDTH or 1 vehicles, last
+    index.
+    """
 
     p: F1
-    """Position, or costate of it, at the stage under way; shape (L,)."""
+    """Position, or its costate, at the current stage; shape (L,)."""
     v: F1
-    """Velocity, or costate of it; shape (L,)."""
+    """Velocity, or its costate; shape (L,)."""
     leader_p: F1
-    """Position of the vehicle that is followed [m]; shape (L,)."""
+    """Position of the plan that is tracked [m]; shape (L,)."""
     leader_v: F1
-    """Velocity of the vehicle that is followed [m/s]; shape (L,)."""
+    """Velocity of the plan that is tracked [m/s]; shape (L,)."""
     w: F1
     """Disturbance ŵ [m/s]; shape (L,)."""
     p00: F1
-    """Entry for position of the matrix P of the backward pass; shape (L,)."""
+    """Matrix P of the backward pass, entry of position; shape (L,)."""
     p01: F1
-    """Entry for position and velocity; shape (L,)."""
+    """Matrix P, mixed entry; shape (L,)."""
     p11: F1
-    """Entry for velocity; shape (L,)."""
+    """Matrix P, entry of velocity; shape (L,)."""
     total: F1
-    """Sum of a gradient, which is not finite where one of its numbers is not; shape (L,)."""
+    """Sum of the gradient, which is not finite if one of its numbers is not; shape (L,)."""
     changed: F1
-    """Number of inputs that entered or left the active set in the last round; shape (L,)."""
+    """Number of inputs that entered or left the active set in the last iteration; shape (L,)."""
     held: F1
     """Number of inputs in the active set; shape (L,)."""
     worst: F1
@@ -160,23 +160,23 @@ class SimdBatch(NamedTuple):
     target_v: F2
     """Desired velocities [m/s]; shape (H + 1, L)."""
     leader_speed: F2
-    """Velocities of the vehicle that is followed [m/s]; shape (H + 1, L)."""
+    """Velocities of the plan that is tracked [m/s]; shape (H + 1, L)."""
     drift_p: F2
-    """See `lead`, on position; shape (H, L)."""
+    """Weighted position error without inputs, see `lead`; shape (H, L)."""
     drift_v: F2
-    """The drift on velocity; shape (H, L)."""
+    """Weighted velocity error without inputs; shape (H, L)."""
     previous: F2
-    """Horizon of the step before, shifted [m/s]; shape (H, L)."""
+    """Previous plan, shifted [m/s]; shape (H, L)."""
     gradient: F2
     """Gradient g; shape (H, L)."""
     inputs: F2
-    """Optimal inputs, not rounded yet [m/s]; shape (H, L)."""
+    """Optimal inputs, not yet rounded [m/s]; shape (H, L)."""
     side: F2
-    """-1 or 1 where the input is at that bound, 0 where it is free; shape (H, L)."""
+    """-1 or 1 if the input is at that bound, 0 if it is free; shape (H, L)."""
     own: F2
-    """Input that each stage would choose for itself at x = 0 [m/s]; shape (H, L)."""
+    """Unconstrained choice of each stage at x = 0 [m/s]; shape (H, L)."""
     k0: F2
-    """Backward pass for the active sets under way, column K0 of `exact`; shape (H, L)."""
+    """Column K0 of the backward pass, see `exact`; shape (H, L)."""
     k1: F2
     """Column K1."""
     f00: F2
@@ -190,13 +190,13 @@ class SimdBatch(NamedTuple):
 
 
 def simd_memory(H: int, width: int) -> Array:
-    """Memory of a `SimdBatch`: one array, since each costs time in a call."""
+    """Memory of a `SimdBatch` in one array, since each array costs time in a call."""
     return np.zeros((len(SimdBatch._fields), H + 1, width))
 
 
 @shared
 def simd_batch(memory: F3) -> SimdBatch:
-    """The batch in what `simd_memory` made."""
+    """Batch that uses memory from `simd_memory`."""
     H = memory.shape[1] - 1
     return SimdBatch(
         p=memory[0, 0],
@@ -233,10 +233,7 @@ def simd_batch(memory: F3) -> SimdBatch:
 
 @lanes
 def set_previous(inputs: Inputs, gap: int, fresh: bool, simd: SimdBatch, lane: int) -> None:
-    """Fill in the horizon of the step before as seen `gap` steps later; zeros without one.
-
-    Its last input is repeated.
-    """
+    """Fill in the previous plan shifted by `gap` steps, its last input repeated; zeros if fresh."""
     H = len(inputs)
     for stage in range(H):
         simd.previous[stage, lane] = 0.0 if fresh else inputs[min(stage + gap, H - 1)]
@@ -252,23 +249,23 @@ def set_target(states: F2, simd: SimdBatch, lane: int) -> None:
 
 @lanes
 def set_inputs(inputs: Inputs, simd: SimdBatch, lane: int) -> None:
-    """Fill in inputs that were found elsewhere [m/s]; shape (H,)."""
+    """Fill in inputs computed elsewhere [m/s]; shape (H,)."""
     for stage in range(len(inputs)):
         simd.inputs[stage, lane] = inputs[stage]
 
 
 @lanes
 def column(numbers: F2, lane: int, to: Inputs) -> None:
-    """Copy one vehicle's number of each stage."""
+    """Copy one vehicle's numbers, one per stage."""
     for stage in range(len(to)):
         to[stage] = numbers[stage, lane]
 
 
 @lanes
 def lead(mpc: MPC, axis: int, simd: SimdBatch) -> None:
-    """Fill in the drift W (Φ x - target): how far off the vehicle would come without any input.
+    """Fill in W (Φ x - target): the weighted error without any input.
 
-    Read: p and v at stage 0, the disturbance w that is added to every input on its way, target.
+    Reads p and v at stage 0, the disturbance w that adds to every input, and the target.
     """
     model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
     p, v, w = simd.p, simd.v, simd.w
@@ -285,15 +282,15 @@ def lead(mpc: MPC, axis: int, simd: SimdBatch) -> None:
 
 @inline
 def rounded(u: float) -> float:
-    """The input as it is sent, in float32, see `planner`."""
+    """Input rounded to float32, as it is sent."""
     return np.float64(np.float32(u))
 
 
 @lanes
 def follow(mpc: MPC, axis: int, simd: SimdBatch) -> None:
-    """Fly one vehicle by the inputs, and fill in the drift of another toward it, in one go.
+    """Fill in the tracked plan from its inputs, and W (Φ x - plan) of the vehicle that tracks it.
 
-    Read: p, v and w of the one that follows; leader_p, leader_v and inputs of the other.
+    Reads p, v and w of the vehicle; leader_p, leader_v and inputs of the plan.
 
     Source: eq. (7).
     """
@@ -319,11 +316,12 @@ def follow(mpc: MPC, axis: int, simd: SimdBatch) -> None:
 def adjoint(
     model: Axis, co: tuple[float, float], drift_p: float, drift_v: float
 ) -> tuple[float, float]:
-    """Costate λ of eq. (4) a stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is an input's effect.
+    """Costate λ of eq. (4) one stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is an input's
+    effect.
 
     Args:
         model: eq. (4) on one axis.
-        co: λ of the stage behind, on position and velocity; 0 behind the last.
+        co: λ of the next stage, on position and velocity; 0 after the last.
         drift_p, drift_v: derivative of the cost by the state that the stage leads to.
     """
     return co[0] + drift_p, model.a01 * co[0] + model.a11 * co[1] + drift_v
@@ -331,25 +329,25 @@ def adjoint(
 
 @inline
 def pulled(S: float, previous: float, T: float, target_v: float, R: float, w: float) -> float:
-    """S- and R-terms of the gradient of one input, with its sign turned.
+    """S- and R-terms of the gradient of one input, with negative sign.
 
     Args:
         S, T, R: weights of change, desired velocity and input, see `Weights`.
-        previous: this input in the horizon before [m/s].
+        previous: this input in the previous plan [m/s].
         target_v: desired velocity [m/s].
-        w: what is added to the input on its way [m/s].
+        w: disturbance that adds to the input [m/s].
     """
     return S * previous + T * target_v - R * w
 
 
 @lanes
 def gradient(mpc: MPC, axis: int, which: int, simd: SimdBatch, target_v: F2) -> None:
-    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of eq. (4), less R and S terms.
+    """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of eq. (4), minus R and S terms.
 
     Args:
         mpc, axis: the problem.
         which: FIRST or LATER weights.
-        simd: drift, previous and w are read.
+        simd: reads drift, previous and w.
         target_v: desired velocities [m/s]; shape (H + 1, L).
 
     Source: eqs. (5), (9).
@@ -371,12 +369,12 @@ def gradient(mpc: MPC, axis: int, which: int, simd: SimdBatch, target_v: F2) -> 
 
 @lanes
 def slope(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
-    """Turn g into 𝓗 U + g, with U as it is sent: 0 where U is optimal and within its bounds.
+    """Replace g by 𝓗 U + g, with U as sent: 0 where U is optimal and within its bounds.
 
     Args:
         mpc, axis: the problem.
         which: FIRST or LATER weights.
-        simd: gradient and inputs are read; the gradient is filled in anew.
+        simd: reads gradient and inputs; replaces the gradient.
     """
     model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
     p, v, u, g = simd.p, simd.v, simd.inputs, simd.gradient
@@ -404,9 +402,10 @@ def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: floa
     """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
 
     Args:
-        x: by how much position [m] and velocity [m/s] are others at stage 0; with 0 what is added
-            is ΔUᵀ 𝓗 ΔU.
+        mpc, axis: the problem.
+        x: change of position [m] and velocity [m/s] at stage 0; if 0, the sum is ΔUᵀ 𝓗 ΔU.
         change: ΔU [m/s]; shape (H,).
+        cost: the sum so far.
     """
     model, W, rho = axis_at(mpc.model, axis), mpc.weights.states, mpc.weights.inputs
     p, v = x

@@ -1,15 +1,15 @@
-"""Solver of the box-constrained QPs of `server.mpc.problem`: a batch of them in, inputs out."""
+"""Interface of solvers for the box-constrained QPs of `server.mpc.problem`."""
 
 from typing import Protocol
 
 from skytether.shared.law.model import Array, Flags
 
 NEAR = 1.0 - 1e-6
-"""Share of its bound at which a guessed input counts as at the bound: guesses were float32."""
+"""Share of its bound from which on a guessed input counts as at the bound: guesses were float32."""
 
 
 class SolverFailed(Exception):
-    """The QP of one vehicle has no trustworthy answer."""
+    """The QP of one vehicle has no reliable solution."""
 
     def __init__(self, status: str, iterations: int = 0) -> None:
         super().__init__(f"{status} after {iterations} iterations")
@@ -18,16 +18,16 @@ class SolverFailed(Exception):
 
 
 class Solver(Protocol):
-    """Solves QPs of one Hessian."""
+    """Solver of QPs with the same Hessian."""
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """The optimal inputs of n vehicles.
+        """Optimal inputs of n vehicles.
 
         Args:
             gradient: shape (n, axes, H).
-            guess: inputs expected to be near [m/s]; shape (n, axes, H).
+            guess: initial guess of the inputs [m/s]; shape (n, axes, H).
 
         Returns:
-            inputs within the bounds, shape (n, axes, H), and which vehicles were solved,
-            shape (n,). The inputs of a vehicle that was not are its guess.
+            inputs within the bounds, shape (n, axes, H), and which vehicles were solved, shape
+            (n,). The inputs of an unsolved vehicle are its guess.
         """

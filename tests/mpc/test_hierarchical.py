@@ -18,8 +18,8 @@ from skytether.server.common.desired import Desired
 from skytether.server.common.scheme import FIGURES, Figures, Foresight, foresight
 from skytether.server.controller import BLOCK
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
-from skytether.server.mpc.exact import ExactSolver, Workspace
-from skytether.server.mpc.hierarchical import Batch, Planner
+from skytether.server.mpc.exact import ExactSolver, RiccatiWorkspace
+from skytether.server.mpc.hierarchical import PlanBatch, Planner
 from skytether.server.mpc.osqp_solver import OsqpSolver
 from skytether.server.mpc.problem import FIRST, LATER, Problem, make_mpc, pose
 from skytether.shared.core.stopwatch import Stopwatch
@@ -409,7 +409,7 @@ ROUGH = {
 compiled_pass = skytether.server.mpc.hierarchical._plan
 
 
-def leaving(batch: Batch, rows: Indices, steps: Indices, work: Workspace) -> int:
+def leaving(batch: PlanBatch, rows: Indices, steps: Indices, work: RiccatiWorkspace) -> int:
     """Plan as the compiled pass does, but leave every third vehicle unsolved, with its memory."""
     left, memory = rows[::3], batch.memory
     before = memory.inputs[:, left], memory.start[left], memory.step[left]

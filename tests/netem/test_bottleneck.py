@@ -28,11 +28,11 @@ def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[i
     bottleneck: Bottleneck[int] = Bottleneck(queue)
     out: dict[int, int] = {}
     for number, (entered_ns, size, flow) in enumerate(packets):
-        out.update(bottleneck.give(now_ns=entered_ns))
-        bottleneck.take(number, size, flow, now_ns=entered_ns)
+        out.update(bottleneck.release(now_ns=entered_ns))
+        bottleneck.accept(number, size, flow, now_ns=entered_ns)
         assert bottleneck.waiting_bytes <= queue.room_bytes
     while (due_ns := bottleneck.next_due_ns()) is not None:
-        out.update(bottleneck.give(now_ns=due_ns))
+        out.update(bottleneck.release(now_ns=due_ns))
     assert (bottleneck.waiting, bottleneck.waiting_bytes) == (0, 0)
     return out, bottleneck.dropped
 
@@ -164,9 +164,9 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
     link = Link(UPLINK, 1472, None, direction.path)
     lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
     for _ in range(3):
-        link.take(Datagram(b"x" * (128 - HEADER_BYTES), ("a", 1)), lane, now_ns=0)
+        link.accept(Datagram(b"x" * (128 - HEADER_BYTES), ("a", 1)), lane, now_ns=0)
     assert link.next_due_ns() == 10 * MILLISECOND_NS
-    assert link.give(now_ns=30 * MILLISECOND_NS) == []
+    assert link.release(now_ns=30 * MILLISECOND_NS) == []
     assert (link.counts.lost, link.counts.queueing.largest_ns) == (3, 30 * MILLISECOND_NS)
 
 
@@ -176,11 +176,11 @@ def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
     link = Link(UPLINK, 1472, None, direction.path)
     lane, size = Lane(0, Fates(direction, 1, "uplink", 0), 0), 128 - HEADER_BYTES
     for _ in range(5):
-        link.take(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)
+        link.accept(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)
     assert (link.depth(), link.depth_bytes()) == (4, 4 * 128)
-    link.give(now_ns=25 * MILLISECOND_NS)  # two have passed, and arrive 0.1 s later
+    link.release(now_ns=25 * MILLISECOND_NS)  # two have passed, and arrive 0.1 s later
     assert (link.depth(), link.depth_bytes()) == (4, 2 * size + 2 * 128)
-    link.give(now_ns=115 * MILLISECOND_NS)
+    link.release(now_ns=115 * MILLISECOND_NS)
     assert (link.depth(), link.depth_bytes()) == (4, 4 * size)
 
 
@@ -191,12 +191,12 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
         link = Link(UPLINK, 1472, None, slow.path)
         lane = Lane(0, Fates(slow, 1, "uplink", 0), 0)
         for _ in range(20):
-            link.take(Datagram(b"x" * 72, ("a", 1)), lane, now_ns=0)
-        link.give(now_ns=20 * MILLISECOND_NS)
+            link.accept(Datagram(b"x" * 72, ("a", 1)), lane, now_ns=0)
+        link.release(now_ns=20 * MILLISECOND_NS)
         link.change(path(text), now_ns=20 * MILLISECOND_NS)
         left = 0
         while (due_ns := link.next_due_ns()) is not None:
-            left += len(link.give(now_ns=due_ns))
+            left += len(link.release(now_ns=due_ns))
             assert due_ns <= due_ms * MILLISECOND_NS
         assert left == 18
 
@@ -209,9 +209,9 @@ def test_ordered_lets_nobody_overtake() -> None:
         lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
         for number in range(200):
             now_ns = number * 5 * MILLISECOND_NS
-            link.give(now_ns=now_ns)
-            link.take(Datagram(b"x", ("a", 1)), lane, now_ns=now_ns)
-        link.give(now_ns=10 * SECOND_NS)
+            link.release(now_ns=now_ns)
+            link.accept(Datagram(b"x", ("a", 1)), lane, now_ns=now_ns)
+        link.release(now_ns=10 * SECOND_NS)
         assert link.counts.forwarded == 200
         assert (link.counts.reordered > 0) == reordered
 
@@ -222,8 +222,8 @@ def test_copies_and_flipped_bits() -> None:
     link = Link(UPLINK, 1472, None, direction.path)
     lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
     for number in range(50):
-        link.take(Datagram(bytes(20), ("a", 1)), lane, now_ns=number * MILLISECOND_NS)
-    out = [datagram.payload for datagram in link.give(now_ns=SECOND_NS)]
+        link.accept(Datagram(bytes(20), ("a", 1)), lane, now_ns=number * MILLISECOND_NS)
+    out = [datagram.payload for datagram in link.release(now_ns=SECOND_NS)]
     assert len(out) == 100
     assert out[::2] == out[1::2]
     assert {int.from_bytes(payload).bit_count() for payload in out} == {1}

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skytether.netem import link as link_module
 from skytether.netem.fate import Fates
-from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, Held, Lane, Link
+from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, QueuedPacket, Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
@@ -58,12 +58,12 @@ def packet(name: str) -> Datagram:
 def take(link: Link, lane: Lane, names: str, *, now_ns: int = 0) -> None:
     """A packet for each letter enters."""
     for name in names:
-        link.take(packet(name), lane, now_ns=now_ns)
+        link.accept(packet(name), lane, now_ns=now_ns)
 
 
 def give(link: Link, *, now_ns: int) -> str:
     """The letters of the packets that leave."""
-    return "".join(datagram.payload.decode() for datagram in link.give(now_ns=now_ns))
+    return "".join(datagram.payload.decode() for datagram in link.release(now_ns=now_ns))
 
 
 def test_packets_leave_when_they_are_due_and_not_before() -> None:
@@ -97,17 +97,17 @@ def test_what_leaves_is_what_a_sorted_list_would_give(
     arrived, dues = 0, []
     for number, (gap, delay, lost) in enumerate(packets):
         arrived += gap
-        link.take(Datagram(bytes([number]), PEER), lane, now_ns=arrived)
+        link.accept(Datagram(bytes([number]), PEER), lane, now_ns=arrived)
         dues += [] if lost else [(arrived + delay, number)]
-    left = [datagram.payload[0] for datagram in link.give(now_ns=now_ns)]
+    left = [datagram.payload[0] for datagram in link.release(now_ns=now_ns)]
     assert left == [number for due, number in sorted(dues) if due <= now_ns]
     assert link.depth() == len(dues) - len(left)
 
 
 def test_a_packet_leaves_as_it_came() -> None:
     link, datagram = make_link(), Datagram(b"\x00\xff", PEER, 7)
-    link.take(datagram, make_lane(5), now_ns=0)
-    assert link.give(now_ns=5) == [datagram]
+    link.accept(datagram, make_lane(5), now_ns=0)
+    assert link.release(now_ns=5) == [datagram]
 
 
 def test_a_packet_leaves_once() -> None:
@@ -164,8 +164,8 @@ def test_what_is_longer_than_the_mtu_is_dropped_and_counted_apart() -> None:
     """The longest that passes is the MTU itself; the dropped one uses up its fate."""
     link, lane = make_link(mtu=1200), make_lane(0, 0, 7)
     for size in (1200, 1201, 1):
-        link.take(Datagram(bytes(size), PEER), lane, now_ns=0)
-    assert [len(datagram.payload) for datagram in link.give(now_ns=6)] == [1200]
+        link.accept(Datagram(bytes(size), PEER), lane, now_ns=0)
+    assert [len(datagram.payload) for datagram in link.release(now_ns=6)] == [1200]
     assert link.next_due_ns() == 7
     counts = link.counts
     assert (counts.oversized, counts.lost, counts.overflowed, counts.packets) == (1, 0, 0, 3)
@@ -177,11 +177,11 @@ def test_what_is_under_way_is_bounded_in_bytes_too() -> None:
     lane = make_lane(*range(1, 2001))
     payload = bytes(size)
     for _ in range(2000):
-        link.take(Datagram(payload, PEER), lane, now_ns=0)
+        link.accept(Datagram(payload, PEER), lane, now_ns=0)
     most = QUEUE_BYTES_MAX // size
     assert (link.depth(), link.counts.overflowed) == (most, 2000 - most)
     assert link.depth_bytes() == most * size <= QUEUE_BYTES_MAX
-    assert len(link.give(now_ns=most)) == most
+    assert len(link.release(now_ns=most)) == most
     assert link.depth_bytes() == 0
 
 
@@ -190,9 +190,9 @@ def test_what_leaves_makes_room_for_as_many_bytes(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(link_module, "QUEUE_BYTES_MAX", 100)
     link, lane = make_link(), make_lane(5, 5, 5, 5)
     for size in (90, 20, 10):
-        link.take(Datagram(bytes(size), PEER), lane, now_ns=0)
-    assert [len(datagram.payload) for datagram in link.give(now_ns=5)] == [90, 10]
-    link.take(Datagram(bytes(100), PEER), lane, now_ns=5)
+        link.accept(Datagram(bytes(size), PEER), lane, now_ns=0)
+    assert [len(datagram.payload) for datagram in link.release(now_ns=5)] == [90, 10]
+    link.accept(Datagram(bytes(100), PEER), lane, now_ns=5)
     assert (link.depth(), link.counts.overflowed) == (1, 1)
 
 
@@ -246,8 +246,8 @@ def test_a_lost_packet_overtakes_nobody() -> None:
 
 def test_the_bytes_of_all_packets_are_counted() -> None:
     link, lane = make_link(), make_lane(0, 0, lost=[0])
-    link.take(Datagram(bytes(600), PEER), lane, now_ns=0)
-    link.take(Datagram(b"", PEER), lane, now_ns=0)
+    link.accept(Datagram(bytes(600), PEER), lane, now_ns=0)
+    link.accept(Datagram(b"", PEER), lane, now_ns=0)
     assert link.counts.bytes == 600
 
 
@@ -275,8 +275,8 @@ def recorded(direction: int, lane: Lane, names: str) -> Rows:
     sink = io.BytesIO()
     link = Link(direction, 1472, Recorder(PACKET_COLUMNS, sink))
     for index, name in enumerate(names):
-        link.take(packet(name), lane, now_ns=1000 * index)
-    link.give(now_ns=10**9)
+        link.accept(packet(name), lane, now_ns=1000 * index)
+    link.release(now_ns=10**9)
     return parse(sink.getvalue())
 
 
@@ -299,12 +299,12 @@ def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
     for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: the clock went back
         link, lane = make_link(), Lane(0, fates, began_ns)
         for slot in (*before, 60, 60):
-            link.take(packet("a"), lane, now_ns=began_ns + slot * SLOT_NS)
+            link.accept(packet("a"), lane, now_ns=began_ns + slot * SLOT_NS)
         assert (lane.slot, lane.rank) == (60, 1)
     seen = []
     for late_ns in (0, SLOT_NS - 1, SLOT_NS):
         link, now_ns = make_link(), began_ns + 60 * SLOT_NS + late_ns
-        link.take(packet("a"), Lane(0, fates, began_ns), now_ns=now_ns)
+        link.accept(packet("a"), Lane(0, fates, began_ns), now_ns=now_ns)
         seen.append((link.next_due_ns() or 0) - now_ns)
     assert seen == [fates.at(slot).delay_ns for slot in (60, 60, 61)]
     assert seen[0] != seen[2]
@@ -321,7 +321,7 @@ def test_slices_of_time_give_packets_in_the_order_of_one_heap(
 ) -> None:
     """By due time and then by order of entry, whenever packets enter and leave."""
     queue, now_ns = link_module.Queue(), 0
-    heap: list[Held] = []
+    heap: list[QueuedPacket] = []
     lane = make_lane()
     for entered, (delay_ns, pause_ns) in enumerate(steps):
         held = (now_ns + delay_ns, entered, packet(""), 0, lane, entered, delay_ns, False)
