@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skytether.netem import link as link_module
 from skytether.netem.fate import Fates
-from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, QueuedPacket, Lane, Link
+from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, Lane, Link, QueuedPacket
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
