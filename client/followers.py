@@ -115,12 +115,12 @@ class HorizonFollower:
         # Not math.hypot: its rounding differs in 17 % of cases from the square root in the server's
         # replay.
         self._table[:, rule.SPEED] = math.sqrt(sum(u * u for u in within))
-        self.lead = np.zeros((terms.axes, 2))
+        self.reference = np.zeros((terms.axes, 2))
         """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""
         if feedback is not None:
             self._table[:, TABLED] = feedback[:, TOLD]
-            self.lead[:] = feedback[:, LED]
-        self._lead_stage = 0
+            self.reference[:] = feedback[:, LED]
+        self._reference_stage = 0
 
     def input_at(
         self,
@@ -132,9 +132,9 @@ class HorizonFollower:
         """See `Follower`."""
         flown = np.empty((2, len(state)))
         rule.fly_horizon(
-            self._table, self._inputs, self.lead, self._lead_stage, stage, state, flown
+            self._table, self._inputs, self.reference, self._reference_stage, stage, state, flown
         )
-        self._lead_stage = max(stage, self._lead_stage)
+        self._reference_stage = max(stage, self._reference_stage)
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
@@ -142,7 +142,7 @@ class HorizonFollower:
         if flown is not None:
             return self._model.step(state, flown + self._table[:, rule.DISTURBANCE])
         ahead = np.empty_like(state)
-        rule.foresee_horizon(self._table, self._inputs, self.lead, stage, state, ahead)
+        rule.foresee_horizon(self._table, self._inputs, self.reference, stage, state, ahead)
         return ahead
 
 
@@ -174,9 +174,9 @@ class SplineFollower:
         self._table = table = constants.guide.copy()
         table[:, spline.SPACING], table[:, spline.LENGTH] = spacing, length
         table[:, spline.LAST], table[:, spline.SPEED] = last, math.hypot(*last)
-        self.lead = self._knots[:, :2].copy()
+        self.reference = self._knots[:, :2].copy()
         """Reference state x̄ on the spline at the newest stage [m, m/s]; shape (axes, 2)."""
-        self._lead_stage = 0
+        self._reference_stage = 0
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
         """See `Follower`."""
@@ -184,19 +184,19 @@ class SplineFollower:
         spline.fly_spline(
             self._table,
             self._knots,
-            self.lead,
-            self._lead_stage,
+            self.reference,
+            self._reference_stage,
             stage,
             state,
             disturbance,
             before,
             flown,
         )
-        self._lead_stage = stage
+        self._reference_stage = stage
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:  # noqa: ARG002
         """See `Follower`; the input flown is not used."""
         ahead = np.empty_like(state)
-        spline.foresee_spline(self._table, self._knots, self.lead, stage, state, ahead)
+        spline.foresee_spline(self._table, self._knots, self.reference, stage, state, ahead)
         return ahead

@@ -16,7 +16,7 @@ from skytether.client.filter import Kalman
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.law.dead_time import OnTheirWay
+from skytether.shared.law.dead_time import PendingInputs
 from skytether.shared.law.leap import (
     NOISE_M,
     NOISE_MPS,
@@ -80,7 +80,7 @@ class Navigation:
         self.filter = Kalman(scenario, sensor.delay) if filters(scenario) else Newest(axes)
         """Filter that turns measurements into an estimate."""
         late = any(terms.dead_time_s)
-        self._inputs = OnTheirWay(terms.model.axes(), terms.dead_times) if late else None
+        self._inputs = PendingInputs(terms.model.axes(), terms.dead_times) if late else None
         """Inputs that are not acting yet; None if the model has no dead time."""
         self._delay_ns = sensor.delay * scenario.dt_ns
         """Delay of measurements that the filter allows for [ns]."""

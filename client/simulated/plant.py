@@ -10,7 +10,7 @@ import numpy as np
 
 from skytether.client.simulated.weather import Weather
 from skytether.shared.base.compilable import Numbers, Table, compilable
-from skytether.shared.law.dead_time import OnTheirWay, dead_time
+from skytether.shared.law.dead_time import PendingInputs, dead_time
 from skytether.shared.law.model import Array, Axis, advance, discretise
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
@@ -47,7 +47,7 @@ class FirstOrderPlant:
             for theta_s in zip(tau.tolist(), late_s, strict=True)
         ]
         self._late = np.array([each.late for each in late])
-        self._inputs = OnTheirWay(model.axes(), late) if any(late_s) else None
+        self._inputs = PendingInputs(model.axes(), late) if any(late_s) else None
         """Inputs that are not acting yet; None without a dead time."""
         self.weather = weather
         self.x = np.zeros((len(tau), 2))

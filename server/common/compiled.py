@@ -32,7 +32,7 @@ Laws = Annotated[NDArray[np.void], records(AXIS_LAW, 1)]
 
 advance = shared(model.advance)
 bounded, lasting = shared(rule.bounded), shared(rule.lasting)
-lead_to, step = shared(rule.lead_to), shared(rule.step)
+reference_at, step = shared(rule.reference_at), shared(rule.step)
 
 
 @inline

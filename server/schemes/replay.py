@@ -9,11 +9,11 @@ disturbance observer replays what was flown, and doubt asks what follows from a 
 
 from typing import NamedTuple
 
-from skytether.server.common.compiled import advance, axis_of, lead_to, step
+from skytether.server.common.compiled import advance, axis_of, reference_at, step
 from skytether.server.schemes.sent import HOVERS, Sent
 from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings
 from skytether.shared.base.kernel import F1, F2, I1, inline, part
-from skytether.shared.law.rule import Held
+from skytether.shared.law.rule import AxisHorizon
 
 
 class HorizonsInForce(NamedTuple):
@@ -92,7 +92,7 @@ def roll(
         if number < 0:
             # Unknown horizon: assume that the last input is held.
             brake = settings.brake if number == HOVERS else 0.0
-            stands = Held(
+            stands = AxisHorizon(
                 model, (told_first,), 1, True, speed_told, brake, bound, False, 0.0, 0.0, 0.0
             )
             p, v = _fly(stands, begin, 0.0, 0.0, p, v, w, first, last, begin, told_first, track)
@@ -100,7 +100,7 @@ def roll(
         slot = number % memory.sent.plans.shape[1]
         horizon, led = memory.horizons[row, slot], memory.led[row, slot, axis]
         made_for, led_p, led_v = memory.sent.plans[row, slot].step, led.p, led.v
-        held = Held(
+        held = AxisHorizon(
             model,
             memory.inputs[row, slot, axis],
             horizon.length,
@@ -114,7 +114,7 @@ def roll(
             led.w,
         )
         if settings.feeds_back:
-            led_p, led_v = lead_to(held, led.stage, first - made_for, led_p, led_v)
+            led_p, led_v = reference_at(held, led.stage, first - made_for, led_p, led_v)
             if leg == 0 and first - made_for > led.stage:
                 led.stage, led.p, led.v = first - made_for, led_p, led_v
         p, v = _fly(held, made_for, led_p, led_v, p, v, w, first, last, begin, told_first, track)
@@ -124,7 +124,7 @@ def roll(
 
 @inline
 def _fly(
-    held: Held,
+    held: AxisHorizon,
     made_for: int,
     led_p: float,
     led_v: float,

@@ -1,4 +1,4 @@
-"""Events of a vehicle's own autopilot: what the client hears of it, and how it judges that."""
+"""Events about a vehicle's autopilot: its messages, and the client's judgement of them."""
 
 import msgspec
 
@@ -11,15 +11,15 @@ class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameter of an autopilot, and what it means for whoever flies the vehicle."""
+    """Parameter of an autopilot and its meaning for the flight."""
 
     name: str
     value: float | None
-    """Value; None of a parameter that the autopilot does not have."""
+    """Value; None if the autopilot does not have the parameter."""
     meaning: str
     """Meaning of the value, in words."""
     wanted: str = ""
-    """Values that would be safe, and the one to set; empty where this one is."""
+    """Safe values, and the one to set; empty if the value is safe."""
 
     def __str__(self) -> str:
         value = "missing" if self.value is None else f"{self.value:g}"
@@ -28,19 +28,19 @@ class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has heard its autopilot for the first time."""
+    """The client has heard the vehicle's autopilot for the first time."""
 
     name: str
     """Name and version."""
     system: int
-    """Number of its system in MAVLink."""
+    """Number of its MAVLink system."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
 
 
 class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has read the parameters that decide what its autopilot does in silence."""
+    """The client has read the parameters that decide how the autopilot reacts to silence."""
 
     parameters: tuple[AutopilotParameter, ...]
 
@@ -50,10 +50,10 @@ class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has set parameters of its autopilot, and read them back."""
+    """The client has set parameters of the autopilot, and read them back."""
 
     changes: tuple[tuple[str, float, float], ...]
-    """Name, value before and value after of each."""
+    """Name, old value and new value of each."""
 
     def __str__(self) -> str:
         lines = [
@@ -64,30 +64,30 @@ class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotRefused(VehicleEvent, frozen=True, kw_only=True):
-    """An autopilot has refused a command."""
+    """The autopilot has refused a command."""
 
     asked: str
     """Command, in words."""
     answer: str
-    """Answer of the autopilot: the name of a MAV_RESULT."""
+    """Answer of the autopilot, the name of a MAV_RESULT."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: its autopilot refuses to {self.asked}: {self.answer}"
 
 
 class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's autopilot has said something in words."""
+    """The autopilot has sent a status text."""
 
     text: str
     severity: int
-    """Severity as MAVLink has it, from 0, an emergency, to 7."""
+    """MAVLink severity, from 0 (emergency) to 7."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}, its autopilot: {self.text}"
 
 
 class TextsOmitted(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's autopilot has said more in words than is logged one by one."""
+    """The autopilot has sent more status texts than are logged."""
 
     count: int
     """Number of texts that were not logged."""
@@ -107,14 +107,14 @@ class AutopilotWaits(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
-    """Datagrams come to the line of a silent autopilot from another address, and are dropped."""
+    """Datagrams arrive from another address than that of a silent autopilot, and are dropped."""
 
     came_from: str
-    """HOST:PORT of their sender."""
+    """HOST:PORT of the sender."""
     expected: str
     """HOST:PORT of the autopilot."""
     content: str
-    """What they contain, in words."""
+    """Content of the newest datagram, in words."""
 
     def __str__(self) -> str:
         silent = f"vehicle {self.vehicle}: nothing comes from its autopilot at {self.expected}"
@@ -122,19 +122,19 @@ class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotMoved(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on the ground hears its autopilot from another address after a silence."""
+    """The autopilot of a vehicle on the ground is heard from another address after a silence."""
 
     before: str
-    """HOST:PORT that it had."""
+    """Old HOST:PORT."""
     after: str
-    """HOST:PORT that it has."""
+    """New HOST:PORT."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: its autopilot is at {self.after}, it was at {self.before}"
 
 
 class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
-    """Positions come from a vehicle's autopilot, but none of them can be used."""
+    """Positions arrive from the autopilot, but none of them can be used."""
 
     why: str
 
@@ -143,7 +143,7 @@ class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's autopilot is in another mode, or has been armed or disarmed."""
+    """The autopilot has changed its mode, or was armed or disarmed."""
 
     mode: str
     armed: bool
@@ -154,14 +154,14 @@ class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has heard somebody else tell its autopilot where to fly."""
+    """Somebody else commands the autopilot."""
 
     system: int
-    """Number of the sender's system in MAVLink."""
+    """Number of the sender's MAVLink system."""
     component: int
     """Number of its component."""
     said: str
-    """Kind of its newest message."""
+    """Type of its newest message."""
 
     def __str__(self) -> str:
         who = f"system {self.system}, component {self.component}"
@@ -169,10 +169,10 @@ class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
 
 
 class Strays(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle does not do what it is told, by more than wind and errors of its model explain."""
+    """A vehicle deviates from its commands by more than wind and model errors explain."""
 
     off_mps: float
-    """Difference between its velocity and those that it can have [m/s]."""
+    """Distance of its velocity from the possible ones [m/s]."""
 
     def __str__(self) -> str:
         off = f"flies {self.off_mps:.1f} m/s otherwise than it is told"
@@ -180,10 +180,10 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not armed, for its autopilot would do what is not safe in silence."""
+    """A vehicle is not armed because its autopilot would react unsafely to silence."""
 
     parameters: tuple[AutopilotParameter, ...]
-    """Parameters that are not safe, or that could not be set."""
+    """Parameters that are unsafe, or could not be set."""
 
     def __str__(self) -> str:
         lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
@@ -197,10 +197,10 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not flown, for its autopilot has not come into the air with it."""
+    """A vehicle is not flown because its take-off has failed."""
 
     doing: str
-    """Stage of the take-off that it has not reached."""
+    """Stage of the take-off that was not reached."""
     why: str
 
     def __str__(self) -> str:
@@ -208,7 +208,7 @@ class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on the ground is not armed before a person says that it may be."""
+    """A vehicle on the ground is not armed until an operator allows it."""
 
     why: str
 
@@ -218,10 +218,10 @@ class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
 
 
 class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle in the air hovers, for nobody knows where the scenario's origin is."""
+    """A vehicle in the air hovers because the scenario's origin is unknown."""
 
     place: tuple[float, float, float]
-    """Where it is in the autopilot's local frame: north, east, up [m]."""
+    """Position in the autopilot's local frame: north, east, up [m]."""
 
     def __str__(self) -> str:
         at = ", ".join(f"{each:.2f}" for each in self.place)
@@ -233,7 +233,7 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
 
 
 AboardFailure = ParametersUnsafe | NotTakenOff
-"""Events after which a vehicle is not flown."""
+"""Events that make a vehicle unusable."""
 AboardEvent = (
     AutopilotFound
     | ParametersRead

@@ -1,11 +1,11 @@
-"""Changes in flight: some keys of a scenario get other values while it is flown.
+"""Changes in flight: new values for some keys of a scenario while it is flown.
 
-    values by key → may these change? → checked as a scenario is → `Endpoint.change` → `Changed`
+    values by key → may these change? → checked like a scenario → `Endpoint.change` → `Changed`
 
 All values of a request take effect together, between two steps of the endpoint, or none does. A
-request is an object of JSON, values by key; one without keys asks which may change. The answer is
-an `Answer`. `shell.control` has the socket that both pass through, and `sim.flight` makes the same
-changes in virtual time.
+request is a JSON object, values by key; an empty one asks for the keys that may change. The answer
+is an `Answer`. `shell.control` has the socket for both, and `sim.flight` makes the same changes in
+virtual time.
 """
 
 from collections.abc import Mapping
@@ -26,31 +26,32 @@ from skytether.shared.scenario.schema import DirectionConfig, Scenario
 REQUEST_BYTES_MAX = 4096
 """Largest size of a request [B]."""
 WHOLE = "impairments"
-"""Key that says all of a direction of the network: the direction itself stands for it."""
+"""Key for all impairments of a direction of the network; the direction itself may be used
+instead."""
 ONCE = keys_of(InFlight.LEAP)
-"""Keys with which something is decided once: no later run of the process takes them up."""
+"""Keys of one-time decisions, which no later run of the process repeats."""
 KEY_SHOWN_MAX = 60
-"""Largest number of characters that a message repeats of a key that there is not."""
+"""Largest number of characters of an unknown key repeated in a message."""
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to a request."""
 
     refused: str = ""
-    """Why nothing was changed, in a line; empty where the request was heeded."""
+    """Why nothing was changed, in one line; empty if the request was carried out."""
     changed: tuple[Changed, ...] = ()
-    """Keys that have another value now."""
+    """Keys with new values."""
     values: dict[str, Any] = {}
-    """Keys that may change and their present values, where the request has none."""
+    """Keys that may change and their present values, if the request was empty."""
 
 
 class Running:
-    """A scenario that an endpoint is flying, and may be changed in.
+    """Scenario being flown by an endpoint, which may be changed.
 
     Args:
-        endpoint: what flies it.
-        scenario: the scenario that the endpoint was made with.
-        settings: values that were set in an earlier run, which it has.
+        endpoint: the endpoint.
+        scenario: scenario that the endpoint was made with.
+        settings: values in it that were set in an earlier run.
     """
 
     def __init__(
@@ -62,11 +63,11 @@ class Running:
         self._endpoint = endpoint
         self._scenario = scenario
         self.settings = settings
-        """All values that were set in flight, by key; another object after each change."""
+        """All values that were set in flight, by key; replaced by a new object at each change."""
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with all that was changed so far."""
+        """The scenario with all changes so far."""
         return self._scenario
 
     @property
@@ -75,37 +76,37 @@ class Running:
         return self._endpoint.changeable
 
     def change(self, values: Mapping[str, Any], *, now_ns: int) -> tuple[Changed, ...]:
-        """Give keys other values, and say so in events of the endpoint.
+        """Change the values of keys, and report it by events of the endpoint.
 
         Args:
-            values: plain values by key, as a scenario's file has them.
+            values: plain values by key, as in a scenario's file.
             now_ns: time on the endpoint's clock [ns].
 
         Returns:
-            What has got another value.
+            Keys whose value has changed.
 
         Raises:
-            ConfigError: nothing was changed, as an event tells, too.
+            ConfigError: nothing was changed, which is reported by an event, too.
         """
         before = reading.to_table(self._scenario)
         try:
             scenario = self._checked(values, before)
-            if said := self._endpoint.objection(scenario, frozenset(values)):
-                raise ConfigError(said)
+            if objection := self._endpoint.objection(scenario, frozenset(values)):
+                raise ConfigError(objection)
         except ConfigError as error:
             self.refuse(str(error))
             raise
-        # Only now, when the whole scenario was checked: a change is made as a whole, or not at all.
+        # Only after checking the whole scenario: a change is made completely, or not at all.
         self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
         lasting = {key: value for key, value in values.items() if key not in ONCE}
         if lasting:
             self.settings = {**self.settings, **lasting}
         changed = tuple(
-            Changed(key=key, before=was, after=becomes)
+            Changed(key=key, before=before_text, after=after_text)
             for key in values
-            if (was := _text(_shown(_at(before, key))))
-            != (becomes := _text(_shown(_at(after, key))))
+            if (before_text := _text(_shown(_at(before, key))))
+            != (after_text := _text(_shown(_at(after, key))))
         )
         for event in changed:
             self._endpoint.tell(event)
@@ -120,10 +121,10 @@ class Running:
         self._endpoint.tell(ChangeRefused(reason=reason))
 
     def answer(self, request: bytes, *, now_ns: int) -> bytes:
-        """Heed a request, whatever it is, and make the answer to it.
+        """Carry out a request, valid or not, and return the encoded answer.
 
         Args:
-            request: what has come, or as much of it as shows that it is too long.
+            request: the request, or enough of it to show that it is too long.
             now_ns: time on the endpoint's clock [ns].
         """
         if len(request) > REQUEST_BYTES_MAX:
@@ -146,7 +147,7 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _checked(self, values: Mapping[str, Any], table: Mapping[str, Any]) -> Scenario:
-        """The scenario with these values laid over it.
+        """Scenario with these values.
 
         Raises:
             ConfigError: a key may not change, or the scenario cannot be flown so.
@@ -159,8 +160,8 @@ class Running:
                 _at(table, key)
             except (KeyError, TypeError):
                 shown = key[:KEY_SHOWN_MAX]
-                # A request may come from anybody who can open the socket: no control characters
-                # into the log.
+                # A request may come from anybody who can open the socket: no control characters in
+                # the log.
                 shown = shown if shown.isprintable() else repr(shown)
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
             what = f"expected one of {', '.join(may)}"
@@ -169,24 +170,24 @@ class Running:
 
 
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
-    """A scenario with other values laid over it.
+    """Scenario with some values replaced.
 
     Args:
-        scenario: with which nothing is wrong.
+        scenario: a valid scenario.
         values: plain values by key.
 
     Raises:
-        ConfigError: there is no such key, or the scenario cannot be flown so.
+        ConfigError: a key is unknown, or the scenario cannot be flown so.
     """
-    laid = reading.to_table(scenario)
+    table = reading.to_table(scenario)
     for key, value in values.items():
         *sections, name = key.split(".")
         try:
-            _at(laid, ".".join(sections))[name] = value
+            _at(table, ".".join(sections))[name] = value
         except (KeyError, TypeError):
             raise ConfigError(f"{key[:KEY_SHOWN_MAX]}: no such key") from None
     try:
-        return reading.check(laid, known=scenario)
+        return reading.check(table, known=scenario)
     except RecursionError:
         raise ConfigError("got values that are nested too deeply") from None
 
@@ -195,11 +196,11 @@ _DECODER = msgspec.json.Decoder(dict[str, Any])
 
 
 def _at(table: Any, key: str) -> Any:
-    """Value that a table has under a key with dots.
+    """Value of a dotted key in a table.
 
     Raises:
-        KeyError: nothing, at some point of the way.
-        TypeError: something that is no table.
+        KeyError: a part of the key is missing.
+        TypeError: a part of the key is not a table.
     """
     for name in filter(None, key.split(".")):
         table = table[name]
@@ -207,12 +208,12 @@ def _at(table: Any, key: str) -> Any:
 
 
 def _shown(value: Any) -> Any:
-    """A value as a user would give it: a direction of the network is its text."""
+    """Value as a user would write it: a direction of the network as its text."""
     if isinstance(value, dict):
         return msgspec.convert(value, DirectionConfig).text
     return value
 
 
 def _text(value: Any) -> str:
-    """A value as a scenario's file has it."""
+    """Value as JSON."""
     return msgspec.json.encode(value).decode()

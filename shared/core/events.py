@@ -1,8 +1,8 @@
-"""Events: what an endpoint, or the process around it, has to say, as typed values.
+"""Events: reports of an endpoint, or of the process around it, as typed values.
 
-An endpoint hands its events out (`Endpoint.events`); a driver gives them to whoever listens: a
-log, a flight in virtual time, a command that has started the process. `str(event)` is the
-operator's sentence. For a program an event is an object of JSON whose key `type` names the class.
+An endpoint returns its events (`Endpoint.events`); a driver passes them to a log, a flight in
+virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
+For programs an event is a JSON object whose key `type` is the name of the class.
 """
 
 from typing import Any, Literal
@@ -20,12 +20,12 @@ def address_text(host: str, port: int) -> str:
 
 
 class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has bound its socket and is about to be driven."""
+    """A process has bound its socket and is about to start."""
 
     host: str
     port: int
     waiting_for: str
-    """Peers whose datagrams it waits for."""
+    """Peers that it waits for."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -33,7 +33,7 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The name of a peer cannot be found yet."""
+    """The name of a peer cannot be resolved yet."""
 
     host: str
     reason: str
@@ -43,7 +43,7 @@ class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The name of a peer that could not be found before has been found."""
+    """The name of a peer was resolved after earlier failures."""
 
     host: str
     address: str
@@ -54,38 +54,38 @@ class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A page can be looked at."""
+    """A page can be opened in a browser."""
 
     address: str
-    """Address for a browser; with a token in it where that may change what flies."""
+    """Address for a browser; includes a token if the page may change the flight."""
     taken: str = ""
-    """HOST:PORT that it was to have, where somebody else has that."""
+    """Requested HOST:PORT, if it is in use already."""
 
     def __str__(self) -> str:
-        # Nothing but a space follows the address: it is copied, or clicked at.
+        # Only a space may follow the address: it is copied, or clicked.
         return f"the page is at {self.address}" + (
             f" ({self.taken} is taken)" if self.taken else ""
         )
 
 
 class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A page has turned browsers away, or has dropped what they have sent."""
+    """A page has refused browsers, or dropped what they sent."""
 
     why: str
     count: int
-    """Number of times that this has happened so far."""
+    """Number of times so far."""
 
     def __str__(self) -> str:
         return f"refused, {self.count} so far: {self.why}"
 
 
 class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process serves its figures over HTTP, as metrics."""
+    """A process serves its figures over HTTP as metrics."""
 
     host: str
     port: int
     local: bool = True
-    """Whether no other machine can read them."""
+    """Whether only this machine can read them."""
 
     def __str__(self) -> str:
         whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
@@ -98,7 +98,7 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     at_s: float
     """First time in the flight at which it is too fast [s]."""
     speed_mps: float
-    """Desired speed along an axis then [m/s]."""
+    """Desired speed along an axis at that time [m/s]."""
     most_mps: float
     """Largest speed of the vehicle along this axis [m/s]."""
 
@@ -117,10 +117,10 @@ class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has no keys: what it hears may be anybody's, and anybody may read what it says."""
+    """A process has no keys: its packets can be read and forged by anybody."""
 
     local: bool
-    """Whether no other machine can reach it, nor be reached."""
+    """Whether only this machine can reach it."""
 
     def __str__(self) -> str:
         who = "on this machine" if self.local else "on the network"
@@ -128,22 +128,22 @@ class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has been asked for its figures, or ends."""
+    """A process was asked for its figures, or ends."""
 
     figures: dict[str, Any]
-    """Numbers by name; a dictionary in it is a group of them."""
+    """Figures by name; a nested dictionary is a group."""
 
     def __str__(self) -> str:
         return "counted so far:"
 
 
 class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Events of a kind were left out, for more have happened than are told one by one."""
+    """Events of a kind were left out because there were too many."""
 
     kind: str
-    """Name of their class; "lines" where nobody has read what was printed."""
+    """Name of their class; "lines" if the output was not read in time."""
     count: int
-    """Number of events that are not told."""
+    """Number of events left out."""
 
     def __str__(self) -> str:
         return f"… and {self.count:,} more {self.kind}".replace(",", " ")
@@ -154,24 +154,24 @@ class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     file: str
     reason: str
-    """Message of the system, such as "No space left on device"."""
+    """System's message, such as "No space left on device"."""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.reason}: the record is incomplete, the flight goes on"
 
 
 class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has met a mistake in its own code, and goes on."""
+    """An error in the code of a process, which goes on."""
 
     traceback: str
-    """Traceback in Python's words."""
+    """Python's traceback."""
 
     def __str__(self) -> str:
         return f"a mistake in its code, the flight goes on\n{self.traceback.rstrip()}"
 
 
 class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """New client, heard by netem."""
+    """netem has opened a flow for a new client."""
 
     flow: int
     """Number of the flow, from 0."""
@@ -186,7 +186,7 @@ class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A packet has come back to netem, while the server has never answered."""
 
     times: int
-    """Number of new addresses that it has come from, one after the other."""
+    """Number of successive new addresses that it came from."""
 
     def __str__(self) -> str:
         return (
@@ -196,26 +196,26 @@ class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """An autopilot has said something in words."""
+    """An autopilot has sent a status text."""
 
     text: str
     severity: int
-    """Severity as MAVLink has it, from 0, an emergency, to 7."""
+    """MAVLink severity, from 0 (emergency) to 7."""
 
     def __str__(self) -> str:
         return self.text or "nothing in words"
 
 
 class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A server with keys has dropped datagrams: strangers made them, or they came twice or late."""
+    """A server with keys has dropped datagrams that were forged, repeated or too old."""
 
     count: int
     """Number of them so far."""
     host: str
-    """Host that the newest came from."""
+    """Host of the newest one's sender."""
     port: int
     reason: Drop
-    """Fault of the newest one."""
+    """Why the newest was dropped."""
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
@@ -223,7 +223,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The server misses more of its ticks than it may, or has stopped doing so."""
+    """The server has begun to miss too many ticks, or has stopped missing them."""
 
     degraded: bool
 
@@ -232,33 +232,33 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A key of the scenario has another value from now on."""
+    """A key of the scenario has a new value."""
 
     key: str
     before: str
-    """Value that it had, as a scenario's file has it."""
+    """Old value, as in a scenario's file."""
     after: str
-    """Value that it has."""
+    """New value."""
 
     def __str__(self) -> str:
         return f"{self.key} is {self.after} from now on, it was {self.before}"
 
 
 class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A change in flight that was asked for is refused, and nothing is changed."""
+    """A requested change in flight was refused, and nothing was changed."""
 
     reason: str
-    """Why it cannot be; names the key, what was given and what was expected."""
+    """Reason, which names the key, the given and the expected value."""
 
     def __str__(self) -> str:
         return f"a change is refused: {self.reason}"
 
 
 class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
-    """The server has received the first observation of a vehicle's session."""
+    """The server has received the first observation of a session."""
 
     host: str
-    """Host that the vehicle's HELLO came from."""
+    """Host of the vehicle's HELLO."""
     port: int
 
     def __str__(self) -> str:
@@ -266,14 +266,14 @@ class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
-    """A session has ended: the vehicle has closed it, or was silent for long."""
+    """A session has ended: the vehicle has closed it, or was silent for too long."""
 
     def __str__(self) -> str:
         return f"the session of vehicle {self.vehicle} has ended"
 
 
 class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
-    """Server and vehicle fly different scenarios; each end says so from its own side."""
+    """Server and vehicle fly different scenarios; each end reports it."""
 
     differences: tuple[Difference, ...]
     """Keys of the scenario that differ."""
@@ -287,13 +287,13 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ServerFull(VehicleEvent, frozen=True, kw_only=True):
-    """The server has refused a vehicle for which it has no room."""
+    """The server has refused a vehicle because it is full."""
 
     host: str
-    """Host that the vehicle's HELLO came from."""
+    """Host of the vehicle's HELLO."""
     port: int
     room: int
-    """Number of vehicles that there is room for."""
+    """Largest number of vehicles."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -302,7 +302,7 @@ class ServerFull(VehicleEvent, frozen=True, kw_only=True):
 
 
 class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
-    """The client of a vehicle on a mission has begun anew, and does not go on with its motion."""
+    """The client of a vehicle on a mission has restarted, and does not continue its motion."""
 
     def __str__(self) -> str:
         return (
@@ -312,13 +312,13 @@ class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
-    """The server has refused a vehicle whose number is that of another one, which it hears."""
+    """The server has refused a vehicle because its number is in use by another one."""
 
     host: str
-    """Host that the refused vehicle's HELLO came from."""
+    """Host of the refused vehicle's HELLO."""
     port: int
     holder: str
-    """HOST:PORT of the vehicle that uses this number already."""
+    """HOST:PORT of the vehicle that already uses this number."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -327,13 +327,13 @@ class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NoSession(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has heard why the server opens no session for it; it goes on asking."""
+    """The server opens no session for a vehicle, which keeps asking."""
 
     host: str
-    """Host that it says HELLO to."""
+    """Host to which the vehicle sends HELLO."""
     port: int
     reason: Literal["full", "taken"]
-    """Whether the server has no room, or another client flies under the vehicle's number."""
+    """Whether the server is full, or another client uses the vehicle's number."""
 
     def __str__(self) -> str:
         why = {
@@ -344,15 +344,15 @@ class NoSession(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has given up, never having heard the server."""
+    """A vehicle has given up without having heard the server."""
 
     host: str
-    """Host that it said HELLO to."""
+    """Host to which it sent HELLO."""
     port: int
     waited_s: float
     """Time since its first HELLO [s]."""
     secure: bool = False
-    """Whether it has a key, so that an answer counts only of those who know it."""
+    """Whether it has a key, so that only answers with that key count."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -366,10 +366,10 @@ class Unanswered(VehicleEvent, frozen=True, kw_only=True):
     """No answer from the server yet; the vehicle keeps asking."""
 
     host: str
-    """Host that it says HELLO to."""
+    """Host to which it sends HELLO."""
     port: int
     left_s: float
-    """Time after which it gives up [s]."""
+    """Time until it gives up [s]."""
 
     def __str__(self) -> str:
         at, left = address_text(self.host, self.port), f"{self.left_s:.0f} s"
@@ -380,7 +380,7 @@ class Welcomed(VehicleEvent, frozen=True, kw_only=True):
     """The server has opened a session for a vehicle that cannot be flown yet."""
 
     host: str
-    """Host that the vehicle says HELLO to."""
+    """Host to which the vehicle sends HELLO."""
     port: int
 
     def __str__(self) -> str:
@@ -389,7 +389,7 @@ class Welcomed(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle that is not flown yet hears nothing of the server any more."""
+    """A vehicle that is not flown yet does not hear the server any more."""
 
     silent_s: float
     """Time since the newest packet [s]."""
@@ -409,26 +409,26 @@ class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
 
 
 class Flying(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's first session has opened, and with it the flight has begun."""
+    """A vehicle's first session has opened, and the flight has begun."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: session open, flying"
 
 
 class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle does something else from now on, or the same for another reason.
+    """A vehicle has changed its mode, or the reason for it.
 
-    That it coasts along a plan that still lasts is not told.
+    Coasting along a plan that still lasts is not reported.
     """
 
     before: str
-    """Name of the mode that it was in, see `shared.wire.protocol.Mode`."""
+    """Name of the previous mode, see `shared.wire.protocol.Mode`."""
     after: str
-    """Name of the mode that it is in; the same where its reason alone has changed."""
+    """Name of the new mode; the same if only the reason has changed."""
     reason: str
 
     def __str__(self) -> str:
-        # Of another version, or somebody else's recording, the name may be one that is not known.
+        # A recording of another version may contain an unknown name.
         does = DOES.get(self.after, f"is in the mode {self.after}")
         return f"vehicle {self.vehicle} {does}: {self.reason}"
 
@@ -446,7 +446,7 @@ DOES = {
     "manual": "is flown by somebody else, or by nobody",
     "fault": "stands still, and must be checked before it flies again",
 }
-"""Words for each mode, as far as the server is told: along a plan it coasts in silence."""
+"""Words for each mode, except coasting along a plan, which is not reported."""
 
 
 class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
@@ -459,27 +459,27 @@ class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
 
 
 class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
-    """The server does not believe the state that a vehicle reports, since it did so before."""
+    """The server rejects the states that a vehicle reports."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} reports a state that it cannot have reached: not believed"
 
 
 class InZone(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on a mission was found at rest within a zone, by a server that has just begun."""
+    """A vehicle on a mission was at rest within a zone when the server started."""
 
     zone: str
-    """Zone, as the scenario writes it."""
+    """Zone, as written in the scenario."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is led out"
 
 
 class LeftTube(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle of a mission is further from its motion than the others reckon with."""
+    """A vehicle on a mission is further from its motion than allowed."""
 
     off_m: float
-    """Distance by which it is outside its tube [m]."""
+    """Distance outside its tube [m]."""
 
     def __str__(self) -> str:
         off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"
@@ -487,15 +487,15 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
 
 
 def metres(leap_m: tuple[float, ...]) -> str:
-    """A displacement as an operator reads it."""
+    """Text of a displacement."""
     return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
 
 
 class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
-    """What a vehicle measures of itself has leapt, and somebody has to say which frame counts."""
+    """A vehicle's measured state has leapt, and the operator has to choose a frame."""
 
     by_m: tuple[float, ...]
-    """Displacement of its position on each axis [m]; empty where its velocity alone has leapt."""
+    """Displacement of its position on each axis [m]; empty if only its velocity has leapt."""
     land_after_s: float
     """Time of hovering after which it lands without a choice [s]; 0: never."""
 
@@ -513,14 +513,14 @@ class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
     """The packets of a vehicle contradict what was known of its clock."""
 
     what: str
-    """Knowledge that was contradicted, and what follows."""
+    """What was contradicted, and the consequence."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: {self.what}"
 
 
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
-    """The fence lets less pass than the vehicle was told to fly."""
+    """The fence limits the input of a vehicle."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is held back by its fence"
@@ -534,14 +534,14 @@ class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NotFlown(VehicleEvent, frozen=True, kw_only=True):
-    """The time of a flight is over, and the vehicle has had no plan for long, or never had one."""
+    """A flight has ended without a plan, or never had one."""
 
     covered: int
-    """Number of steps for which it had an input planned."""
+    """Number of steps with a planned input."""
     steps: int
     """Number of all steps."""
     why: str
-    """Reason for there being none, as far as the vehicle knows."""
+    """Why there was no plan, as far as the vehicle knows."""
 
     def __str__(self) -> str:
         flown = f"ended without a plan, after {self.covered} of {self.steps} steps with one"
@@ -549,10 +549,10 @@ class NotFlown(VehicleEvent, frozen=True, kw_only=True):
 
 
 class Recalled(VehicleEvent, frozen=True, kw_only=True):
-    """A client has found what an earlier run of it has kept."""
+    """A client has restored the state saved by an earlier run."""
 
     goes_on: bool
-    """Whether the flight of that run goes on."""
+    """Whether the flight of that run continues."""
 
     def __str__(self) -> str:
         if self.goes_on:
@@ -561,7 +561,7 @@ class Recalled(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
-    """A client does not follow what an earlier run seems to have kept."""
+    """A client ignores the state saved by an earlier run."""
 
     reason: str
 
@@ -570,12 +570,11 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """What was set in flight in an earlier run of the process is in force again."""
+    """Values set in flight in an earlier run of the process are in force again."""
 
     path: str
-    """Journal that has it."""
+    """Journal that contains them."""
     values: dict[str, Any]
-    """Values by key."""
 
     def __str__(self) -> str:
         each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
@@ -583,7 +582,7 @@ class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """What the next run of a process must know cannot be written."""
+    """The state for the next run of a process cannot be written."""
 
     reason: str
 
@@ -595,9 +594,8 @@ class Finished(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle has begun the last step of its flight."""
 
     steps: int
-    """Steps of the flight."""
     missed: int
-    """Steps that it slept through."""
+    """Number of missed steps."""
 
     def __str__(self) -> str:
         return (
@@ -606,7 +604,7 @@ class Finished(VehicleEvent, frozen=True, kw_only=True):
 
 
 Failure = SessionRefused | NoSession | NoAnswer | NotFlown | AboardFailure
-"""Events after which a vehicle cannot fly, or has not."""
+"""Events that end or prevent the flight of a vehicle."""
 
 Event = (
     Listening

@@ -1,12 +1,12 @@
 """Addresses as users write them: HOST:PORT of a UDP peer, and lines to a vehicle's own hardware.
 
-    udp:HOST:PORT       listen there, and talk to whoever speaks first
-    udpout:HOST:PORT    talk to this address
+    udp:HOST:PORT       listen there, and answer whoever sends first
+    udpout:HOST:PORT    send to this address
     tcp:HOST:PORT       connect to it
     serial:PATH:BAUD    a serial port, as in serial:/dev/ttyACM0:57600
 
-TCP and serial lines carry bytes without borders: an endpoint hears them in pieces, all of them from
-the peer `LINE`.
+TCP and serial lines are byte streams: an endpoint receives them in pieces, all from the peer
+`LINE`.
 """
 
 import ipaddress
@@ -16,11 +16,11 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 
 HOST_PORT = "HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
-"""Form of an address, in messages."""
+"""Form of an address, for messages."""
 LINE: Address = ("line", 0)
 """Peer at the other end of a TCP or serial line."""
 FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
-"""Forms of a line, in messages."""
+"""Forms of a line, for messages."""
 
 
 class Line(NamedTuple):
@@ -30,7 +30,7 @@ class Line(NamedTuple):
     host: str
     """Host, or path of a serial port."""
     number: int
-    """Port, or bits a second of a serial port."""
+    """Port, or baud rate of a serial port [bit/s]."""
 
     @property
     def address(self) -> Address:
@@ -39,12 +39,12 @@ class Line(NamedTuple):
 
     @property
     def peer(self) -> Address | None:
-        """Peer at the other end; None where the first to speak becomes the peer."""
+        """Peer at the other end; None if the first sender becomes the peer."""
         return {"udp": None, "udpout": self.address}.get(self.kind, LINE)
 
 
 def parse_address(text: str) -> Address | None:
-    """Address in a text as HOST:PORT, with an IPv6 host in brackets; None where it is none."""
+    """Address from HOST:PORT, with an IPv6 host in brackets; None if the text is invalid."""
     host, _, port = text.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     host = host[1:-1] if bracketed else host
@@ -59,10 +59,10 @@ def parse_address(text: str) -> Address | None:
 
 
 def parse_line(key: str, text: str) -> Line:
-    """Line in a text.
+    """Line from its text.
 
     Raises:
-        ConfigError: it is none; `key` is who gave it.
+        ConfigError: it is invalid; the message names `key`.
     """
     kind, _, rest = text.partition(":")
     if kind == "serial":

@@ -1,13 +1,12 @@
 """Steady time for an endpoint whose host's clock jumps.
 
-An endpoint counts on a clock that goes forward, and no faster than life. Where the clock goes back,
-or leaps ahead, what it does by its clock would be an hour early or late, and stamps of before and
-after would not be of one time. Seen through `Steady` the clock stands still for such a jump and
-goes on from there:
+An endpoint needs a clock that goes forward at the rate of real time. If the clock is set back or
+ahead, scheduled work would be late or early, and time stamps from before and after could not be
+compared. Through `Steady` the clock stands still for the jump and goes on from there:
 
     steady = clock - (all jumps so far)
 
-A stall of the host, in which real time passes, is no jump: it is passed on as it is.
+If the host stalls, real time passes; that is no jump and is passed on unchanged.
 """
 
 from collections.abc import Sequence
@@ -19,15 +18,15 @@ from skytether.shared.core.events import Event
 from skytether.shared.scenario.schema import Scenario
 
 JUMP_NS = 60 * SECOND_NS
-"""Time by which a clock may go on between two looks at it, or past a wake that is due [ns]; more is
-a jump."""
+"""Largest advance of a clock between two readings, or past a wake that is due [ns]; more is a
+jump."""
 
 
 class Steady(Endpoint):
-    """An endpoint around an endpoint, which it shows a steady time.
+    """Wraps an endpoint, and gives it a steady time.
 
-    An endpoint that waits for datagrams alone may wait for as long as it takes: only a clock that
-    goes back jumps then.
+    An endpoint that waits for datagrams only may wait for any time: then only a clock that goes
+    back jumps.
 
     Args:
         inner: the endpoint.
@@ -39,12 +38,11 @@ class Steady(Endpoint):
         self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
         self.keeps = inner.keeps
         self._seen_ns: int | None = None
-        """Time that the clock showed last."""
+        """Latest reading of the clock."""
         self._jumps_ns = 0
-        """Sum of all jumps [ns]."""
 
     def _steady(self, now_ns: int) -> int:
-        """Time to be shown."""
+        """Steady time for the endpoint."""
         seen_ns = now_ns if self._seen_ns is None else self._seen_ns
         self._seen_ns = now_ns
         if not 0 <= now_ns - seen_ns <= JUMP_NS and self._is_jump(seen_ns, now_ns):
@@ -55,8 +53,8 @@ class Steady(Endpoint):
     def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
         if now_ns < seen_ns:
             return True
-        # Counted from when it was to be woken: an endpoint that sleeps for an hour until its wake
-        # has not jumped.
+        # Counted from the wake that is due: an endpoint that sleeps for an hour until then has not
+        # jumped.
         due_ns = self.next_wake_ns()
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 
@@ -90,7 +88,7 @@ class Steady(Endpoint):
         self._inner.learn_time(utc_ns, error_ns, now_ns=self._steady(now_ns))
 
     def keep(self, *, now_ns: int) -> bytes | None:
-        """See `Endpoint`; what is kept names times by how long ago they were."""
+        """See `Endpoint`; saved times are relative to the time of writing."""
         return self._inner.keep(now_ns=self._steady(now_ns))
 
     def kept(self) -> None:

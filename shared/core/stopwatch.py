@@ -1,14 +1,14 @@
-"""Stopwatch: cost of each part of the work, by a clock that the driver lends to a core."""
+"""Stopwatch: cost of each part of the work, on a clock that the driver passes to a core."""
 
 from collections import Counter
 from collections.abc import Callable
 
 
 class Stopwatch:
-    """Adds up how long things take.
+    """Sums durations by name.
 
     Args:
-        clock_ns: any clock [ns]; None counts nothing, for time that is virtual.
+        clock_ns: any clock [ns]; None measures nothing, as in virtual time.
     """
 
     def __init__(self, clock_ns: Callable[[], int] | None = None) -> None:
@@ -25,7 +25,7 @@ class Stopwatch:
         self._since_ns = self._clock_ns()
 
     def lap(self, name: str) -> int:
-        """End the lap, count it by this name, and begin the next; returns how long it took [ns]."""
+        """End the lap, count it under this name, and begin the next; returns its duration [ns]."""
         if not self.runs:
             return 0
         now_ns = self._clock_ns()

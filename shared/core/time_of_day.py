@@ -1,27 +1,27 @@
-"""Time of day as an endpoint has learned it, and how far it may be wrong."""
+"""Time of day as learned by an endpoint, and its error."""
 
 from typing import NamedTuple
 
 from skytether.shared.base.units import SECOND_NS
 
 FRESH_NS = 10 * SECOND_NS
-"""Time for which what was learned counts [ns]."""
+"""Time for which it is valid after it was learned [ns]."""
 DRIFT = 1000
-"""Time in which two clocks may come apart by one unit of it: 0.1 %, of two hosts whose clocks are
-slewed by 500 ppm each."""
+"""Time in which two clocks drift apart by one unit: 0.1 %, for two hosts whose clocks are slewed by
+500 ppm each."""
 
 
 class TimeOfDay(NamedTuple):
     """Time of day at a time of an endpoint's own clock."""
 
     ahead_ns: int
-    """Time since 1970, less the time on the endpoint's own clock [ns]."""
+    """Time since 1970 minus the time on the endpoint's own clock [ns]."""
     error_ns: int
     """Largest error of `ahead_ns` at the time `learned_ns` [ns]."""
     learned_ns: int
     """Time on the endpoint's own clock when it was learned [ns]."""
 
     def error_at(self, now_ns: int) -> int | None:
-        """Largest error at a time of the endpoint's own clock [ns]; None where it is too old."""
+        """Largest error at a time of the endpoint's own clock [ns]; None if it is too old."""
         age_ns = now_ns - self.learned_ns
         return self.error_ns + age_ns // DRIFT + 1 if 0 <= age_ns <= FRESH_NS else None

@@ -1,1 +1,3 @@
-"""Law of flight that both ends predict with: model, eq. (1)-(4), rule, eq. (11), and terms."""
+"""Dynamics and rules for prediction at both ends: model, eq. (1)-(4), rule of flight, eq. (11),
+terms.
+"""

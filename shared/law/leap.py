@@ -1,7 +1,7 @@
-"""Leaps: changes from one state to another that no vehicle can make in the time between.
+"""Leaps: changes of state that no vehicle can make in the given time.
 
-The vehicle holds what it measures of itself against what it measured before, the server what it is
-told against what it was told; both by this, which is compiled into the server's kernel.
+The vehicle compares its measurements with the previous ones, the server compares observations; both
+use these functions, which are also compiled into the server's kernel.
 """
 
 ACCELERATION_MPS2 = 50.0
@@ -15,8 +15,8 @@ def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
 
     Args:
         v, after_v: velocity on one axis before and after [m/s].
-        time: between the two [s].
-        noise: what noise may add to the change [m/s].
+        time: time between the two [s].
+        noise: change that noise may cause [m/s].
     """
     return abs(after_v - v) > noise + ACCELERATION_MPS2 * time
 
@@ -27,22 +27,22 @@ def displacement(p: float, v: float, after_p: float, after_v: float, time: float
     Args:
         p, v: position [m] and velocity [m/s] on one axis before.
         after_p, after_v: position [m] and velocity [m/s] after.
-        time: between the two [s].
+        time: time between the two [s].
     """
-    # By the mean of both velocities, so that only what an acceleration cannot explain is left.
+    # By the mean of both velocities, so that only what acceleration cannot explain is left.
     return after_p - p - 0.5 * (v + after_v) * time
 
 
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
-    """Whether no vehicle can have come from one place to another.
+    """Whether no vehicle can have moved from one position to the other.
 
     Args:
         p, v: position [m] and velocity [m/s] on one axis before.
         after_p, after_v: position [m] and velocity [m/s] after.
-        time: between the two [s].
-        noise: what noise may add to the change of position [m].
+        time: time between the two [s].
+        noise: change of position that noise may cause [m].
     """
     return abs(displacement(p, v, after_p, after_v, time)) > most_m(time, noise)
 
@@ -51,7 +51,7 @@ def most_m(time: float, noise: float) -> float:
     """Largest `displacement` that acceleration and noise explain [m].
 
     Args:
-        time: between the two positions [s].
-        noise: what noise may add [m].
+        time: time between the two positions [s].
+        noise: change that noise may cause [m].
     """
     return noise + 0.5 * ACCELERATION_MPS2 * time * time

@@ -1,15 +1,15 @@
-"""The UAV as a first-order velocity loop per axis, eq. (1)-(4).
+"""Model of the vehicle: a first-order velocity loop per axis, eq. (1)-(4).
 
 Per axis the state is x = [p, v] (position [m], velocity [m/s]) and the input u the desired velocity
-[m/s]; v follows g u, with the gain g and the time constant tau; `shared.law.dead_time` says what a
-dead time changes. The axes do not couple, so the model of the whole vehicle is one 2 x 2 system an
-axis, and the same code flies in 2-D and 3-D:
+[m/s]; v follows g u, with the gain g and the time constant tau; for the dead time see
+`shared.law.dead_time`. The axes are not coupled, so the model of the whole vehicle is one 2 x 2
+system per axis, and the same code serves 2-D and 3-D:
 
     p(k+1) = p(k) + a01 v(k) + b0 u(k)          A = [[1, a01],   B = [b0,
     v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
 
-`advance` is the one home of eq. (4). It takes the numbers of one axis or the arrays of all, and is
-compiled into every kernel that rolls a state along.
+`advance` is the only implementation of eq. (4). It takes the numbers of one axis or the arrays of
+all, and is compiled into every kernel that predicts a state.
 """
 
 from collections.abc import Sequence
@@ -24,57 +24,57 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 """Flag of each vehicle; shape (n,)."""
 ALTITUDE = 2
-"""Axis of the altitude, where there is one."""
+"""Axis of the altitude, if there is one."""
 
 
 class Axis(NamedTuple):
-    """Numbers of the discretised model, eq. (4), on one axis."""
+    """Coefficients of the discretised model, eq. (4), on one axis."""
 
     a01: float
     """Change of position in a step for each m/s of velocity [s]."""
     a11: float
-    """Share of the velocity that is left after a step."""
+    """Factor of the velocity in a step."""
     b0: float
     """Change of position in a step for each m/s of input [s]."""
     b1: float
-    """Share of the input that the velocity has taken on after a step."""
+    """Change of velocity in a step for each m/s of input."""
 
 
 class Model(NamedTuple):
-    """Numbers of the discretised model, eq. (4), on every axis; each of shape (axes,)."""
+    """Coefficients of the discretised model, eq. (4), on every axis; each of shape (axes,)."""
 
     a01: Array
     """Change of position in a step for each m/s of velocity [s]."""
     a11: Array
-    """Share of the velocity that is left after a step."""
+    """Factor of the velocity in a step."""
     b0: Array
     """Change of position in a step for each m/s of input [s]."""
     b1: Array
-    """Share of the input that the velocity has taken on after a step."""
+    """Change of velocity in a step for each m/s of input."""
 
     def axes(self) -> list[Axis]:
-        """The model of each axis in plain numbers."""
-        # Plain floats: numpy takes twice as long for sums of two or three numbers, and the
-        # vehicle's loops have no more.
+        """The model of each axis in plain floats."""
+        # numpy takes twice as long for sums of two or three numbers, which is all that the
+        # vehicle's loops have.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 
     def step(self, x: Array, u: Array | float) -> Array:
-        """State a step later; x of shape (..., axes, 2), u of shape (..., axes)."""
+        """State one step later; x of shape (..., axes, 2), u of shape (..., axes)."""
         return np.stack(advance(self, x[..., 0], x[..., 1], u), -1)
 
     def roll(self, x: Array, inputs: Array) -> Array:
-        """States that inputs lead to one after the other, x among them; shape (n + 1, axes, 2).
+        """States under successive inputs, starting with x; shape (n + 1, axes, 2).
 
         Args:
-            x: state at the begin; shape (axes, 2).
-            inputs: one a step [m/s]; shape (axes, n).
+            x: initial state; shape (axes, 2).
+            inputs: one per step [m/s]; shape (axes, n).
         """
         paths = []
         for axis, (p, v), along in zip(self.axes(), x.tolist(), inputs.tolist(), strict=True):
             path = [(p, v)]
             for u in along:
-                p, v = advance(axis, p, v, u)  # noqa: PLW2901 - rolled along
+                p, v = advance(axis, p, v, u)  # noqa: PLW2901 - predicted step by step
                 path.append((p, v))
             paths.append(path)
         return np.array(paths).swapaxes(0, 1)
@@ -98,7 +98,7 @@ class Model(NamedTuple):
 
 
 def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
-    """Position and velocity a step later, x(k+1) = A x(k) + B u(k).
+    """Position and velocity one step later, x(k+1) = A x(k) + B u(k).
 
     Args:
         axis: an `Axis` and numbers, or a `Model` and arrays whose last axis is the spatial one.
@@ -106,8 +106,7 @@ def advance(axis: Any, p: Any, v: Any, u: Any) -> tuple[Any, Any]:
 
     Source: eq. (4).
     """
-    # The order of these operations is part of the rule: the client and the compiled kernels must
-    # agree to the last bit.
+    # The order of these operations matters: client and compiled kernels must agree to the last bit.
     return p + axis.a01 * v + axis.b0 * u, axis.a11 * v + axis.b1 * u
 
 
@@ -124,7 +123,7 @@ def discretise(
     Source: eqs. (1), (2), (3).
     """
     tau, g = np.asarray(tau_s, dtype=np.float64), np.asarray(gain, dtype=np.float64)
-    # 1 - exp(-dt/tau), without cancellation where tau is long.
+    # 1 - exp(-dt/tau), without cancellation if tau is long.
     settled = -np.expm1(-dt_s / tau)
     B = g * (dt_s - tau * settled), g * settled
     return Model(tau * settled, np.exp(-dt_s / tau), *B)
@@ -136,13 +135,14 @@ def white_acceleration(tau_s: Array, dt_s: float) -> Array:
     With G = [0, 1], e^{As}G = [τ(1 - e^{-s/τ}), e^{-s/τ}], and the integrals over [0, Δt] follow.
 
     Args:
-        tau_s: shape (axes,).
+        tau_s: time constants [s]; shape (axes,).
+        dt_s: length of a step [s].
 
     Returns:
         shape (axes, 2, 2).
     """
     tau = np.asarray(tau_s, dtype=np.float64)
-    # expm1 keeps the digits that 1 - exp(-x) loses where a step is short beside τ.
+    # expm1 keeps the digits that 1 - exp(-x) loses if a step is much shorter than τ.
     one = -tau * np.expm1(-dt_s / tau)  # ∫ e^{-s/τ}
     two = -0.5 * tau * np.expm1(-2.0 * dt_s / tau)  # ∫ e^{-2s/τ}
     positions = tau**2 * (dt_s - 2.0 * one + two)

@@ -1,8 +1,8 @@
-"""Motions of vehicles that keep apart: where one is at every time.
+"""Motions of vehicles on a mission: position of a vehicle at every time.
 
 A motion has knots SPACING steps apart, at multiples of SPACING of the vehicle's own steps, with
-constant acceleration between them, and rests from the last one on. It is sent as a trajectory of as
-many knots (`shared.law.spline`): the cubic between two of them is that very motion.
+constant acceleration between them, and rests from the last one on. It is sent as a trajectory with
+the same knots (`shared.law.spline`): the cubic between two of them equals the motion.
 """
 
 from typing import Annotated, NamedTuple
@@ -14,21 +14,21 @@ from skytether.shared.law.model import Array
 SPACING = 10
 """Steps from one knot to the next."""
 INTERVALS = 12
-"""Number of intervals that are planned."""
+"""Number of planned intervals."""
 JOIN_MAX = 3
-"""Largest number of intervals that a new motion takes over from the one that is flown."""
+"""Largest number of intervals that a new motion copies from the motion in force."""
 SAMPLES = 4
-"""Number of straight pieces that an interval of a motion is taken for."""
+"""Number of straight pieces that approximate an interval of a motion."""
 MARGIN_M = 0.03
 """Least margin of a plan, see `Clearances` [m]."""
 
 
 Knots = Annotated[Array, 2]
-"""Numbers of knots; shape (knots, axes). The 2 tells kernels the number of dimensions."""
+"""Values at the knots; shape (knots, axes). The 2 is the number of dimensions, for kernels."""
 
 
 class Motion(NamedTuple):
-    """Motion: position of a vehicle at every time, by its own steps."""
+    """Position of a vehicle at every time, by its own steps."""
 
     first: int
     """Step of the first knot, a multiple of SPACING."""
@@ -39,13 +39,13 @@ class Motion(NamedTuple):
 
     @property
     def last(self) -> int:
-        """Step of the last knot; it rests from there on."""
+        """Step of the last knot; the vehicle rests from there on."""
         return self.first + (len(self.position) - 1) * SPACING
 
     def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
-        """Positions [m] and velocities [m/s] at steps, of which there may be fractions.
+        """Positions [m] and velocities [m/s] at steps, which may be fractional.
 
-        Before the first knot it rests there.
+        Before the first knot the vehicle rests there.
 
         Args:
             steps: shape (n,).
@@ -74,23 +74,23 @@ class Clearances(NamedTuple):
     tube_m: float
     """Distance from zones: largest distance of a vehicle from its motion."""
     bend_m: float
-    """Largest distance of a motion from its straight pieces, SAMPLES an interval."""
+    """Largest distance of a motion from its straight pieces, SAMPLES per interval."""
 
     @property
     def margin_m(self) -> float:
-        """Margin of a plan beyond these, between the times at which it keeps them, and for the
+        """Margin of a plan beyond these: for the times between those that are checked, and the
         solver's tolerance [m].
         """
         return max(MARGIN_M, 2.0 * self.bend_m + 0.02)
 
     @property
     def planned_apart_m(self) -> float:
-        """Distance from each other that planned motions and goals keep [m]."""
+        """Distance of planned motions and goals from each other [m]."""
         return self.apart_m + self.margin_m
 
     @property
     def planned_clear_m(self) -> float:
-        """Distance from zones that planned motions and goals keep [m]."""
+        """Distance of planned motions and goals from zones [m]."""
         return self.tube_m + self.margin_m
 
 
@@ -100,6 +100,6 @@ def bend_m(acceleration_mps2: float, dt_s: float) -> float:
 
 
 def resting(step: int, position: Array) -> Motion:
-    """Rest at a place [m; shape (axes,)], known at a step."""
+    """Motion at rest at a position [m; shape (axes,)] from a step on."""
     at = np.array([position], dtype=np.float64)
     return Motion(step // SPACING * SPACING, at, np.zeros_like(at))

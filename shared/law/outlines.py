@@ -1,6 +1,6 @@
-"""Outlines of zones: whether a straight piece of a way comes too near to one.
+"""Outlines of zones: whether a straight line comes too near to one.
 
-Plain arithmetic on numbers. The server compiles it, for it looks at every piece of every motion.
+Plain arithmetic on numbers, which the server compiles, since it checks every piece of every motion.
 """
 
 from typing import Annotated, NamedTuple
@@ -9,16 +9,16 @@ from skytether.shared.law.model import Array
 
 
 class Outlines(NamedTuple):
-    """Polygons between two heights, side by side."""
+    """Polygons between two heights, in arrays."""
 
     edges: Annotated[Array, 3]
-    """Begin and end of each edge, x and y [m]; shape (zones, edges, 4)."""
+    """Start and end of each edge, x and y [m]; shape (zones, edges, 4)."""
     counts: Annotated[Array, 1]
     """Number of edges of each zone; shape (zones,)."""
     boxes: Annotated[Array, 2]
     """Least and largest x, y, and height [m]; shape (zones, 6)."""
     fences: Annotated[Array, 1]
-    """1 where vehicles stay within the zone, 0 where they keep out of it; shape (zones,)."""
+    """1 if vehicles stay within the zone, 0 if they keep out of it; shape (zones,)."""
 
 
 def is_near(
@@ -30,32 +30,32 @@ def is_near(
     y1: float,
     low_m: float,
     high_m: float,
-    room_m: float,
+    clearance_m: float,
 ) -> bool:
-    """Whether a straight piece comes nearer than this to what a zone forbids, or touches it.
+    """Whether a straight line comes nearer than a clearance to what a zone forbids, or touches it.
 
     Args:
         outlines: zones.
-        zone: index of the one that is looked at.
-        x0, y0, x1, y1: both ends of the piece [m].
-        low_m, high_m: its least and its largest height.
-        room_m: distance that is to be kept [m].
+        zone: index of the zone.
+        x0, y0, x1, y1: both ends of the line [m].
+        low_m, high_m: its least and largest height.
+        clearance_m: distance to keep [m].
     """
     box, is_fence = outlines.boxes[zone], outlines.fences[zone] > 0.0
     off_m = max(box[4] - high_m, low_m - box[5])
-    room2 = room_m * room_m if room_m > 0.0 else 0.0
+    clearance2 = clearance_m * clearance_m if clearance_m > 0.0 else 0.0
     if is_fence:
-        if min(low_m - box[4], box[5] - high_m) < room_m:
+        if min(low_m - box[4], box[5] - high_m) < clearance_m:
             return True
     else:
-        # Beside its heights as well, it may be as much nearer in the plane.
+        # Above or below the zone, the distance in the plane may be smaller.
         if off_m > 0.0:
-            room2 -= off_m * off_m
+            clearance2 -= off_m * off_m
         beside_x = max(box[0] - max(x0, x1), min(x0, x1) - box[1], 0.0)
         beside_y = max(box[2] - max(y0, y1), min(y0, y1) - box[3], 0.0)
-        if beside_x * beside_x + beside_y * beside_y > room2:
+        if beside_x * beside_x + beside_y * beside_y > clearance2:
             return False
-    way_x, way_y = x1 - x0, y1 - y0
+    line_x, line_y = x1 - x0, y1 - y0
     inside, after = False, False
     for i in range(int(outlines.counts[zone])):
         edge = outlines.edges[zone, i]
@@ -63,9 +63,9 @@ def is_near(
         nearest2 = min(
             _off2(x0 - x, y0 - y, along_x, along_y),
             _off2(x1 - x, y1 - y, along_x, along_y),
-            _off2(x - x0, y - y0, way_x, way_y),
+            _off2(x - x0, y - y0, line_x, line_y),
         )
-        if nearest2 < room2 or _crosses(x - x0, y - y0, way_x, way_y, along_x, along_y):
+        if nearest2 < clearance2 or _crosses(x - x0, y - y0, line_x, line_y, along_x, along_y):
             return True
         inside ^= _is_left(x0, y0, x, y, edge[2], edge[3])
         after ^= _is_left(x1, y1, x, y, edge[2], edge[3])
@@ -73,7 +73,7 @@ def is_near(
 
 
 def _off2(x: float, y: float, along_x: float, along_y: float) -> float:
-    """Square of the distance of a point from a straight piece that begins at the origin [m²]."""
+    """Squared distance of a point from a straight line that starts at the origin [m²]."""
     square = max(along_x * along_x + along_y * along_y, 1e-18)
     share = min(max((x * along_x + y * along_y) / square, 0.0), 1.0)
     x, y = x - share * along_x, y - share * along_y
@@ -81,25 +81,26 @@ def _off2(x: float, y: float, along_x: float, along_y: float) -> float:
 
 
 def _crosses(
-    x: float, y: float, way_x: float, way_y: float, along_x: float, along_y: float
+    x: float, y: float, line_x: float, line_y: float, along_x: float, along_y: float
 ) -> bool:
-    """Whether an edge crosses a straight piece; its begin is told from that of the piece."""
-    begins = way_x * y - way_y * x
-    ends = way_x * (y + along_y) - way_y * (x + along_x)
-    here = along_y * x - along_x * y
-    there = along_x * (way_y - y) - along_y * (way_x - x)
-    return begins * ends < 0.0 and here * there < 0.0
+    """Whether an edge, whose start is relative to that of a line, crosses that line."""
+    begins = line_x * y - line_y * x
+    ends = line_x * (y + along_y) - line_y * (x + along_x)
+    line_begins = along_y * x - along_x * y
+    line_ends = along_x * (line_y - y) - along_y * (line_x - x)
+    return begins * ends < 0.0 and line_begins * line_ends < 0.0
 
 
 def _is_left(x: float, y: float, x0: float, y0: float, x1: float, y1: float) -> bool:
-    """Whether an edge runs past the right of a point: an odd number does of those around it.
+    """Whether an edge passes to the right of a point: a point is inside if an odd number of edges
+    does.
 
     Args:
         x, y: the point [m].
         x0, y0, x1, y1: both ends of the edge [m].
     """
-    # Heights are compared as they are: a difference is rounded, and an edge and the next one that
-    # ends there have to agree on which side of it the point is.
+    # Heights are compared directly: a difference is rounded, and two edges that meet have to agree
+    # on which side of their common end the point is.
     if (y0 > y) == (y1 > y):
         return False
     return x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)

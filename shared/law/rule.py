@@ -1,23 +1,25 @@
-"""The rule of flight: what a vehicle flies at a step with the horizon it holds, eq. (11).
+"""Rule of flight: what a vehicle flies at a step with the horizon in force, eq. (11).
 
     u*(k) = u(min(k, k_h + n - 1) | k_h)                    k_h: the step the horizon was made for
-                                                            n: the inputs it has
-                                                            k - k_h: the stage it is at
-No input is flown for longer than `link.age_max_s` after the observation that it was planned from:
-a horizon that reaches further ends there. After its last input that is held for ever, or braked
-along. Without compensation all of its inputs until then are its first.
+                                                            n: number of its inputs
+                                                            k - k_h: the present stage
 
-With feedback aboard the vehicle is led back to where these inputs lead, x̄, also after the last:
+No input is flown for longer than `link.age_max_s` after the observation that it was planned from: a
+longer horizon ends there. After its last input the vehicle repeats it for ever, or brakes from it.
+Without compensation the first input is flown at all stages until then.
+
+With feedback aboard the vehicle is controlled towards the reference state x̄ of these inputs, also
+after the last one:
 
     u*(k) = u(k) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i) + ŵ)
 
-ŵ is a disturbance that the inputs reckon with. Once they are braked to nothing it is left out, so
-that x̄ comes to rest, and the vehicle stays there in whatever wind.
+ŵ is the disturbance that the inputs compensate. Once braking has ended it is left out, so that x̄
+comes to rest, and the vehicle stays there in any wind.
 
-This is the one source of that rule: `step` and `lead_to` put its parts together for one spatial
-axis, and `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
-compiles the very same functions into its kernels, and so knows what was flown. `speed` alone
-belongs to all axes.
+This is the only implementation of the rule: `step` and `reference_at` combine its parts for one
+spatial axis, `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
+compiles the same functions into its kernels, and so knows what was flown. Only `speed` concerns all
+axes.
 """
 
 from collections.abc import Sequence
@@ -27,21 +29,20 @@ from skytether.shared.base.compilable import Table, compilable
 from skytether.shared.law.model import Array, Axis, advance
 
 
-class Held(NamedTuple):
-    """A horizon as one axis flies it."""
+class AxisHorizon(NamedTuple):
+    """Horizon on one axis."""
 
     model: Axis
-    """Model of the axis, eq. (4)."""
     inputs: Sequence[float] | Array
     """Inputs of the horizon, from k_h on [m/s]."""
     length: int
-    """Number of inputs that are flown."""
+    """Number of inputs that may be flown."""
     indexed: bool
-    """Whether each stage has an input of its own, rather than all of them the first."""
+    """Whether each stage has an input of its own, not always the first."""
     speed: float
     """Magnitude of the last input over all axes [m/s]."""
     brake: float
-    """Speed that braking takes away in a step [m/s]; 0 holds the last input for ever."""
+    """Decrease of speed per step when braking [m/s]; 0 repeats the last input for ever."""
     bound: float
     """Bound u_max of the input [m/s]."""
     feeds_back: bool
@@ -51,14 +52,14 @@ class Held(NamedTuple):
     gain_v: float
     """K on velocity."""
     disturbance: float
-    """Disturbance ŵ that the inputs reckon with [m/s]."""
+    """Disturbance ŵ that the inputs compensate [m/s]."""
 
 
 def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
-    """Number of a horizon's inputs that are flown; none where it is less than 1.
+    """Number of a horizon's inputs that may be flown; none if it is less than 1.
 
     Args:
-        length: number of inputs that it has.
+        length: number of its inputs.
         made_for: k_h, the step of the first.
         observed: step of the observation that they were planned from.
         age_max: largest age of that observation [steps].
@@ -70,26 +71,26 @@ def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
 def late_max(horizon: int) -> int:
     """Number of steps after its committed ones at which a horizon may still come into force.
 
-    By then the vehicle has flown other inputs than its plan begins with; a few are made good with
-    the next plan, many would make the server's estimate and its plans swing.
+    By then the vehicle has flown other inputs than its plan begins with. The next plan makes up for
+    a few; many would make the server's estimate and its plans oscillate.
     """
-    # A longer allowance let the estimate swing until the vehicle flew away
+    # A longer allowance let the estimate oscillate until the vehicle flew away
     # (tests/server/test_slow.py).
     return max(2, horizon // 4)
 
 
 def entry(stage: int, length: int) -> int:
-    """Index of the input that counts at a stage of a horizon with so many inputs.
+    """Index of the input at a stage of a horizon with `length` inputs.
 
     Source: eq. (11).
     """
-    if stage < 0:  # Python, which flies aboard, takes half the time for this of min and max
+    if stage < 0:  # in Python, aboard, this takes half the time of min and max
         return 0
     return stage if stage < length else length - 1
 
 
 def bounded(u: float, bound: float) -> float:
-    """An input within the bound u_max [m/s].
+    """Input within the bound u_max [m/s].
 
     Source: eq. (6).
     """
@@ -99,34 +100,34 @@ def bounded(u: float, bound: float) -> float:
 
 
 def remaining(stage: int, length: int, speed: float, brake: float) -> float:
-    """Share of the input at `entry` that is told: 1, and after the last what braking leaves of it.
+    """Braking factor of the input at `entry`: 1 until the horizon ends, then falling to 0.
 
     Args:
-        stage: where in the horizon the step is; may lie before its first or after its last input.
-        length: how many inputs the horizon has.
+        stage: present stage; may be before the first or after the last input.
+        length: number of inputs of the horizon.
         speed: magnitude of its last input over all axes [m/s].
-        brake: speed that braking takes away in a step [m/s]; 0 holds the last input for ever.
+        brake: decrease of speed per step when braking [m/s]; 0 repeats the last input for ever.
     """
-    # Brake 0 is the paper's vehicle, which holds its last input for ever (E10).
+    # Brake 0 is the paper's vehicle, which repeats its last input for ever (E10).
     if stage < length or brake == 0.0:
         return 1.0
-    # One share for all axes: the vehicle slows down without turning.
+    # The same factor for all axes: the vehicle slows down without turning.
     return max(0.0, speed - (stage - length + 1) * brake) / speed if speed > 0.0 else 0.0
 
 
-def leading(told: float, disturbance: float, share: float) -> float:
-    """Input under which x̄ goes on [m/s].
+def reference_input(without_feedback: float, disturbance: float, share: float) -> float:
+    """Input that drives the reference state x̄ [m/s].
 
     Args:
-        told: the input that is told [m/s].
+        without_feedback: input without feedback [m/s].
         disturbance: ŵ [m/s].
         share: `remaining`; at 0, x̄ comes to rest.
     """
-    # With ŵ left in, x̄ would drift on for ever after the vehicle was told to stand still.
-    return told + disturbance if share > 0.0 else 0.0
+    # With ŵ, x̄ would drift on for ever after the vehicle has braked.
+    return without_feedback + disturbance if share > 0.0 else 0.0
 
 
-def led_back(gain_p: float, gain_v: float, dp: float, dv: float) -> float:
+def feedback(gain_p: float, gain_v: float, dp: float, dv: float) -> float:
     """Feedback aboard K (x̄ - x) [m/s].
 
     Args:
@@ -136,93 +137,96 @@ def led_back(gain_p: float, gain_v: float, dp: float, dv: float) -> float:
     return gain_p * dp + gain_v * dv
 
 
-def flown(stage: int, told: float, back: float, bound: float) -> float:
-    """The input that is flown at a stage of a horizon [m/s].
+def flown(stage: int, without_feedback: float, back: float, bound: float) -> float:
+    """Input that is flown at a stage of a horizon [m/s].
 
     Args:
-        stage: where in the horizon the step is; before its first input there is no x̄.
-        told: the input that is told: `remaining` of that at `entry` [m/s].
-        back: `led_back`, or 0 without feedback [m/s].
+        stage: present stage; before the first input there is no x̄.
+        without_feedback: `remaining` times the input at `entry` [m/s].
+        back: `feedback`, or 0 without it [m/s].
         bound: u_max [m/s].
     """
-    # Before stage 0 there is no x̄ to be led back to: it begins at the step the horizon was made
-    # for.
-    u = told + back if stage >= 0 else told
+    # Before stage 0 there is no x̄: it starts at the step that the horizon was made for.
+    u = without_feedback + back if stage >= 0 else without_feedback
     return bounded(u, bound)
 
 
-def tell(held: Held, stage: int) -> tuple[float, float]:
-    """Input that a horizon tells at a stage, without feedback [m/s], and its share `remaining`."""
-    share = remaining(stage, held.length, held.speed, held.brake)
+def planned_input(horizon: AxisHorizon, stage: int) -> tuple[float, float]:
+    """Input of a horizon at a stage without feedback [m/s], and its braking factor `remaining`."""
+    share = remaining(stage, horizon.length, horizon.speed, horizon.brake)
     # Without compensation the first input is flown at every stage (E21).
-    index = entry(stage, held.length) if held.indexed else 0
-    return share * bounded(held.inputs[index], held.bound), share
+    index = entry(stage, horizon.length) if horizon.indexed else 0
+    return share * bounded(horizon.inputs[index], horizon.bound), share
 
 
-def lead_on(
-    held: Held, told: float, share: float, lead_p: float, lead_v: float
+def next_reference(
+    horizon: AxisHorizon, without_feedback: float, share: float, ref_p: float, ref_v: float
 ) -> tuple[float, float]:
-    """State x̄ at the next stage, position [m] and velocity [m/s].
+    """Reference state x̄ at the next stage, position [m] and velocity [m/s].
 
     Args:
-        held: the horizon.
-        told, share: see `tell`.
-        lead_p, lead_v: x̄ at the stage, position [m] and velocity [m/s].
+        horizon: the horizon.
+        without_feedback, share: see `planned_input`.
+        ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
     """
-    return advance(held.model, lead_p, lead_v, leading(told, held.disturbance, share))
+    return advance(
+        horizon.model, ref_p, ref_v, reference_input(without_feedback, horizon.disturbance, share)
+    )
 
 
-def lead_to(held: Held, first: int, last: int, lead_p: float, lead_v: float) -> tuple[float, float]:
-    """State x̄ at the stage `last`, position [m] and velocity [m/s].
+def reference_at(
+    horizon: AxisHorizon, first: int, last: int, ref_p: float, ref_v: float
+) -> tuple[float, float]:
+    """Reference state x̄ at the stage `last`, position [m] and velocity [m/s].
 
     Args:
-        held: the horizon.
-        first: stage from which it is rolled on, 0 or later.
-        last: stage to which it is.
-        lead_p, lead_v: x̄ at `first`, position [m] and velocity [m/s].
+        horizon: the horizon.
+        first: stage of the given x̄, 0 or later.
+        last: stage of the result.
+        ref_p, ref_v: x̄ at `first`, position [m] and velocity [m/s].
     """
     for stage in range(first, last):
-        told, share = tell(held, stage)
-        lead_p, lead_v = lead_on(held, told, share, lead_p, lead_v)
-    return lead_p, lead_v
+        without_feedback, share = planned_input(horizon, stage)
+        ref_p, ref_v = next_reference(horizon, without_feedback, share, ref_p, ref_v)
+    return ref_p, ref_v
 
 
 def step(
-    held: Held, stage: int, lead_p: float, lead_v: float, p: float, v: float
+    horizon: AxisHorizon, stage: int, ref_p: float, ref_v: float, p: float, v: float
 ) -> tuple[float, float, float, float]:
-    """Fly one axis for a step by the horizon that is held.
+    """Fly one axis for a step with the horizon in force.
 
     Args:
-        held: the horizon.
-        stage: k - k_h; may lie before its first or after its last input.
-        lead_p, lead_v: x̄ at the stage, position [m] and velocity [m/s].
+        horizon: the horizon.
+        stage: k - k_h; may be before the first or after the last input.
+        ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
         p, v: state at the stage, position [m] and velocity [m/s].
 
     Returns:
-        the input that is flown, u*(k) [m/s]; what of it is told, without feedback [m/s]; and x̄ at
-        the next stage, position [m] and velocity [m/s], where there is feedback.
+        the input that is flown, u*(k) [m/s]; the same without feedback [m/s]; and, with feedback,
+        x̄ at the next stage, position [m] and velocity [m/s].
 
     Source: eq. (11).
     """
-    (told, share), back = tell(held, stage), 0.0
-    if held.feeds_back:
-        back = led_back(held.gain_p, held.gain_v, lead_p - p, lead_v - v)
+    (without_feedback, share), back = planned_input(horizon, stage), 0.0
+    if horizon.feeds_back:
+        back = feedback(horizon.gain_p, horizon.gain_v, ref_p - p, ref_v - v)
         if stage >= 0:
-            lead_p, lead_v = lead_on(held, told, share, lead_p, lead_v)
-    return flown(stage, told, back, held.bound), told, lead_p, lead_v
+            ref_p, ref_v = next_reference(horizon, without_feedback, share, ref_p, ref_v)
+    return flown(stage, without_feedback, back, horizon.bound), without_feedback, ref_p, ref_v
 
 
 MODEL = len(Axis._fields)
-"""Columns of the model, which come first in a table with a row an axis."""
+"""Number of columns of the model, which come first in a table with one row per axis."""
 LENGTH, INDEXED, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = range(
-    MODEL, MODEL + len(Held._fields) - 2
+    MODEL, MODEL + len(AxisHorizon._fields) - 2
 )
-"""Columns of a table of horizons: the fields of `Held` but for model and inputs."""
+"""Columns of a table of horizons: the fields of `AxisHorizon` except model and inputs."""
 
 
-def held_of(table: Table, inputs: Table, axis: int) -> Held:
-    """Horizon on one axis, from a table with a row an axis."""
-    return Held(
+def horizon_of(table: Table, inputs: Table, axis: int) -> AxisHorizon:
+    """Horizon on one axis, from a table with one row per axis."""
+    return AxisHorizon(
         model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
         inputs=inputs[axis],
         length=int(table[axis, LENGTH]),
@@ -241,47 +245,49 @@ def held_of(table: Table, inputs: Table, axis: int) -> Held:
 def fly_horizon(
     table: Table,
     inputs: Table,
-    lead: Table,
+    reference: Table,
     first: int,
     stage: int,
     state: Table,
     flown: Table,
 ) -> None:
-    """Fly all axes for a step by the horizon that is held, see `step`.
+    """Fly all axes for a step with the horizon in force, see `step`.
 
     Args:
-        table: the horizon but for its inputs, with a row an axis, see `held_of`.
-        inputs: the horizon's inputs [m/s]; shape (axes, n).
-        lead: x̄ at the stage `first` [m, m/s], rolled on to `stage` where that is later and there is
-            feedback; shape (axes, 2).
-        first: stage to which x̄ belongs.
+        table: the horizon without its inputs, one row per axis, see `horizon_of`.
+        inputs: inputs of the horizon [m/s]; shape (axes, n).
+        reference: x̄ at the stage `first` [m, m/s]; with feedback advanced to `stage` if that is
+            later; shape (axes, 2).
+        first: stage of the given x̄.
         stage: k - k_h.
         state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        flown: output: the inputs flown, and what of them is told [m/s]; shape (2, axes).
+        flown: output: the inputs flown, and the same without feedback [m/s]; shape (2, axes).
     """
     for axis in range(len(table)):
-        held = held_of(table, inputs, axis)
-        lead_p, lead_v = lead[axis, 0], lead[axis, 1]
-        if held.feeds_back:
-            lead_p, lead_v = lead_to(held, first, stage, lead_p, lead_v)
-            lead[axis, 0], lead[axis, 1] = lead_p, lead_v
-        u, told, _, _ = step(held, stage, lead_p, lead_v, state[axis, 0], state[axis, 1])
-        flown[0, axis], flown[1, axis] = u, told
+        horizon = horizon_of(table, inputs, axis)
+        ref_p, ref_v = reference[axis, 0], reference[axis, 1]
+        if horizon.feeds_back:
+            ref_p, ref_v = reference_at(horizon, first, stage, ref_p, ref_v)
+            reference[axis, 0], reference[axis, 1] = ref_p, ref_v
+        u, without_feedback, _, _ = step(
+            horizon, stage, ref_p, ref_v, state[axis, 0], state[axis, 1]
+        )
+        flown[0, axis], flown[1, axis] = u, without_feedback
 
 
 @compilable
 def foresee_horizon(
-    table: Table, inputs: Table, lead: Table, stage: int, state: Table, ahead: Table
+    table: Table, inputs: Table, reference: Table, stage: int, state: Table, ahead: Table
 ) -> None:
-    """State of each axis a step later, flown by the horizon from a state at the stage.
+    """State of each axis one step later, flown with the horizon from a state at the stage.
 
     Args:
         table, inputs, stage, state: see `fly_horizon`.
-        lead: x̄ at the stage [m, m/s]; shape (axes, 2).
-        ahead: output: the state a step later [m, m/s]; shape (axes, 2).
+        reference: x̄ at the stage [m, m/s]; shape (axes, 2).
+        ahead: output: the state one step later [m, m/s]; shape (axes, 2).
     """
     for axis in range(len(table)):
-        held = held_of(table, inputs, axis)
+        horizon = horizon_of(table, inputs, axis)
         p, v = state[axis, 0], state[axis, 1]
-        u, _, _, _ = step(held, stage, lead[axis, 0], lead[axis, 1], p, v)
-        ahead[axis, 0], ahead[axis, 1] = advance(held.model, p, v, u + held.disturbance)
+        u, _, _, _ = step(horizon, stage, reference[axis, 0], reference[axis, 1], p, v)
+        ahead[axis, 0], ahead[axis, 1] = advance(horizon.model, p, v, u + horizon.disturbance)

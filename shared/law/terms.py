@@ -1,8 +1,8 @@
-"""The terms of a flight: what server and client must agree on before it.
+"""Terms of a flight: what server and client must agree on before it.
 
-Whatever both ends predict with is a term, and both build it from the terms alone, so that what is
-left out here cannot be used. Keys of a scenario that are no terms belong to one end, which may set
-them as it likes; `shared/scenario/schema.py` says of each whose it is.
+Everything that both ends use for prediction is a term, and both build it from the terms alone, so
+that nothing left out here can be used. Keys of a scenario that are not terms belong to one end,
+which may set them freely; `shared/scenario/schema.py` says of each whose it is.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class Difference(msgspec.Struct, frozen=True):
     key: str
     """Key of the scenario."""
     here: str
-    """Value at the end that tells it."""
+    """Value at the end that reports it."""
     there: str
     """Value at the other end."""
 
@@ -31,9 +31,9 @@ class Terms(NamedTuple):
     dt_ns: int
     """Length of a step [ns]."""
     horizon: int
-    """Steps planned ahead, H."""
+    """Number of steps planned ahead, H."""
     axes: int
-    """Spatial axes, 2 or 3."""
+    """Number of spatial axes, 2 or 3."""
     tau_s: tuple[float, ...]
     """Time constant of the model, eq. (2)-(3), of each axis [s]."""
     gain: tuple[float, ...]
@@ -43,9 +43,9 @@ class Terms(NamedTuple):
     u_max: tuple[float, ...]
     """Bound of the input, eq. (6), on each axis [m/s]."""
     scheme: str
-    """Delay compensation at both ends, as in `control.scheme`."""
+    """Scheme of delay compensation, as in `control.scheme`."""
     feedback: bool
-    """Whether horizons bring feedback."""
+    """Whether horizons contain feedback."""
     exhausted: str
     """Behaviour after a horizon's last input: "hold" or "brake"."""
     brake_mps2: float
@@ -53,7 +53,7 @@ class Terms(NamedTuple):
     age_max_s: float
     """Largest age of the observation behind an input [s]."""
     join_s: float
-    """Time after its first knot up to which a trajectory is taken [s]; 0: at any time."""
+    """Time after its first knot up to which a trajectory is accepted [s]; 0: at any time."""
     land_after_s: float
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     shape: str
@@ -69,9 +69,9 @@ class Terms(NamedTuple):
     speed_mps: float
     """Speed between waypoints [m/s]."""
     loop: bool
-    """Whether the waypoints are flown round and round."""
+    """Whether the waypoints are flown in a loop."""
     table: str
-    """Digest of what stands in the trajectory's CSV file, wherever the file lies."""
+    """Digest of the content of the trajectory's CSV file."""
 
     @property
     def dt_s(self) -> float:
@@ -80,7 +80,7 @@ class Terms(NamedTuple):
 
     @property
     def model(self) -> Model:
-        """The UAV as both ends know it."""
+        """Model of the vehicle, the same at both ends."""
         return discretise(self.tau_s, self.dt_s, self.gain)
 
     @property
@@ -91,7 +91,7 @@ class Terms(NamedTuple):
 
     @property
     def indexed(self) -> bool:
-        """Whether the vehicle reads a horizon by the step it is at, and not always its first."""
+        """Whether the vehicle reads a horizon at the present stage, not always at its first."""
         return self.scheme not in ("trajectory", "none")
 
     @property
@@ -101,17 +101,17 @@ class Terms(NamedTuple):
 
     @property
     def splines(self) -> bool:
-        """Whether a spline of the desired trajectory is sent, and no inputs."""
+        """Whether splines of the desired trajectory are sent instead of inputs."""
         return self.scheme == "trajectory"
 
     @property
     def planned(self) -> int:
-        """Number of a horizon's inputs behind the committed ones: H, or 1 without a plan."""
+        """Number of a horizon's inputs after the committed ones: H, or 1 without a plan."""
         return 1 if self.splines else self.horizon
 
     @property
     def reach(self) -> int:
-        """Steps behind the committed ones for which a horizon is good: H, or the age bound."""
+        """Steps after the committed ones for which a horizon can be used: H, or the age bound."""
         return self.age_max if self.splines else self.horizon
 
     @property
@@ -121,7 +121,7 @@ class Terms(NamedTuple):
 
     @property
     def join(self) -> int:
-        """Steps after its first knot up to which a trajectory is taken; 0: at any time."""
+        """Steps after its first knot up to which a trajectory is accepted; 0: at any time."""
         return seconds_to_ns(self.join_s) // self.dt_ns
 
     @property
@@ -131,5 +131,5 @@ class Terms(NamedTuple):
 
     @property
     def brake(self) -> float:
-        """Speed that braking takes away in a step [m/s]; 0 where the last input is held."""
+        """Decrease of speed per step when braking [m/s]; 0 if the last input is held."""
         return self.brake_mps2 * self.dt_s if self.exhausted == "brake" else 0.0

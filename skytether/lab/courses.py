@@ -12,12 +12,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.server.common.compiled import lead_to, step
+from skytether.server.common.compiled import reference_at, step
 from skytether.server.schemes.trajectory import along, follow, guided_to
 from skytether.shared.base.kernel import F1, kernel
 from skytether.shared.law.model import Array, Axis
-from skytether.shared.law.rule import Held, bounded
-from skytether.shared.law.spline import Guide
+from skytether.shared.law.rule import AxisHorizon, bounded
+from skytether.shared.law.spline import AxisSpline
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
     DISTURBANCE,
@@ -251,10 +251,12 @@ def _by_inputs(
 ) -> float:
     """Input on one axis at a stage of a horizon [m/s]; see `shared.law.rule.step`."""
     gain_p, gain_v, w = feedback[GAIN_P], feedback[GAIN_V], feedback[DISTURBANCE]
-    held = Held(model, inputs, length, True, speed, brake, bound, feeds_back, gain_p, gain_v, w)
+    held = AxisHorizon(
+        model, inputs, length, True, speed, brake, bound, feeds_back, gain_p, gain_v, w
+    )
     led_p, led_v = feedback[LED_P], feedback[LED_V]
     if feeds_back:
-        led_p, led_v = lead_to(held, 0, stage, led_p, led_v)
+        led_p, led_v = reference_at(held, 0, stage, led_p, led_v)
     u, _, _, _ = step(held, stage, led_p, led_v, p, v)
     return u
 
@@ -288,7 +290,7 @@ def _by_spline(
     before: float,
 ) -> float:
     """Input on one axis at a stage of a trajectory [m/s]; see `shared.law.spline.follow`."""
-    guide = Guide(
+    guide = AxisSpline(
         model, knots, spacing, dt_s, length, last, speed, brake, bound, gain_p, gain_v, lag
     )
     led_p, led_v = guided_to(guide, 0, stage, knots[0], knots[1])

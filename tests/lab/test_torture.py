@@ -224,7 +224,9 @@ def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
     """Feedback that stops after the last input, aboard."""
     step = rule.step
 
-    def end(held: rule.Held, stage: int, *states: float) -> tuple[float, float, float, float]:
+    def end(
+        held: rule.AxisHorizon, stage: int, *states: float
+    ) -> tuple[float, float, float, float]:
         """Feedback up to the last input."""
         if stage >= held.length:
             held = held._replace(gain_p=0.0, gain_v=0.0)

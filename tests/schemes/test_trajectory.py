@@ -28,7 +28,7 @@ from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain
 from skytether.shared.law.model import Array, Indices, advance
-from skytether.shared.law.spline import Guide, along, follow, guided_to, regulated, spline_at
+from skytether.shared.law.spline import AxisSpline, along, follow, guided_to, regulated, spline_at
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
@@ -140,7 +140,7 @@ def test_one_knot_is_a_state_that_goes_on_by_itself(
 # -- the rule of flight ----------------------------------------------------------------------
 
 
-def guide(flown: Scenario, knots: Sequence[float], **other: Any) -> Guide:
+def guide(flown: Scenario, knots: Sequence[float], **other: Any) -> AxisSpline:
     """A spline on the first axis, flown for 100 stages."""
     terms = flown.terms()
     numbers = {
@@ -155,7 +155,7 @@ def guide(flown: Scenario, knots: Sequence[float], **other: Any) -> Guide:
         "gain_v": 0.5,
         "lag": 0.0,
     }
-    return Guide(terms.model.axes()[0], knots, **{**numbers, **other})
+    return AxisSpline(terms.model.axes()[0], knots, **{**numbers, **other})
 
 
 def test_along_a_spline_the_models_velocity_is_the_splines() -> None:

@@ -17,14 +17,14 @@ from skytether.shared.base.kernel import part
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Axis, advance
 from skytether.shared.law.rule import (
-    Held,
+    AxisHorizon,
     bounded,
     entry,
+    feedback,
     flown,
     lasting,
     late_max,
-    leading,
-    led_back,
+    reference_input,
     remaining,
 )
 from skytether.shared.scenario.gain import feedback_gain
@@ -63,9 +63,9 @@ def test_an_input_is_kept_within_the_bound() -> None:
 
 def test_feedback_leads_back_in_position_and_velocity() -> None:
     """K (x̄ - x): each gain on its own part."""
-    assert led_back(3.0, 1.5, 0.25, 0.0) == 0.75
-    assert led_back(3.0, 1.5, 0.0, -0.5) == -0.75
-    assert led_back(3.0, 1.5, 0.25, -0.5) == 0.0
+    assert feedback(3.0, 1.5, 0.25, 0.0) == 0.75
+    assert feedback(3.0, 1.5, 0.0, -0.5) == -0.75
+    assert feedback(3.0, 1.5, 0.25, -0.5) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -96,18 +96,18 @@ def test_braking_takes_away_its_part_of_the_speed_at_every_step_until_rest() -> 
 
 def test_where_it_leads_is_blown_along_only_until_it_stands() -> None:
     """The disturbance counts while anything of the inputs is left."""
-    assert leading(0.5, -0.25, 1.0) == 0.25
-    assert leading(0.0, -0.25, 0.01) == -0.25
-    assert leading(0.0, -0.25, 0.0) == 0.0
+    assert reference_input(0.5, -0.25, 1.0) == 0.25
+    assert reference_input(0.0, -0.25, 0.01) == -0.25
+    assert reference_input(0.0, -0.25, 0.0) == 0.0
 
 
-def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) -> Held:
+def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) -> AxisHorizon:
     """A horizon of some inputs, all of them flown; braked from its last one on."""
     axis = Axis(a01=0.09, a11=0.88, b0=0.01, b1=0.12)
     numbers = {"speed": abs(inputs[-1]), "brake": 0.125, "bound": 1.8, "disturbance": 0.25}
     gain = {"gain_p": 3.0, "gain_v": 1.5}
     given = {"length": len(inputs), "indexed": True, **numbers, **gain, **changed}
-    return Held(model=axis, inputs=inputs, feeds_back=feeds_back, **given)
+    return AxisHorizon(model=axis, inputs=inputs, feeds_back=feeds_back, **given)
 
 
 @pytest.mark.parametrize(
@@ -140,8 +140,8 @@ def test_where_a_horizon_leads_is_that_step_by_step() -> None:
     """From any stage to any later one; to an earlier one, or the same, it stays."""
     horizon, lead = held([0.25, 0.5]), (1.0, 0.5)
     for stage in range(6):
-        assert rule.lead_to(horizon, 0, stage, 1.0, 0.5) == lead
-        assert rule.lead_to(horizon, stage, stage, *lead) == lead
+        assert rule.reference_at(horizon, 0, stage, 1.0, 0.5) == lead
+        assert rule.reference_at(horizon, stage, stage, *lead) == lead
         *_, lead_p, lead_v = rule.step(horizon, stage, *lead, 0.0, 0.0)
         lead = lead_p, lead_v
 
@@ -149,7 +149,7 @@ def test_where_a_horizon_leads_is_that_step_by_step() -> None:
 speeds = st.floats(-3.0, 3.0)
 COMPILED = {
     each.__name__: part(each)
-    for each in (lasting, entry, bounded, remaining, leading, led_back, flown, rule.step)
+    for each in (lasting, entry, bounded, remaining, reference_input, feedback, flown, rule.step)
 }
 
 
@@ -166,9 +166,9 @@ def test_compiled_it_says_the_same(
     share = remaining(stage, length, speed, brake)
     for function, *given_ in (
         (remaining, stage, length, speed, brake),
-        (leading, told, back, share),
+        (reference_input, told, back, share),
         (flown, stage, told, back, bound),
-        (led_back, *numbers[:4]),
+        (feedback, *numbers[:4]),
         (bounded, told, bound),
         (entry, stage, length),
         (lasting, length, 100, 100 - stage, 20),
@@ -318,5 +318,5 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 
 
 def test_the_server_compiles_the_very_functions_that_the_vehicle_calls() -> None:
-    for name in ("lasting", "bounded", "lead_to", "step", "advance"):
+    for name in ("lasting", "bounded", "reference_at", "step", "advance"):
         assert getattr(law, name) is getattr(rule, name)
