@@ -1,1 +1,1 @@
-"""Foundations: units of time, named chance, files, hints, errors for users."""
+"""Foundations: units of time, random streams, files, hints, errors for users."""

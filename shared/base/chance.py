@@ -1,4 +1,4 @@
-"""Named streams of chance: the same seed and names give the same numbers, in any process."""
+"""Named random streams: the same seed and names give the same numbers in any process."""
 
 import zlib
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
-    """An independent generator for one purpose, as in `stream(3, "uplink", "delay", flow)`."""
+    """Independent random generator for one purpose, as in `stream(3, "uplink", "delay", flow)`."""
     # The count comes first: to a SeedSequence [1, 2] and [1, 2, 0] are the same.
     numbers = [zlib.crc32(name.encode()) if isinstance(name, str) else name for name in names]
     return np.random.Generator(

@@ -1,4 +1,4 @@
-"""Extras: what `pip install skytether` leaves out, and which extra of pyproject.toml brings it."""
+"""Optional extras: the packages that each extra of pyproject.toml adds."""
 
 import re
 from collections.abc import Iterator
@@ -6,11 +6,11 @@ from contextlib import contextmanager
 from importlib import util
 
 MODULES = {"pillow": "PIL"}
-"""Module of each package that is not imported by its own name."""
+"""Modules of packages whose import name differs."""
 
 
 class ExtraMissing(ModuleNotFoundError):
-    """Error: what was asked for needs an extra; the message says which, and how to install it."""
+    """An extra is needed; the message says which, and how to install it."""
 
     def __init__(self, module: str, extra: str) -> None:
         command = f"pip install 'skytether[{extra}]'"
@@ -19,10 +19,10 @@ class ExtraMissing(ModuleNotFoundError):
 
 @contextmanager
 def named() -> Iterator[None]:
-    """Name the smallest extra that brings a module which is missing in this block.
+    """Within this block, name the smallest extra that provides a missing module.
 
     Raises:
-        ExtraMissing: in place of a ModuleNotFoundError, where an extra has the module.
+        ExtraMissing: instead of a ModuleNotFoundError, if an extra provides the module.
     """
     try:
         yield
@@ -37,10 +37,10 @@ def named() -> Iterator[None]:
 
 
 def need(extra: str) -> None:
-    """Refuse what would miss a module of an extra later.
+    """Check that an extra is installed.
 
     Raises:
-        ExtraMissing: the extra is not installed, or not all of it.
+        ExtraMissing: it is not, or not completely.
     """
     for module in _extras()[extra]:
         if util.find_spec(module) is None:
@@ -48,7 +48,7 @@ def need(extra: str) -> None:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Modules of each extra, each called as its package is, except for MODULES."""
+    """Modules of each extra, named like their packages, except for MODULES."""
     from importlib import metadata  # a tenth of what flies; wanted where something is missing
 
     extras: dict[str, list[str]] = {}

@@ -1,15 +1,16 @@
-"""Files that a user names: read up to a largest size, and written without destroying another.
+"""Files named by a user: read with a size limit, and written without destroying others.
 
-Whatever a command writes is a plain file: a device, a pipe or a link at its place is refused. With
-`--out /dev/sda`, or a link that somebody has left there, it would otherwise write elsewhere.
+Everything that a command writes is a plain file: a device, a pipe or a link in its place is
+refused. Otherwise `--out /dev/sda`, or a link left there by somebody else, would write elsewhere.
 
-- New content is written beside the old and takes its name once it is whole (`replacing`): a full
-  disk or a killed process leaves the old file as it was.
+- New content is written beside the old file and takes its name once it is complete (`replacing`): a
+  full disk or a killed process leaves the old file as it was.
 - A file that grows during a flight (`Growing`) has its own name from the start, unless an older
   file has it.
-- No command writes a file that it reads, and no two commands write one file (`apart`, `claim`).
+- No command writes a file that it reads, and no two commands write the same file (`apart`,
+  `claim`).
 
-Nothing else in this package opens a file for writing, which tests/whole/test_writes.py proves.
+Nothing else in this package opens a file for writing; tests/whole/test_writes.py checks it.
 """
 
 import fcntl
@@ -25,13 +26,13 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-"""Flags for files that are written: they guard against a link or a pipe in the file's place."""
+"""Flags for files to be written: they guard against a link or a pipe in the file's place."""
 MODE = 0o666
-"""Permissions of a new file, less the user's mask."""
+"""Permissions of a new file, before the user's umask."""
 
 T = TypeVar("T")
 Inode = tuple[int, int]
-"""Device and number of a file, the same by whichever name it is reached."""
+"""Device and inode of a file, the same under any of its names."""
 
 
 # -- one command's files ----------------------------------------------------------------------
@@ -44,19 +45,19 @@ class _Command:
     inputs: set[Inode] = field(default_factory=set)
     """Files that it has read."""
     outputs: set[Inode] = field(default_factory=set)
-    """Files and folders that it is going to write, each locked."""
+    """Files and folders that it will write, each locked."""
     ending: ExitStack = field(default_factory=ExitStack)
-    """Locks, and new files to remove where nothing was written."""
+    """Releases locks, and removes new files to which nothing was written."""
 
 
 _commands: list[_Command] = []
-"""The command that runs, behind those that run it; none outside of `apart`, where files are only
-read and written."""
+"""Running command, after those that called it; empty outside `apart`, when files are only read and
+written."""
 
 
 @contextmanager
 def apart() -> Iterator[None]:
-    """Keep the files that a command reads from being written, for as long as the block takes.
+    """Within this block, keep files that the command reads from being written.
 
     Locks of `claim` last until the end of the block.
     """
@@ -72,7 +73,7 @@ def note(path: Path, file: BinaryIO) -> None:
     """Note that the command reads an open file, which it may then not write.
 
     Raises:
-        OSError: the command is going to write it.
+        OSError: the command will write it.
     """
     inode = _inode(os.fstat(file.fileno()))
     for each in _commands:
@@ -82,12 +83,13 @@ def note(path: Path, file: BinaryIO) -> None:
 
 
 def claim(path: Path, *, is_input: bool = False) -> None:
-    """Lock a file to be written until the command ends; one that is missing is made, empty.
+    """Lock a file that will be written, until the command ends; a missing one is created empty.
 
     A new file that is still empty at the end is removed.
 
     Args:
-        is_input: whether the command reads the file as well; none is made then.
+        path: the file.
+        is_input: whether the command reads the file as well; then it is not created.
 
     Raises:
         OSError: it cannot be written, the command reads it, another option names it, or another
@@ -98,7 +100,7 @@ def claim(path: Path, *, is_input: bool = False) -> None:
         return
     folder = path.absolute().parent
     if not os.access(folder, os.W_OK | os.X_OK):
-        folder.stat()  # raises where it is missing, which access does not tell apart
+        folder.stat()  # raises if it is missing, which access does not distinguish
         raise OSError(EACCES, os.strerror(EACCES), str(path))
     with ExitStack() as stack:
         flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if made else 0)
@@ -110,16 +112,16 @@ def claim(path: Path, *, is_input: bool = False) -> None:
 
 
 def claim_folder(path: Path) -> None:
-    """Lock a folder to write files in until the command ends; one that is missing is made.
+    """Lock a folder for writing files until the command ends; a missing one is created.
 
     Raises:
-        OSError: it cannot be made, or another command has locked it.
+        OSError: it cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         stack.callback(os.close, descriptor)
-        # Two options may name one folder.
+        # Two options may name the same folder.
         if not _is_claimed(_inode(os.fstat(descriptor))):
             _hold(path, descriptor, stack)
 
@@ -142,7 +144,7 @@ def _is_claimed(inode: Inode) -> bool:
 
 
 def _locked(path: Path, descriptor: int) -> bool:
-    """Lock an open file; False where another command has locked it, or has just replaced it."""
+    """Lock an open file; False if another command has locked it, or has just replaced it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -153,7 +155,7 @@ def _locked(path: Path, descriptor: int) -> bool:
 
 
 def _remove_empty(path: Path, descriptor: int) -> None:
-    """Remove a file that was made to be locked, unless something was written to it."""
+    """Remove a file created for locking, unless something was written to it."""
     with suppress(OSError):
         status = path.lstat()
         if not status.st_size and _inode(status) == _inode(os.fstat(descriptor)):
@@ -168,18 +170,19 @@ def _inode(status: os.stat_result) -> Inode:
 
 
 def read(path: Path, most: int, *, private: bool = False) -> bytes:
-    """The content of a file.
+    """Content of a file.
 
     Args:
+        path: the file.
         most: largest size of the file [B].
-        private: whether nobody but its owner may be able to read, write or replace it.
+        private: whether only its owner may be able to read, write or replace it.
 
     Raises:
-        OSError: it cannot be read, it is larger, or a pipe or device, which might never end; it is
-            to be private, and is not; or the command is going to write it.
-        ValueError: no file can have this name.
+        OSError: it cannot be read, is too large, is a pipe or device (which might never end), is
+            not private as required, or will be written by the command.
+        ValueError: the name is invalid.
     """
-    # Without O_NONBLOCK, opening a pipe waits for somebody who writes.
+    # Without O_NONBLOCK, opening a pipe waits for a writer.
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
     if private:
         check_private(path)
@@ -199,21 +202,21 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
 
 
 def check_private(path: Path) -> None:
-    """Refuse a private file where others decide which file has its name.
+    """Refuse a private file if others can put another file in its place.
 
-    That is a link, a folder that anybody may write to, and one within a folder in which anybody
-    may put another in its place.
+    That is the case for a link, in a folder that anybody may write to, and in a folder that anybody
+    may replace.
 
     Raises:
-        OSError: with what it is, and what was expected.
-        ValueError: no file can have this name.
+        OSError: says what was found and what was expected.
+        ValueError: the name is invalid.
     """
     if path.is_symlink():
         raise OSError(ELOOP, "it is a link, expected the file itself")
     for folder in (path.absolute().parent, path.parent.resolve()):
         for each in (folder, *folder.parents):
             mode = stat.S_IMODE(each.stat().st_mode)
-            # Where the sticky bit is, folders within are their owners'.
+            # With the sticky bit, the folders within belong to their owners.
             if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
                 found = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
                 raise OSError(EACCES, f"{found}: expected one where nobody else may")
@@ -223,16 +226,17 @@ def check_private(path: Path) -> None:
 
 
 def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
-    """Refuse a place where a file cannot be written: anything but a plain file, or nothing yet.
+    """Refuse a path at which no plain file can be written.
 
     Args:
+        path: the path.
         is_input: whether the file may be one that the command reads.
 
     Returns:
-        what is known of the file that is there; None for none.
+        status of the present file; None if there is none.
 
     Raises:
-        OSError: with what is there.
+        OSError: says what is there.
     """
     try:
         status = path.lstat()
@@ -249,7 +253,7 @@ def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file as a whole, or not at all; see `replacing`."""
+    """Write a file completely, or not at all; see `replacing`."""
     with replacing(path) as file:
         file.write(content)
 
@@ -263,17 +267,18 @@ def replacing(
     is_new: bool = False,
     is_synced: bool = True,
 ) -> Iterator[BinaryIO]:
-    """File for new content, which gets its name at the end of the block; on an error, nothing is
-    changed.
+    """File for new content, which takes its name at the end of the block; after an error nothing
+    has changed.
 
-    It has no name until then where the file system can do this, so that a killed process leaves
-    nothing. Its permissions are those of the file that it replaces.
+    It has no name until then if the file system supports that, so that a killed process leaves
+    nothing. It has the permissions of the file that it replaces.
 
     Args:
+        path: final path of the file.
         is_input: whether the file may be one that the command reads.
-        mode: its permissions, unless they are to be those of the file that it replaces.
-        is_new: whether a file that is there is an error.
-        is_synced: whether it is on the disk at the end, and outlives the computer.
+        mode: its permissions; None: those of the file that it replaces.
+        is_new: whether an existing file is an error.
+        is_synced: whether it is synced to disk at the end.
 
     Raises:
         OSError: it cannot be written, is no plain file, or exists although it must be new.
@@ -309,7 +314,7 @@ def replacing(
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file for reading and for more lines at its end, locked until it is closed.
+    """Open a file for reading and appending, locked until it is closed.
 
     Raises:
         OSError: it cannot be written, is no plain file, or another command has locked it.
@@ -323,10 +328,10 @@ def appending(path: Path) -> BinaryIO:
 
 
 class Growing:
-    """File that grows as long as a flight takes, and may be read meanwhile.
+    """File that grows during a flight, and may be read meanwhile.
 
-    It has its own name from the start. Where an older file has that name, it is written beside that
-    file, as NAME.part1.SUFFIX, until it is whole: see `end`.
+    It has its own name from the start. If an older file has that name, it is written beside that
+    file, as NAME.part1.SUFFIX, until it is complete: see `end`.
 
     Args:
         path: file to write.
@@ -340,29 +345,29 @@ class Growing:
         self._path = path
         status = check(path)
         self.at = path
-        """Path of the file, for now."""
+        """Present path of the file."""
         if status and status.st_size:
             self.at, descriptor = _unused(path, _new)
         else:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE)
         self.file: BinaryIO = os.fdopen(descriptor, "r+b", buffering=buffering)
-        """The file, open for writing and reading."""
+        """Open file, for writing and reading."""
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size:
             self.file.close()
             raise OSError(EINVAL, "it is no plain file, or has just been written", str(path))
 
     def end(self, *, empty: bool, whole: bool) -> None:
-        """Close the file; beside an older one, it takes its name or is removed, or stays there.
+        """Close the file; if there is an older one, replace it, or stay beside it, or be removed.
 
         Args:
-            empty: whether it holds nothing of use: then the older one stays.
-            whole: whether it holds everything: then the older one is gone.
+            empty: whether it contains nothing useful: then it is removed.
+            whole: whether it is complete: then it replaces the older one.
 
         Raises:
             OSError: it cannot be renamed.
         """
-        with suppress(OSError):  # raised where its buffer cannot be written
+        with suppress(OSError):  # raised if its buffer cannot be written
             self.file.close()
         if self.at == self._path:
             return
@@ -376,16 +381,16 @@ def _new(path: Path, mode: int = MODE) -> int:
     """Descriptor of a new file.
 
     Raises:
-        OSError: it exists, or cannot be made.
+        OSError: it exists, or cannot be created.
     """
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, mode)
 
 
 def _link(descriptor: int, path: Path) -> None:
-    """Give an open file a name that is not taken.
+    """Give an open file a name.
 
     Raises:
-        OSError: the name is taken.
+        OSError: the name is in use.
     """
     # link(2) would not follow the link in /proc; with `src_dir_fd` Python calls linkat(2).
     own = f"/proc/self/fd/{descriptor}"
@@ -393,9 +398,9 @@ def _link(descriptor: int, path: Path) -> None:
 
 
 def _unused(path: Path, make: Callable[[Path], T]) -> tuple[Path, T]:
-    """Make a file beside another, under the first name that is not taken."""
+    """Create a file beside another, with the first unused name."""
     for number in count(1):
         with suppress(FileExistsError):
             at = path.with_stem(f"{path.stem}.part{number}")
             return at, make(at)
-    raise AssertionError  # numbers do not end
+    raise AssertionError  # unreachable

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 def hint(given: str, known: Iterable[str]) -> str:
-    """Asks after the known name that is most like it; where none is, lists them."""
+    """Ask for the most similar known name; if none is similar, list them all."""
     import difflib  # for mistakes alone
 
     close = difflib.get_close_matches(given, known, n=1)

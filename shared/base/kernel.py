@@ -1,17 +1,17 @@
-"""Compiled kernels: loops along a horizon, compiled by numba when they are called first.
+"""Compiled kernels: loops along a horizon, compiled by numba on their first call.
 
-A kernel's signature is read off its annotations, so that mypy and numba check the same words: an
-array is annotated with one of the types below, an array of records with one made of its dtype, and
-arrays that travel together with their NamedTuple. A record is told by a class, a line a field; none
-is ever made of it, but it names the type of a record to mypy. A part is a function that only
-kernels call; it is compiled into each of them.
+A kernel's signature is taken from its annotations, so that mypy and numba check the same types: an
+array is annotated with one of the types below, an array of records with one made from its dtype,
+and arrays that belong together with their NamedTuple. A record is described by a class with a line
+per field, which is never instantiated but is its type for mypy. A part is a function that only
+kernels call, and is compiled into each of them.
 
-What must not wait in flight compiles them before: `missing` tells which have no machine code yet,
-`load` has all of them ready. Importing them compiles nothing.
+What must not wait in flight compiles them earlier: `missing` lists the kernels without machine
+code, `load` prepares all of them. Importing compiles nothing.
 
-Machine code is kept on disk, beside the sources or where NUMBA_CACHE_DIR says. Numba looks at the
-kernel's own file to see whether it is still right; here every function and constant that a kernel
-reaches counts, in whichever module it stands, so that no kernel flies by a rule that has changed.
+Machine code is stored on disk, beside the sources or in NUMBA_CACHE_DIR. Numba itself only checks
+whether the kernel's own file has changed; here every function and constant that a kernel uses
+counts, in any module, so that no outdated machine code is used.
 """
 
 import hashlib
@@ -50,56 +50,56 @@ S2 = Annotated[NDArray[np.float32], numba.float32[:, ::1]]
 S3 = Annotated[NDArray[np.float32], numba.float32[:, :, ::1]]
 S4 = Annotated[NDArray[np.float32], numba.float32[:, :, :, ::1]]
 B1 = Annotated[NDArray[np.bool_], numba.boolean[::1]]
-"""Contiguous arrays of float64 (F; R where they are only read), int64 (I), float32 (S) and bool
-(B), by number of axes."""
+"""Contiguous arrays of float64 (F; R if only read), int64 (I), float32 (S) and bool (B), by number
+of axes."""
 
 SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
 
 
 CODES = {int: "i8", float: "f8", bool: "?"}
-"""Numpy's code of the field of a record, by its annotation."""
+"""Numpy's type codes of record fields by annotation."""
 
 
 def record(kind: type) -> np.dtype[np.void]:
-    """Numpy dtype of a record, with a field for each annotation of a class."""
+    """Numpy dtype of a record, one field per annotation of the class."""
     fields = [(name, CODES[hint]) for name, hint in get_type_hints(kind).items()]
     return np.dtype(fields, align=True)
 
 
 def records(dtype: np.dtype[np.void], ndim: int) -> Any:
-    """The numba type of a contiguous array of such records, for an annotation."""
+    """Numba type of a contiguous array of such records, for an annotation."""
     return numba.types.Array(numba.from_dtype(dtype), ndim, "C")
 
 
 def kernel(function: F) -> F:
-    """A function, compiled at its first call for the types that its annotations name.
+    """Function that is compiled on its first call, for the types of its annotations.
 
     It cannot make arrays: numba counts no references in it. Counting them is an atomic instruction
-    for each array and slice, and took half of the time of a plan.
+    per array and slice, and took half of the time of a plan.
     """
     return _at_first_call(numba.njit(error_model="numpy", _nrt=False)(function))
 
 
 def making_kernel(function: F) -> F:
-    """A kernel that makes arrays of its own."""
+    """Kernel that makes arrays of its own."""
     return _at_first_call(numba.njit(error_model="numpy")(function))
 
 
 def _at_first_call(dispatcher: Any) -> Any:
-    """A kernel that compiles for its annotations once it is called; its `dispatcher` is numba's.
+    """Kernel that compiles for its annotations on the first call; `dispatcher` is numba's.
 
-    A dispatcher takes the types of all arguments at every call, to find the machine code for them:
-    of 45 arrays in tuples that took 15 µs, and 70 µs where a tick comes every 50 ms and the caches
-    are cold. There is one machine code only, so the types are checked at the first call, and the
-    later ones go straight to it. `check_types` has every call checked.
+    A dispatcher determines the types of all arguments at every call to find the machine code for
+    them: with 45 arrays in tuples that took 15 µs, and 70 µs when a tick comes every 50 ms and the
+    caches are cold. Here there is only one machine code, so the types are checked at the first
+    call, and later calls go straight to it. With `check_types` every call is checked.
     """
 
     def first(*arguments: Any) -> Any:
         _compile(dispatcher)
         answer = dispatcher(*arguments)
         (compiled,) = dispatcher.overloads.values()
-        # A partial function of no arguments: its function can be changed, and calling it costs less
-        # than a method would.
+        # A partial function without arguments: its function can be replaced, and calling it costs
+        # less than a method.
         code = dispatcher if _CHECKED else compiled.entry_point
         call.__setstate__((code, (), {}, call.__dict__))
         return answer
@@ -111,53 +111,53 @@ def _at_first_call(dispatcher: Any) -> Any:
 
 
 _CHECKED: list[bool] = []
-"""Holds something where the types of arguments are checked at every call of a kernel."""
+"""Not empty if the types of arguments are checked at every call of a kernel."""
 
 
 def check_types() -> None:
-    """From now on, check at each call of a kernel that its arguments are what it says: for tests.
+    """From now on, check the types of arguments at each call of a kernel: for tests.
 
-    Kernels that have been called already go on as they are.
+    Kernels that have been called already are not affected.
     """
     _CHECKED.append(True)
 
 
 KERNELS: list[Any] = []
-"""Kernels whose modules are imported, compiled or not."""
+"""Kernels of all imported modules, compiled or not."""
 
 
 class Missing(NamedTuple):
-    """A kernel without machine code in memory or on disk."""
+    """Kernel without machine code in memory or on disk."""
 
     name: str
     """Module and name of the kernel, for `compile_named`."""
-    is_kept: bool
-    """Whether the machine code will be kept on disk."""
+    is_stored: bool
+    """Whether the machine code will be stored on disk."""
     compile: Callable[[], None]
-    """Function that compiles it, or reads what another process has compiled since."""
+    """Function that compiles it, or loads what another process has compiled since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:
-    """Kernels without machine code in memory or on disk; those with the most to compile come first.
+    """Kernels without machine code in memory or on disk, the slowest to compile first.
 
     Args:
         without: names of the modules whose kernels are not needed.
     """
-    found = [
+    uncompiled = [
         each
         for each in KERNELS
-        if each.__module__ not in without and not (each.overloads or _is_kept(each))
+        if each.__module__ not in without and not (each.overloads or _is_stored(each))
     ]
     return [
         Missing(
             _name(each), not isinstance(each._cache, caching.NullCache), partial(_compile, each)
         )
-        for each in sorted(found, key=_extent, reverse=True)
+        for each in sorted(uncompiled, key=_extent, reverse=True)
     ]
 
 
 def compile_named(name: str) -> None:
-    """Compile the kernel that `Missing` names so."""
+    """Compile the kernel with this `Missing.name`."""
     import_module(name.partition(":")[0])
     (dispatcher,) = (each for each in KERNELS if _name(each) == name)
     _compile(dispatcher)
@@ -168,7 +168,7 @@ def _name(dispatcher: Any) -> str:
 
 
 def _extent(dispatcher: Any) -> int:
-    """Number of arguments, with the parts of tuples, by which the time of compiling rises."""
+    """Number of arguments, including the parts of tuples, with which the compile time grows."""
 
     def parts(kind: Any) -> int:
         return sum(map(parts, kind)) if isinstance(kind, numba.types.BaseTuple) else 1
@@ -187,53 +187,56 @@ def load(without: Collection[str] = ()) -> None:
             _compile(each)
 
 
-def _is_kept(dispatcher: Any) -> bool:
+def _is_stored(dispatcher: Any) -> bool:
     """Whether the machine code of a kernel is on disk."""
-    _keep(dispatcher)
+    _store_on_disk(dispatcher)
     cache = dispatcher._cache
     if isinstance(cache, caching.NullCache):
         return False
     key = cache._index_key(_signature(dispatcher), dispatcher.targetctx.codegen())
-    return key in cache._cache_file._load_index()  # the code itself takes ten times as long
+    return key in cache._cache_file._load_index()  # loading the code itself takes ten times as long
 
 
 @global_compiler_lock  # type: ignore[untyped-decorator]
 def _compile(dispatcher: Any) -> None:
-    """Take the machine code of a kernel from the disk, or make it, once."""
+    """Load the machine code of a kernel from disk, or compile it, once."""
     if dispatcher.overloads:
         return
-    _keep(dispatcher)
+    _store_on_disk(dispatcher)
     if dispatcher.targetoptions.get("_nrt", True):
-        rtsys.initialize(dispatcher.targetctx)  # what counts references, which `Kept` leaves out
+        rtsys.initialize(
+            dispatcher.targetctx
+        )  # reference counting, which `KernelCache` does not set up
     signature = _signature(dispatcher)
     try:
         dispatcher.compile(signature)
-    except OSError:  # the disk is full, say: it is compiled, and not kept
+    except OSError:  # for example, a full disk: compiled, but not stored
         dispatcher._cache = caching.NullCache()
         dispatcher.compile(signature)
     dispatcher.disable_compile()
 
 
-def _keep(dispatcher: Any) -> None:
-    """Cache machine code on disk, where there is a place for it."""
-    if isinstance(dispatcher._cache, Kept):
+def _store_on_disk(dispatcher: Any) -> None:
+    """Store machine code on disk, if a folder is writable."""
+    if isinstance(dispatcher._cache, KernelCache):
         return
-    with suppress(RuntimeError):  # no place can be written to
-        dispatcher._cache = Kept(dispatcher.py_func)
+    with suppress(RuntimeError):  # no folder is writable
+        dispatcher._cache = KernelCache(dispatcher.py_func)
 
 
 def _signature(dispatcher: Any) -> tuple[Any, ...]:
-    """Numba's types of the parameters, as they are annotated."""
+    """Numba types of the annotated parameters."""
     hints = get_type_hints(dispatcher.py_func, include_extras=True)
     hints.pop("return", None)
     return tuple(map(_type, hints.values()))
 
 
 def _type(hint: Any) -> Any:
-    """Numba's type for an annotation."""
+    """Numba type of an annotation."""
     if hasattr(hint, "__metadata__"):
         kind = hint.__metadata__[0]
-        # What flies aboard imports no numba: there a number of dimensions stands for the type.
+        # Code that flies aboard does not import numba: there a number of dimensions stands for the
+        # type.
         return numba.types.Array(numba.float64, kind, "C") if isinstance(kind, int) else kind
     if hasattr(hint, "_fields"):
         fields = get_type_hints(hint, include_extras=True)
@@ -242,13 +245,13 @@ def _type(hint: Any) -> Any:
 
 
 def part(function: F) -> F:
-    """A function that kernels call, once for a vehicle or an axis; it makes no arrays."""
+    """Function called by kernels, for example once per vehicle or axis; it makes no arrays."""
     compiled: F = numba.njit(error_model="numpy", _nrt=False)(function)
     return compiled
 
 
 def making_part(function: F) -> F:
-    """A part that makes arrays of its own."""
+    """Part that makes arrays of its own."""
     compiled: F = numba.njit(error_model="numpy")(function)
     return compiled
 
@@ -256,18 +259,18 @@ def making_part(function: F) -> F:
 class Disjoint(compiler.Compiler):  # type: ignore[misc]
     """Numba's compiler for functions whose arrays share no memory.
 
-    Numba promises that to LLVM of none of its own functions, and LLVM gives up on vectors where
-    more than a few pairs of arrays would have to be compared in flight.
+    Numba does not give LLVM this guarantee for its own functions, and LLVM does not vectorise if
+    more than a few pairs of arrays would have to be compared at run time.
     """
 
     def define_pipelines(self) -> Any:
-        """Numba's passes, with that promise."""
+        """Numba's passes, with that guarantee."""
         self.state.flags.noalias = True
         return super().define_pipelines()
 
 
 def lanes(function: F) -> F:
-    """A part whose innermost loops go over lanes, side by side in vectors.
+    """Part whose innermost loops run over vehicles, vectorised.
 
     No two of its arrays may share memory, unless both are only read.
     """
@@ -276,14 +279,14 @@ def lanes(function: F) -> F:
 
 
 def inline(function: F) -> F:
-    """A function of a few numbers that kernels call at every stage."""
+    """Function of a few numbers that kernels call at every stage."""
     compiled: F = numba.njit(error_model="numpy", _nrt=False, inline="always")(function)
     return compiled
 
 
 def shared(function: F) -> F:
-    """A function of `shared` as it is, which kernels may call as Python does; so what it calls."""
-    for each in _reached(function):
+    """Unchanged function that kernels may call, too, with everything that it calls."""
+    for each in _dependencies(function):
         if inspect.isfunction(each) and each not in _SHARED:
             register_jitable(error_model="numpy")(each)
             _SHARED.add(each)
@@ -291,11 +294,11 @@ def shared(function: F) -> F:
 
 
 _SHARED: set[Callable[..., Any]] = set()
-"""Functions that kernels may call as they are."""
+"""Functions that kernels may call unchanged."""
 
 
 def compile_all() -> None:
-    """From now on, fly by machine code what `shared.base.compilable` marks, in this process."""
+    """From now on, in this process, use machine code for the functions marked `compilable`."""
     for call in COMPILABLE:
         if call.func not in _PLAIN:
             if call.func not in _MACHINE:
@@ -305,38 +308,38 @@ def compile_all() -> None:
 
 
 def interpret_all() -> None:
-    """Fly by plain Python again what `compile_all` has compiled."""
+    """Use plain Python again for the functions that `compile_all` has compiled."""
     for call in COMPILABLE:
         if call.func in _PLAIN:
             call.__setstate__((_PLAIN[call.func], (), {}, {}))
 
 
 _MACHINE: dict[Callable[..., Any], Any] = {}
-"""Kernels by the functions that they were made of."""
+"""Kernels by original function."""
 _PLAIN: dict[Any, Callable[..., Any]] = {}
-"""The other way round."""
+"""Original functions by kernel."""
 
 
 def plain(function: F) -> F:
-    """The function that a kernel or part was made of, to be called from Python now and then."""
+    """Original function of a kernel or part, for occasional calls from Python."""
     original: F = function.py_func  # type: ignore[attr-defined]
     return original
 
 
-class Reaching:
-    """Makes one of numba's cache locators mind everything that a kernel reaches."""
+class DependencyStamp:
+    """Makes a numba cache locator depend on everything that a kernel uses."""
 
     def get_source_stamp(self) -> str:
-        """Stamp that must be unchanged for machine code on disk to be used."""
+        """Stamp that must be unchanged for stored machine code to be used."""
         return self.stamp
 
     def get_disambiguator(self) -> str:
-        """Part of the file's name: a file that another stamp belongs to is not even opened."""
+        """Part of the file's name: a file with another stamp is not even opened."""
         return self.stamp[:16]
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        """The locator of a kernel, or None where this place cannot be written to."""
+        """Locator for a kernel, or None if its folder is not writable."""
         locator = super().from_function(py_func, py_file)  # type: ignore[misc]
         if locator is not None:
             locator.stamp = stamp(py_func)
@@ -345,58 +348,58 @@ class Reaching:
     stamp: str
 
 
-class Given(Reaching, caching.UserProvidedCacheLocator):  # type: ignore[misc]
-    """The folder that NUMBA_CACHE_DIR names."""
+class NamedFolder(DependencyStamp, caching.UserProvidedCacheLocator):  # type: ignore[misc]
+    """Folder named by NUMBA_CACHE_DIR."""
 
 
-class Beside(Reaching, caching.InTreeCacheLocator):  # type: ignore[misc]
-    """The folder `__pycache__` beside the source."""
+class SourceFolder(DependencyStamp, caching.InTreeCacheLocator):  # type: ignore[misc]
+    """Folder `__pycache__` beside the source."""
 
 
-class OfUser(Reaching, caching.UserWideCacheLocator):  # type: ignore[misc]
-    """The user's own cache."""
+class UserFolder(DependencyStamp, caching.UserWideCacheLocator):  # type: ignore[misc]
+    """The user's cache folder."""
 
 
-class Places(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    """The places where machine code may be kept, in the order of preference."""
+class CacheFolders(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    """Folders for machine code, in order of preference."""
 
-    _locator_classes = (Given, Beside, OfUser)
+    _locator_classes = (NamedFolder, SourceFolder, UserFolder)
 
 
-class Kept(caching.FunctionCache):  # type: ignore[misc]
+class KernelCache(caching.FunctionCache):  # type: ignore[misc]
     """Machine code of a kernel on disk.
 
-    Before it looks there, numba's own cache imports all that its compiler knows of Python and
-    numpy: 0.3 s and 36 MB. Machine code that is loaded needs none of that, and where some has to be
-    made, the compiler imports it.
+    Before looking there, numba's own cache imports everything its compiler knows of Python and
+    numpy: 0.3 s and 36 MB. Stored machine code does not need it; to compile, the compiler imports
+    it anyway.
     """
 
-    _impl_class = Places
+    _impl_class = CacheFolders
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The machine code for a signature, or None where there is none."""
+        """Machine code for a signature, or None."""
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 
 
 def stamp(function: Callable[..., Any]) -> str:
-    """A digest of a kernel, and of all types, compiled functions and constants that it reaches."""
+    """Digest of a kernel, and of all types, compiled functions and constants that it uses."""
     hints = get_type_hints(function, include_extras=True)
-    found = {"types": repr([_type_name(hint) for hint in hints.values()])}
-    for each in _reached(function):
+    dependencies = {"types": repr([_type_name(hint) for hint in hints.values()])}
+    for each in _dependencies(function):
         place = f"{each.__module__}.{each.__qualname__}"
-        found[place] = _source(each)
+        dependencies[place] = _source(each)
         for name in each.__code__.co_names:
             value: Any = each.__globals__.get(name)
             if isinstance(value, type) and hasattr(value, "_fields"):
-                found[f"{place}: {name}"] = _type_name(value)
+                dependencies[f"{place}: {name}"] = _type_name(value)
             elif isinstance(value, int | float | str | tuple | np.dtype):
-                found[f"{place}: {name}"] = repr(value)
-    return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()
+                dependencies[f"{place}: {name}"] = repr(value)
+    return hashlib.sha256(repr(sorted(dependencies.items())).encode()).hexdigest()
 
 
-def _reached(function: Callable[..., Any]) -> list[Callable[..., Any]]:
-    """A function and all that it calls, as Python has them."""
+def _dependencies(function: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """A function and all that it calls, as Python functions."""
     reached, waiting = [], [function]
     while waiting:
         each = waiting.pop()
@@ -411,9 +414,9 @@ def _reached(function: Callable[..., Any]) -> list[Callable[..., Any]]:
 
 
 def _source(function: Callable[..., Any]) -> str:
-    """Lines of a function's source, from its first decorator to its last instruction.
+    """Source lines of a function, from its first decorator to its last instruction.
 
-    `inspect.getsource` looks for the end with a tokenizer, which took 0.1 s of each start.
+    `inspect.getsource` uses a tokenizer to find the end, which took 0.1 s of each start.
     """
     code = function.__code__
     end = max(line or 0 for _, line, _, _ in code.co_positions())
@@ -421,7 +424,7 @@ def _source(function: Callable[..., Any]) -> str:
 
 
 def _type_name(hint: Any) -> str:
-    """A type in words that differ where the type does, wherever it is defined."""
+    """Text that identifies a type, wherever it is defined."""
     if not hasattr(hint, "_fields"):
         return repr(hint)
     fields = get_type_hints(hint, include_extras=True)

@@ -1,11 +1,11 @@
-"""Texts of files and peers, as they may be printed."""
+"""Texts of files and peers, made safe for printing."""
 
 
 def printable(text: str) -> str:
-    r"""Text in which an escape such as `\x1b` stands for each character that is not visible.
+    r"""Text in which characters that are not visible are replaced by escapes such as `\x1b`.
 
-    A terminal obeys some of these: it clears the screen, writes elsewhere, or turns the direction
-    of what follows.
+    A terminal obeys some of them: it clears the screen, moves the cursor, or reverses the direction
+    of text.
     """
     if text.isprintable():
         return text

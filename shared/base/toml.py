@@ -1,9 +1,9 @@
-"""TOML text, refused before it is parsed where parsing it would take too much.
+"""TOML text, refused before parsing if that would take too much memory.
 
-The standard library's parser keeps every prefix of a dotted key: its memory grows with the square
+The standard library's parser stores every prefix of a dotted key: its memory grows with the square
 of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So
-the text is first read for these two alone, in one pass. Nothing else parses TOML in this package,
-which tests/shared/test_toml.py proves.
+the text is first checked for these two, in one pass. Nothing else parses TOML in this package;
+tests/shared/test_toml.py checks it.
 """
 
 import re
@@ -13,9 +13,9 @@ from typing import Any
 BYTES_MAX = 1_000_000
 """Largest size of a text [characters]."""
 PARTS_MAX = 8
-"""Most parts of a key."""
+"""Largest number of parts of a key."""
 DEPTH_MAX = 32
-"""Most brackets open at once."""
+"""Largest number of open brackets."""
 
 _OPAQUE = re.compile(
     r'"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}'
@@ -25,17 +25,16 @@ _OPAQUE = re.compile(
     r"|\#[^\n]*+",
     re.DOTALL,
 )
-"""Strings and comments, in which points and brackets are only letters."""
+"""Strings and comments, in which dots and brackets have no meaning."""
 _DIVIDERS = re.compile(r"[=,\[\]{}\n]")
-"""Letters that end a key."""
+"""Characters that end a key."""
 
 
 def loads(text: str) -> dict[str, Any]:
     """Values of a TOML text.
 
     Raises:
-        ValueError: it is no valid TOML, too long, nested too deeply, or has a key of too many
-            parts.
+        ValueError: it is invalid, too long, nested too deeply, or has a key of too many parts.
     """
     if len(text) > BYTES_MAX:
         raise ValueError(f"got {len(text)} characters, expected at most {BYTES_MAX}")

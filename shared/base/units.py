@@ -1,4 +1,4 @@
-"""Time at every boundary is whole nanoseconds; float seconds are for formulas alone."""
+"""Time is whole nanoseconds at every boundary; float seconds are for formulas only."""
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000

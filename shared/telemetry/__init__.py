@@ -1,1 +1,1 @@
-"""Telemetry of a flight: records, their summaries, feeds for those who look on."""
+"""Telemetry of a flight: records, summaries, and feeds for observers."""

@@ -1,9 +1,9 @@
-"""The feed of a process: what it records and says, for whoever looks on while it flies.
+"""Feed of a process: its record and events, for observers during the flight.
 
-A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) and so many bytes of
-msgpack. The first is `Opened`; of the parts of the record it names, `Rows` follow as they are made.
-Whoever reads it late gets the last of what was, from a whole frame on. A reader that is too slow
-is dropped; the process never waits for one (`shell.feed`).
+A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) followed by as many bytes
+of msgpack. The first is `Opened`; `Rows` follow for the parts of the record that it names. An
+observer that connects late gets the most recent frames, starting with a whole one. A reader that is
+too slow is dropped; the process never waits for one (`shell.feed`).
 """
 
 from collections.abc import Mapping
@@ -25,24 +25,24 @@ ROW_BYTES_MAX = 4096
 
 
 class FeedError(ValueError):
-    """Error: what is read is no feed."""
+    """The data are not a feed."""
 
 
 class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process and what it flies: the first frame of its feed."""
+    """A process and its scenario: the first frame of its feed."""
 
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""
     name: str
     """Name of the scenario."""
     scenario: str
-    """The scenario as TOML, with what was changed in flight until now."""
+    """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
     """Parts of the record that follow, by name: columns, as JSON of numpy's description."""
     wall_ns: int
-    """Time of day at which `time_ns` was taken [ns since 1970]."""
+    """Time of day corresponding to `time_ns` [ns since 1970]."""
     time_ns: int
-    """Time of the process's clock at the beginning [ns; CLOCK_MONOTONIC]."""
+    """Start time on the process's clock [ns; CLOCK_MONOTONIC]."""
 
 
 class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -51,26 +51,26 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     part: str
     """Name of the part: client, server, plan or netem."""
     time_ns: int
-    """Time at which they were made [ns; CLOCK_MONOTONIC]."""
+    """Time at which they were recorded [ns; CLOCK_MONOTONIC]."""
     rows: bytes
-    """Rows as they are in memory."""
+    """Rows as in memory."""
 
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """An event."""
 
     time_ns: int
-    """Time at which it was said [ns; CLOCK_MONOTONIC]."""
+    """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event
 
 
 class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Numbers counted so far, about once a second."""
+    """Figures so far, about once a second."""
 
     time_ns: int
-    """Time at which they were taken [ns; CLOCK_MONOTONIC]."""
+    """Time of the figures [ns; CLOCK_MONOTONIC]."""
     figures: dict[str, Any]
-    """Numbers by name, see `Endpoint.figures`."""
+    """Figures by name, see `Endpoint.figures`."""
 
 
 Frame = Opened | Rows | Said | Figures
@@ -78,19 +78,19 @@ Frame = Opened | Rows | Said | Figures
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Frame)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors that the decoder has for what is no frame."""
+"""Errors of the decoder for invalid frames."""
 
 
 def pack(frame: Frame) -> bytes:
-    """A frame as msgpack."""
+    """Frame as msgpack."""
     return _ENCODER.encode(frame)
 
 
 def unpack(body: bytes | bytearray) -> Frame:
-    """The frame that `pack` made these bytes of.
+    """Frame from the bytes of `pack`.
 
     Raises:
-        FeedError: they are no frame.
+        FeedError: they are not a frame.
     """
     try:
         return _DECODER.decode(body)
@@ -99,22 +99,22 @@ def unpack(body: bytes | bytearray) -> Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """A frame as bytes, its length first."""
+    """Frame as bytes, with its length first."""
     body = pack(frame)
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
 class Reader:
-    """Makes frames of bytes, however they are cut."""
+    """Splits a byte stream into frames."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
 
     def read(self, piece: bytes) -> list[Frame]:
-        """The frames that are whole now.
+        """Frames that are complete now.
 
         Raises:
-            FeedError: these are no frames.
+            FeedError: the bytes are not frames.
         """
         self._bytes += piece
         frames: list[Frame] = []
@@ -133,15 +133,15 @@ class Reader:
 
 
 def described(columns: Mapping[str, np.dtype[np.void]]) -> dict[str, str]:
-    """Parts of the record as `Opened` names them, by their columns."""
+    """Descriptions of the parts of the record for `Opened`, from their columns."""
     return {part: msgspec.json.encode(kind.descr).decode() for part, kind in columns.items()}
 
 
 def columns_of(described: str) -> np.dtype[np.void]:
-    """Columns of a part.
+    """Columns of a part from their description.
 
     Raises:
-        FeedError: these are none.
+        FeedError: it is invalid.
     """
     try:
         columns = record.columns_of(msgspec.json.decode(described))
@@ -156,7 +156,7 @@ def table(rows: bytes, columns: np.dtype[np.void]) -> Table:
     """Rows as a structured array.
 
     Raises:
-        FeedError: they are not whole.
+        FeedError: the last row is incomplete.
     """
     if len(rows) % columns.itemsize:
         raise FeedError(f"got {len(rows)} B, expected rows of {columns.itemsize} B")

@@ -1,4 +1,4 @@
-"""Histograms of durations, which take as much memory for many as for few."""
+"""Histograms of durations, of constant memory."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,7 +9,7 @@ BINS = 500
 
 
 class Histogram:
-    """Counts of durations in bins of equal width; the last bin takes all that is longer.
+    """Counts of durations in bins of equal width; the last bin takes all longer ones.
 
     Args:
         bin_ns: width of a bin [ns].
@@ -22,14 +22,14 @@ class Histogram:
 
     def add(self, value_ns: int) -> None:
         """Count one duration [ns]."""
-        # Once a packet or step: comparisons cost half of what min() and max() do.
+        # Called once per packet or step: comparisons cost half of min() and max().
         index = value_ns // self.bin_ns
         self.counts[index if index < BINS else -1] += 1
         if value_ns > self.largest_ns:  # noqa: PLR1730
             self.largest_ns = value_ns
 
     def add_all(self, values_ns: Iterable[int]) -> None:
-        """Count durations [ns]."""
+        """Count several durations [ns]."""
         counts, bin_ns, largest_ns = self.counts, self.bin_ns, self.largest_ns
         for value_ns in values_ns:
             index = value_ns // bin_ns
@@ -39,7 +39,7 @@ class Histogram:
         self.largest_ns = largest_ns
 
     def quantile_ms(self, share: float) -> float:
-        """Upper edge of the bin in which the quantile of this share lies [ms]; 0 without any."""
+        """Upper edge of the bin that contains a quantile [ms]; 0 if empty."""
         wanted, seen = share * sum(self.counts), 0
         for index, count in enumerate(self.counts):
             seen += count
@@ -48,22 +48,22 @@ class Histogram:
         return self.largest_ns / MILLISECOND_NS
 
     def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
-        """Number of durations below each of these edges [ms], as in `20`, and of all, `inf`.
+        """Number of durations below each edge [ms], keyed as in `20`, and of all, `inf`.
 
-        A bin that an edge cuts is counted above it.
+        A bin that contains an edge is counted above it.
 
         Args:
-            edges_ms: rising edges [ms].
+            edges_ms: ascending edges [ms].
         """
-        told, seen, index = {}, 0, 0
+        counts_below, seen, index = {}, 0, 0
         for edge_ms in edges_ms:
             end = min(round(edge_ms * MILLISECOND_NS) // self.bin_ns, BINS - 1)
             seen += sum(self.counts[index:end])
-            told[f"{edge_ms:g}"], index = seen, end
-        return {**told, "inf": seen + sum(self.counts[index:])}
+            counts_below[f"{edge_ms:g}"], index = seen, end
+        return {**counts_below, "inf": seen + sum(self.counts[index:])}
 
     def by_bin(self) -> dict[str, int]:
-        """Counts by the lower edge of the bin [ms], as in `20`; bins without any are left out."""
+        """Counts by the lower edge of the bin [ms], keyed as in `20`; empty bins are left out."""
         return {
             f"{index * self.bin_ns / MILLISECOND_NS:g}": count
             for index, count in enumerate(self.counts)

@@ -1,8 +1,9 @@
-"""Records of a flight that a process writes: rows of one numpy structured type.
+"""Records of a flight by each process: rows of a numpy structured type.
 
-Each process keeps its own part: the client what flew, the server what it thought, netem the fate of
-every packet. A part is a line of JSON that names the columns, then the rows as they are in memory.
-So a part may end anywhere, as that of a process that is killed does: half a row is left out.
+Each process writes its own part: the client what it flew, the server its estimates and decisions,
+netem the fate of every packet. A part is a line of JSON that names the columns, followed by the
+rows as in memory. It may end anywhere, for example when a process is killed: half a row is left
+out.
 """
 
 import hashlib
@@ -27,13 +28,13 @@ from skytether.shared.scenario.triggers import Compared
 Rows = NDArray[np.void]
 
 _NUMBER = re.compile("[<|][biuf][1248]")
-"""Kinds of numbers, as numpy calls them: order of bytes, kind and size [B]."""
+"""Numbers in numpy's notation: byte order, kind and size [B]."""
 RECORDING = ".mcap"
-"""Suffix of a file that is a recording of a flight, and not a part of the record."""
+"""Suffix of a file that is a recording of a flight, not a part of the record."""
 
 
 class Reason(IntEnum):
-    """Cause of what a vehicle does, see `client.failsafe`."""
+    """Why a vehicle is in its mode, see `client.failsafe`."""
 
     BEGUN = 0
     OPENED = 1
@@ -142,17 +143,17 @@ FIGURES: Mapping[str, tuple[Compared, ...]] = MappingProxyType(
         "trajectory": (Compared.COST_GAP, Compared.EXPECTED_GAP, Compared.DEVIATION_M),
     }
 )
-"""Figures of plans that each scheme computes."""
+"""Figures of plans computed by each scheme."""
 
 
 def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
-    Of the figures that a trigger may compare it has those that the scheme computes; what they are
-    is said by `server.mpc.appraisal.PlanFigures`.
+    It has those figures for triggers that the scheme computes; `server.mpc.appraisal.PlanFigures`
+    describes them.
 
     Args:
-        axes: spatial axes.
+        axes: number of spatial axes.
         scheme: as in `control.scheme`.
     """
     return np.dtype(
@@ -183,25 +184,26 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
 def compared(rows: Rows) -> Array:
     """Figure that the trigger compared in each row of the server's part; shape (n,).
 
-    Where nothing was compared it is V(k) of eq. (16), or NaN without one.
+    If nothing was compared it is V(k) of eq. (16), or NaN without one.
     """
     names = rows.dtype.names or ()
     figures = np.full(len(rows), np.nan)
     for number in np.unique(rows["compared"]).tolist():
         name = str(Compared(number) or Compared.STATE_GAP)
         if name in names:
-            of_it = rows["compared"] == number
-            figures[of_it] = rows[name][of_it]
+            chosen = rows["compared"] == number
+            figures[chosen] = rows[name][chosen]
     return figures
 
 
 def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     """Columns of the server's plans: one row for each horizon that it sends.
 
-    With the scheme "trajectory" the state is the first knot, and the inputs lead along the spline.
+    With the scheme "trajectory" the state is the first knot, and the inputs follow the spline.
 
     Args:
-        planned: number of its inputs on each axis, H.
+        axes: number of spatial axes.
+        planned: number of planned inputs per axis, H.
     """
     return np.dtype(
         [
@@ -216,7 +218,7 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
 
 
 PIECE_ROWS = 1024
-"""Most rows that a recorder gives to a sink in one piece."""
+"""Largest number of rows that a recorder passes to a sink in one piece."""
 
 UPLINK, DOWNLINK = 0, 1
 
@@ -240,22 +242,22 @@ TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
         ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
     ]
 )
-"""Columns of a scripted autopilot's part: one row for each of its ticks."""
+"""Columns of a simulated autopilot's part: one row for each of its ticks."""
 
 
 class Sink(Protocol):
-    """Writer of a part of the record, such as a binary file."""
+    """Destination of a part of the record, such as a binary file."""
 
     def write(self, piece: bytes, /) -> object:
-        """Take the header, or whole rows."""
+        """Write the header, or whole rows."""
 
 
 class Recorder:
-    """Appends rows to sinks.
+    """Writes rows to sinks.
 
     Args:
-        columns: those of the rows.
-        sink: takes the header first; None for a recorder whose rows only go to those that follow.
+        columns: columns of the rows.
+        sink: first gets the header; None for a recorder whose sinks are added by `follow`.
     """
 
     def __init__(self, columns: np.dtype[np.void], sink: Sink | None = None) -> None:
@@ -263,17 +265,19 @@ class Recorder:
         self._sinks: list[Sink] = []
         self._row = _row(columns)
         self.pack = self._row.pack
-        """Function that makes the bytes of a row, of a value for every column in order."""
+        """Function that encodes a row from a value for every column in order."""
         if sink is not None:
             sink.write(json.dumps(columns.descr).encode() + b"\n")
             self._sinks.append(sink)
 
     def follow(self, sink: Sink) -> None:
-        """Have another sink take the rows from now on, and no header."""
+        """Add a sink that gets the rows from now on, without header."""
         self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
-        """Append `count` rows; a value is one for all of them, or an array with the rows first."""
+        """Append `count` rows; a value holds for all of them, or is an array with the rows
+        first.
+        """
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
@@ -286,8 +290,8 @@ class Recorder:
             sink.write(row)
 
     def append_packed(self, rows: Sequence[bytes]) -> None:
-        """Append rows, made by `pack`, in few pieces."""
-        # A sink that has no room drops a whole piece, so a piece is not long.
+        """Append rows encoded by `pack`, in few pieces."""
+        # A full sink drops a whole piece, so pieces are short.
         for first in range(0, len(rows), PIECE_ROWS):
             self._write(b"".join(rows[first : first + PIECE_ROWS]))
 
@@ -307,14 +311,14 @@ def _row(columns: np.dtype[np.void]) -> Struct:
 
 
 def columns_of(descr: Any) -> np.dtype[np.void]:
-    """Columns, of numpy's description of them as JSON has it: names, kinds of numbers and shapes.
+    """Columns from numpy's description as JSON: names, kinds of numbers and shapes.
 
     Raises:
-        ValueError: it describes something else.
+        ValueError: the description is invalid.
     """
     try:
         fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in descr]
-        # numpy reads other kinds as Python does, and has any of its errors for what is none.
+        # numpy evaluates other kinds like Python code, with any kind of error if they are invalid.
         if not all(_NUMBER.fullmatch(kind) for _, kind, *_ in fields):
             raise ValueError("got a column of another kind, expected numbers")
         columns = np.dtype(fields)
@@ -326,10 +330,10 @@ def columns_of(descr: Any) -> np.dtype[np.void]:
 
 
 def parse(part: bytes) -> Rows:
-    """The rows of a part; half a row at its end (a killed writer's) is left out.
+    """Rows of a part; half a row at its end (of a killed writer) is left out.
 
     Raises:
-        ValueError: it is no part.
+        ValueError: it is not a part of a record.
     """
     header, _, body = part.partition(b"\n")
     try:
@@ -340,11 +344,11 @@ def parse(part: bytes) -> Rows:
 
 
 def read(path: Path) -> Rows:
-    """The rows of a part in a file.
+    """Rows of a part in a file.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no part.
+        ValueError: it is not a part of a record.
     """
     return parse(path.read_bytes())
 
@@ -355,8 +359,8 @@ class FlightEvent(NamedTuple):
     time_ns: int
     """Time in the flight [ns]: of the world, or over real UDP since the first event."""
     host: str
-    """Name of the host that tells the event: "server", "netem SEED" or "client SEED.VEHICLE"; over
-    real UDP the name of the process."""
+    """Host of the event: "server", "netem SEED" or "client SEED.VEHICLE"; over real UDP the name of
+    the process."""
     event: Event
 
     @property
@@ -367,25 +371,24 @@ class FlightEvent(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Record of a flight: the parts of its processes, and the events that were told."""
+    """Record of a flight: the parts of its processes, and its events."""
 
     client: Rows
     server: Rows
     netem: Rows
     failure: Failure | None = None
-    """Event that ended the flight of a vehicle, of the first vehicle that has one."""
+    """Event that ended the flight of a vehicle; the first vehicle with one."""
     figures: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); of a flight in a
-    batch, those at the end of the batch."""
+    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, those at
+    the end of the batch."""
     events: tuple[FlightEvent, ...] = ()
-    """Events of the run's own endpoints, and those of the server about its vehicles, in their
-    order."""
+    """Events of the run's own endpoints, and those of the server about its vehicles, in order."""
     incomplete: tuple[RecordIncomplete, ...] = ()
-    """Gaps in the record of a flight over real UDP, one for each part."""
+    """Gaps in the record of a flight over real UDP, one per part."""
     plan: Rows = field(default_factory=lambda: np.empty(0, plan_columns(2, 1)))
-    """Plans that the server has sent; none of a flight in a batch, or over real UDP."""
+    """Plans sent by the server; empty in a batch, or over real UDP."""
 
     def trace_hash(self) -> str:
-        """Hash of the record, equal for two flights that went the same to the last bit."""
+        """Hash of the record, equal for two flights that are equal to the last bit."""
         parts = (self.client, self.server, self.netem)
         return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

@@ -1,4 +1,4 @@
-"""The figures of a flight, from the parts of its record; their names are used everywhere."""
+"""Summary of a flight, computed from its record; its names are used everywhere."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,13 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
-"""Share of the bound from which an input is at it: inputs are rounded on the wire."""
+"""Share of the bound from which on an input counts as at it: inputs are rounded on the wire."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """Summary of one vehicle's flight; None where nothing was measured, or a record is missing."""
+    """Summary of one vehicle's flight; None if something was not measured, or its record is
+    missing.
+    """
 
     scenario: str
     seed: int
@@ -29,21 +31,21 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Root mean square of the position error along x, from `settle` on [m]."""
     rmse_y: float | None
     rmse_z: float | None
-    """Root mean square of the altitude's error [m]; None in the plane."""
+    """Root mean square of the altitude error [m]; None in the plane."""
     rmse_xy: float | None
     error_max: float | None
     """Largest distance from the desired trajectory, from `settle` on [m]."""
     covered: float | None
-    """Share of the steps for which the vehicle had an input planned; in the others it hovered,
-    braked, or held the last."""
+    """Share of the steps with a planned input; in the others the vehicle hovered, braked, or held
+    the last input."""
     modes: dict[str, float]
     """Time in each mode that occurred [s], see `shared.wire.protocol.Mode`."""
     mode: str | None
-    """Mode that the vehicle was in last."""
+    """Last mode of the vehicle."""
     reason: str | None
-    """Why it was in it."""
+    """Reason for the last mode."""
     event_ratio: float | None
-    """Share of the server's steps that sent a horizon."""
+    """Share of the server's steps at which a horizon was sent."""
     uplink_horizons: int | None = None
     """Number of packets with a horizon that the server sent; the other uplink packets are
     heartbeats and the handshake's."""
@@ -54,33 +56,33 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     downlink_packets: int | None
     downlink_bytes: int | None
     uplink_packets_per_s: float | None = None
-    """Packets from the server a second of flight, heartbeats and lost ones among them [1/s]."""
+    """Rate of packets from the server, heartbeats and lost ones included [1/s]."""
     uplink_bytes_per_s: float | None = None
-    """Bytes on the line that they take a second, with HEADER_BYTES a packet [B/s]."""
+    """Their data rate, with HEADER_BYTES per packet [B/s]."""
     downlink_packets_per_s: float | None = None
-    """Packets from the vehicle a second of flight [1/s]."""
+    """Rate of packets from the vehicle [1/s]."""
     downlink_bytes_per_s: float | None = None
-    """Bytes on the line that they take a second, with HEADER_BYTES a packet [B/s]."""
+    """Their data rate, with HEADER_BYTES per packet [B/s]."""
     packets_per_s: float | None = None
-    """Packets both ways a second of flight [1/s]."""
+    """Rate of packets both ways [1/s]."""
     bytes_per_s: float | None = None
-    """Bytes on the line both ways a second, with HEADER_BYTES a packet [B/s]."""
+    """Data rate both ways, with HEADER_BYTES per packet [B/s]."""
     lost: int | None
-    """Number of packets that the network lost, both ways."""
+    """Number of packets lost by the network, both ways."""
     reordered: int | None
     """Number of packets overtaken by a later one, both ways."""
     stale: int
-    """Number of messages discarded at either end because something newer had come before."""
+    """Number of messages discarded at either end because a newer one had arrived."""
     age_ms_p50: float | None
     """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
     aoi_s_mean: float | None
-    """Mean age of information, of that observation [s], over the steps from `settle` on."""
+    """Mean age of information, that of this observation [s], over the steps from `settle` on."""
     aoi_s_peak: float | None
-    """Mean of its peaks [s]: of the age at each step before one at which it is smaller."""
+    """Mean of its peaks [s]: the age at each step before it decreases."""
     plan_age_s_mean: float | None
     """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
-    of all that the server alone knows, as where its target is."""
+    of information that only the server has, such as the position of a target."""
     effort_mps: float | None
     """Root mean square of the change of the input from step to step, over all axes together, from
     `settle` on [m/s]."""
@@ -88,15 +90,15 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the steps from `settle` on at which the input is at its bound on some axis."""
     too_fast: float | None = None
     """Share of the steps at which the desired trajectory is faster than u_max times the gain on
-    some axis, so that nothing can follow it; None where only the server knows it."""
+    some axis, so that nothing can follow it; None if only the server knows the trajectory."""
     solve_ms_p50: float | None
     """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
     deadline_misses: int
-    """Number of steps that the server or the client slept through."""
+    """Number of steps missed by server or client."""
     estimate_error_m: float | None = None
-    """Root mean square of how far the position that the vehicle flew by was from the true one, from
-    `settle` on [m]; None where it knew that."""
+    """Root mean square of the error of the position that the vehicle flew by, from `settle` on [m];
+    None if it knew the true position."""
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 
@@ -110,14 +112,15 @@ def summarise(
     *,
     secure: bool = False,
 ) -> Summary:
-    """The summary of one vehicle's flight.
+    """Summary of one vehicle's flight.
 
     Args:
-        name: of the scenario.
-        client: its rows, of one vehicle.
+        scenario: the scenario.
+        name: name of the scenario.
+        client: rows of the vehicle in the client's part.
         server: rows of the server, of any vehicles.
         netem: rows of netem; all flows count.
-        secure: whether the link was sealed.
+        secure: whether the link was authenticated and encrypted.
     """
     error = position_error(scenario, client, server)
     counted = client["step"] * scenario.control.dt >= scenario.settled_s
@@ -188,22 +191,25 @@ def summarise(
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
-    Where a live point was, and which goal a vehicle of a mission had, only the server knows: at a
-    step that it has no row of, it is what it was before. What nobody knows is NaN.
+    The position of a live point and the goal of a vehicle on a mission are only in the server's
+    record: at a step without a row the previous one holds. NaN if unknown.
 
     Args:
+        scenario: the scenario.
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
     if scenario.reference.shape != "live" and not scenario.is_mission:
         times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
         return scenario.make_reference(*vehicles)(times_s)[..., 0]
-    known = client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
-    if not len(known):
+    server_rows = (
+        client[:0] if server is None else server[np.isin(server["vehicle"], client["vehicle"])]
+    )
+    if not len(server_rows):
         return np.full((len(client), scenario.model.axes), np.nan)
-    known = known[np.argsort(known["step"], kind="stable")]
-    at = np.searchsorted(known["step"], client["step"], side="right") - 1
-    positions: Array = known["reference"][np.maximum(at, 0), :, 0]
+    server_rows = server_rows[np.argsort(server_rows["step"], kind="stable")]
+    at = np.searchsorted(server_rows["step"], client["step"], side="right") - 1
+    positions: Array = server_rows["reference"][np.maximum(at, 0), :, 0]
     return positions
 
 
@@ -222,20 +228,20 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 
 
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
-    """Difference of the position that was flown by from the true one [m]; shape (steps, axes).
+    """Error of the position that was flown by [m]; shape (steps, axes).
 
-    With a dead time it is that of a dead time later; NaN where the flight has ended by then.
+    With a dead time it is compared with the true position a dead time later; NaN after the flight.
     """
-    known: Array = client["estimate"][..., 0]
+    flown_by: Array = client["estimate"][..., 0]
     true = client["state"][..., 0]
     late, step = np.array(scenario.terms().dead_time_s) / scenario.control.dt, client["step"]
     if not len(step) or not late.any():
-        return known - true
+        return flown_by - true
     met = [
         np.interp(step + steps, step, true[:, axis], right=np.nan)
         for axis, steps in enumerate(late)
     ]
-    error: Array = known - np.stack(met, axis=1)
+    error: Array = flown_by - np.stack(met, axis=1)
     return error
 
 
@@ -257,7 +263,7 @@ def _bytes(netem: Rows | None, direction: int) -> int | None:
 
 
 def _rates(netem: Rows | None, duration_s: float) -> dict[str, float]:
-    """Packets and bytes on the line a second, up, down and both ways; none where not measured."""
+    """Packet and data rates, up, down and both ways; empty if not measured."""
     if netem is None or duration_s == 0.0:
         return {}
     packets, sizes = {}, {}
@@ -282,7 +288,7 @@ def _quantile(values: Array, share: float) -> float | None:
 def least_separation(
     each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
 ) -> float | None:
-    """Smallest distance between two vehicles while both are on a mission [m]; None without.
+    """Smallest distance between two vehicles while both are on a mission [m]; None without any.
 
     See `separations`.
     """
@@ -293,19 +299,19 @@ def least_separation(
 def separations(
     each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
 ) -> tuple[Array, Array]:
-    """Distance between the two vehicles on a mission that are nearest to each other, over time.
+    """Smallest distance between any two vehicles on a mission, over time.
 
-    Each vehicle is on it from the first step on at which it follows what the server has sent.
+    A vehicle is on the mission from the first step at which it follows a plan.
 
     Args:
-        each: rows of the client's part of each vehicle, by their steps.
-        began_s: time at which step 0 of each began, of one clock [s].
+        each: rows of the client's part of each vehicle, in order of steps.
+        began_s: time at which step 0 of each began, on a common clock [s].
         dt_s: length of a step [s].
         height_scale: factor of distances along the third axis, see `MissionConfig`.
 
     Returns:
-        times of that clock [s; shape (n,)], none of fewer than two vehicles, and distances [m],
-        NaN where fewer fly.
+        times on that clock [s; shape (n,)], empty for fewer than two vehicles, and distances [m],
+        NaN while fewer than two fly.
     """
     tracks = [
         track(rows, began, dt_s, height_scale)
@@ -316,20 +322,20 @@ def separations(
 
 
 Track = tuple[Array, Array]
-"""Times [s; shape (n,)] and positions of a vehicle then, heights scaled [m; shape (n, axes)]."""
+"""Times [s; shape (n,)] and positions of a vehicle, heights scaled [m; shape (n, axes)]."""
 
 
 def track(
     rows: Rows, began_s: float, dt_s: float, height_scale: float = 1.0, *, whole: bool = False
 ) -> Track:
-    """Track of a vehicle, see `separations`.
+    """Positions of a vehicle over time, see `separations`.
 
     Args:
         rows: rows of the client's part of it.
         began_s: time at which its step 0 began [s].
         dt_s: length of a step [s].
         height_scale: see `separations`.
-        whole: whether it begins with the first row, and not at the first step on a mission.
+        whole: whether to begin with the first row, not at the first step on the mission.
     """
     flown = rows if whole else rows[np.argmax(rows["mode"] == Mode.TRACK) :]
     at = flown["state"][:, :, 0].copy()
@@ -338,11 +344,10 @@ def track(
 
 
 def nearest(tracks: Sequence[Track], dt_s: float) -> tuple[Array, Array]:
-    """Distance between the two vehicles that are nearest to each other, over time; see
-    `separations`.
+    """Smallest distance between any two vehicles, over time; see `separations`.
 
     Args:
-        tracks: one of each vehicle.
+        tracks: one per vehicle.
         dt_s: time from one distance to the next [s].
     """
     if len(tracks) < 2:

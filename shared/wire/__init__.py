@@ -1,1 +1,1 @@
-"""Wire: messages, sealed channels, the handshake that opens them, and vehicles' keys."""
+"""Wire: messages, secured channels, the handshake that opens them, and vehicles' keys."""

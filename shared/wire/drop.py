@@ -1,7 +1,7 @@
-"""Reasons to drop a datagram, and the error that carries one.
+"""Reasons for dropping a datagram, and the error that carries one.
 
-A datagram that is dropped is the peer's mistake or the network's: it is counted by its reason and
-never answered. Message codec (`protocol`), sealing (`channel`, `handshake`) and both ends raise the
+A dropped datagram is an error of the peer or the network: it is counted by reason and never
+answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends raise the
 same error, so that figures and metrics have one list of reasons.
 """
 
@@ -9,7 +9,7 @@ from enum import StrEnum
 
 
 class Drop(StrEnum):
-    """Why a datagram is dropped; the value is how people read it, and what metrics call it."""
+    """Why a datagram is dropped; the value is the text for people and the name in metrics."""
 
     # It is no message.
     TOO_LONG = "too long"
@@ -27,9 +27,9 @@ class Drop(StrEnum):
     NOT_FOR_A_SERVER = "not for a server"
     NOT_FOR_A_CLIENT = "not for a client"
     OF_ANOTHER_VEHICLE = "of another vehicle"
-    """The message names another vehicle than the one whose key it is sealed with."""
+    """The message names another vehicle than the one whose key encrypted it."""
     FOR_ANOTHER_LIFE = "for another life"
-    """The message answers a client that has ended."""
+    """The message answers an earlier run of the client."""
     UNKNOWN_SESSION = "unknown session"
     OTHER_TERMS = "other terms"
     FULL = "full"
@@ -55,16 +55,16 @@ class Drop(StrEnum):
     # It is a horizon that is not flown, see `client.compensator`.
     FROM_THE_FUTURE = "from the future"
     OBSERVATION = "observation"
-    """The horizon was planned from an observation that there cannot be."""
+    """The observation from which the horizon was planned is impossible."""
     TOO_OLD = "too old"
     TOO_EARLY = "too early"
-    """The motion of a mission begins at a step that is yet to come aboard."""
+    """The motion of a mission begins at a step that is still ahead aboard."""
     TOO_LATE = "too late"
     NOT_TAKEN = "not taken"
 
 
 class ProtocolError(Exception):
-    """Error of the peer: what it has sent is to be dropped."""
+    """Error of the peer: its datagram is to be dropped."""
 
     def __init__(self, reason: Drop) -> None:
         super().__init__(reason)

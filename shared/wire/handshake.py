@@ -1,4 +1,4 @@
-"""The packets of the handshake that opens a channel. Integers are little-endian.
+"""Packets of the handshake that opens a channel. Integers are little-endian.
 
 | type | packet     | sent by | header | then                                            | bytes |
 |------|------------|---------|--------|-------------------------------------------------|-------|
@@ -8,9 +8,9 @@
 |      |            |         |        | MAC 16                                          |       |
 
 The header is version u8, type u8, vehicle u16 and the number of its key u8. The MAC is a keyed
-BLAKE2s over all that stands before it, and in an answer also over the ephemeral key that it
-answers: a packet of another peer, or for another attempt, is dropped before any costly mathematics.
-The HELLO in message 1 is padded, so that no answer is longer than what draws it.
+BLAKE2s over everything before it, and in an answer also over the ephemeral key that it answers: a
+packet of another peer, or for another attempt, is dropped before any costly computation. The HELLO
+in message 1 is padded, so that no answer is longer than its request.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ INITIATION_BYTES = 512
 CHALLENGE_BYTES = HEADER.size + COOKIE_BYTES + MAC_BYTES
 RESPONSE_BYTES_MIN = HEADER.size + CHANNEL.size + MESSAGE_BYTES + MAC_BYTES
 NO_COOKIE = bytes(COOKIE_BYTES)
-"""Cookie of a client that was given none."""
+"""Cookie of a client that has not received one."""
 
 _GREETINGS = (1, 2)
 """Types of the messages HELLO and WELCOME."""
@@ -72,8 +72,7 @@ class Response(NamedTuple):
 def check_place(message: bytes, *, in_handshake: bool) -> None:
     """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
 
-    A packet of the handshake may be repeated by others, and what is agreed upon in a channel is no
-    handshake.
+    Others may repeat a packet of the handshake, so nothing else is accepted there.
 
     Raises:
         ProtocolError: even the holder of the key must not send it there.
@@ -84,36 +83,36 @@ def check_place(message: bytes, *, in_handshake: bool) -> None:
 
 
 def prologue(key: VehicleKey) -> bytes:
-    """Prologue, common to both ends of a handshake: this protocol, the vehicle and its key."""
+    """Prologue of a handshake, the same at both ends: this protocol, the vehicle and its key."""
     return _PROLOGUE + _header(key, INITIATION)
 
 
 def pad(hello: bytes) -> bytes:
-    """A HELLO as message 1 carries it: behind it a byte 0x80, then zeros."""
+    """HELLO padded for message 1: followed by a byte 0x80, then zeros."""
     assert len(hello) <= HELLO_BYTES_MAX
     return (hello + b"\x80").ljust(_PADDED_BYTES, b"\0")
 
 
 def unpad(padded: bytes) -> bytes:
-    """The HELLO that was padded."""
+    """HELLO without its padding."""
     # The byte 0x80 ends the message, so that a HELLO may end with zeros itself.
     return padded.rstrip(b"\0")[:-1]
 
 
 def write_initiation(key: VehicleKey, cookie: bytes, message: bytes) -> bytes:
-    """An INITIATION of its parts."""
+    """INITIATION from its parts."""
     packet = _sealed(key, _header(key, INITIATION) + cookie + message)
     assert len(packet) == INITIATION_BYTES
     return packet
 
 
 def write_challenge(key: VehicleKey, cookie: bytes, public: bytes) -> bytes:
-    """A CHALLENGE of its parts; `public` is the ephemeral key that it answers."""
+    """CHALLENGE from its parts; `public` is the ephemeral key that it answers."""
     return _sealed(key, _header(key, CHALLENGE) + cookie, public)
 
 
 def write_response(key: VehicleKey, channel: int, message: bytes, public: bytes) -> bytes:
-    """A RESPONSE of its parts; `public` is the ephemeral key that it answers."""
+    """RESPONSE from its parts; `public` is the ephemeral key that it answers."""
     packet = _sealed(key, _header(key, RESPONSE) + CHANNEL.pack(channel) + message, public)
     assert len(packet) <= INITIATION_BYTES
     return packet
@@ -132,10 +131,10 @@ def address(packet: bytes) -> tuple[int, int]:
 
 
 def read_initiation(key: VehicleKey, packet: bytes) -> Initiation:
-    """Parts of an INITIATION, whose address is that of the key.
+    """Parts of an INITIATION.
 
     Raises:
-        ProtocolError: nobody who has the key made it.
+        ProtocolError: its sender does not have the key.
     """
     if not is_authentic(key, packet):
         raise ProtocolError(Drop.FORGED)
@@ -143,10 +142,10 @@ def read_initiation(key: VehicleKey, packet: bytes) -> Initiation:
 
 
 def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
-    """Cookie in a CHALLENGE that answers an ephemeral key.
+    """Cookie in a CHALLENGE.
 
     Raises:
-        ProtocolError: it does not.
+        ProtocolError: it does not answer this ephemeral key.
     """
     if len(packet) != CHALLENGE_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -156,10 +155,10 @@ def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
 
 
 def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
-    """Parts of a RESPONSE that answers an ephemeral key.
+    """Parts of a RESPONSE.
 
     Raises:
-        ProtocolError: it does not.
+        ProtocolError: it does not answer this ephemeral key.
     """
     if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -170,8 +169,8 @@ def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
 
 
 def is_authentic(key: VehicleKey, packet: bytes, public: bytes = b"") -> bool:
-    """Whether who made a packet has the key; `public` is the ephemeral key that it answers."""
-    # In constant time: the time of a comparison would tell how many bytes of a guess are right.
+    """Whether the sender of a packet has the key; `public` is the ephemeral key that it answers."""
+    # In constant time: the time of a comparison would reveal how many bytes of a guess are right.
     return hmac.compare_digest(packet[-MAC_BYTES:], _mac(key, packet[:-MAC_BYTES] + public))
 
 

@@ -1,10 +1,10 @@
-"""Keys of vehicles: a file that holds them, and what each is used for.
+"""Keys of vehicles: their file, and the secrets derived from them.
 
     # vehicle  key  secret
     1 1 6f5e…  (64 hexadecimal digits)
 
-A vehicle has one key, or two while they are exchanged: the present one and the next. Nothing here
-shows a secret, in no message and in no `repr`.
+A vehicle has one key, or two during a key change: the present one and the next. No message and no
+`repr` contains a secret.
 """
 
 import hashlib
@@ -21,9 +21,9 @@ SECRET_BYTES = 32
 KEYS_MAX = 2
 """Number of keys that a vehicle may have."""
 VEHICLES, NUMBERS = range(2**16), range(2**8)
-"""Numbers that a vehicle, and a key of a vehicle, may have."""
+"""Valid numbers of a vehicle, and of a key of a vehicle."""
 FILE_BYTES_MAX = 16_000_000
-"""Largest size of a file of keys [B]: room for two of every vehicle, and a word on each."""
+"""Largest size of a file of keys [B]: enough for two keys of every vehicle, with comments."""
 
 _LINE = re.compile(r"(\d{1,5})\s+(\d{1,3})\s+(\S+)", re.ASCII)
 _SECRET = re.compile(rf"[0-9a-fA-F]{{{2 * SECRET_BYTES}}}", re.ASCII)
@@ -45,7 +45,7 @@ class VehicleKey:
 
     @classmethod
     def of(cls, vehicle: int, number: int, secret: bytes) -> "VehicleKey":
-        """Key with what is derived from a secret, which itself is not kept."""
+        """Key derived from a secret, which itself is not stored."""
         assert len(secret) == SECRET_BYTES
         psk = hashlib.blake2s(key=secret, person=b"sky  psk").digest()
         mac = hashlib.blake2s(key=secret, person=b"sky  mac").digest()
@@ -54,10 +54,10 @@ class VehicleKey:
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """Keys of some vehicles."""
+    """Keys of several vehicles."""
 
     name: str
-    """Name by which the user knows the file that the keys are from."""
+    """Name of the file, for messages."""
     keys: Mapping[tuple[int, int], VehicleKey] = field(repr=False)
     """Keys by vehicle and number."""
 
@@ -65,15 +65,15 @@ class Keyring:
         return len(self.keys)
 
     def find(self, vehicle: int, number: int) -> VehicleKey | None:
-        """Key with a number, where the vehicle has it."""
+        """Key with a number; None if the vehicle does not have it."""
         return self.keys.get((vehicle, number))
 
     def numbers(self, vehicle: int) -> list[int]:
-        """Numbers of a vehicle's keys, rising."""
+        """Numbers of a vehicle's keys, ascending."""
         return [number for number in NUMBERS if (vehicle, number) in self.keys]
 
     def of(self, vehicle: int, number: int | None = None) -> VehicleKey:
-        """Key that a vehicle is to use: the one with a number, or that with the highest.
+        """Key that a vehicle uses: the one with a number, or by default with the highest.
 
         Raises:
             ConfigError: there is none.
@@ -95,7 +95,7 @@ def load(path: Path) -> Keyring:
     """Keys in a file.
 
     Raises:
-        ConfigError: there are none, or others than the file's owner can read or write them.
+        ConfigError: there are none, or not only the file's owner can read or write it.
     """
     name = str(path)
     try:
@@ -108,10 +108,10 @@ def load(path: Path) -> Keyring:
 
 
 def parse(name: str, content: bytes) -> Keyring:
-    """Keys in the content of a file that the user calls `name`.
+    """Keys in the content of a file.
 
     Raises:
-        ConfigError: there are none, or a line is not as it must be.
+        ConfigError: there are none, or a line is invalid; the message names `name`.
     """
     keys: dict[tuple[int, int], VehicleKey] = {}
     counts: dict[int, int] = {}
@@ -138,12 +138,12 @@ def parse(name: str, content: bytes) -> Keyring:
 
 
 def write(vehicle: int, number: int, secret: bytes) -> str:
-    """The line of a key in a file."""
+    """Line of a key in a file."""
     return f"{vehicle} {number} {secret.hex()}\n"
 
 
 def _key(text: str, where: str) -> tuple[VehicleKey, bytes]:
-    """Key of a line, and its secret; what is wrong with a line is said without repeating it."""
+    """Key of a line, and its secret; errors do not repeat the line."""
     match = _LINE.fullmatch(text)
     if match is None:
         raise ConfigError(f"{where}: expected {_EXPECTED}")

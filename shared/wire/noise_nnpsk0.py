@@ -1,12 +1,11 @@
-"""The handshake Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s: one message each way, and two keys of it.
+"""The handshake Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s: one message each way, and two derived keys.
 
-    initiator → responder    psk, e      sealed with what the pre-shared key alone gives
-    responder → initiator    e, ee       sealed with that and the secret of both ephemeral keys
+    initiator → responder    psk, e      encrypted with the pre-shared key
+    responder → initiator    e, ee       encrypted with that and the secret of both ephemeral keys
 
-It is written down in The Noise Protocol Framework, revision 34 (sections 5, 7.5 and 9), with the
-names that are used here. Each key that the handshake derives seals one payload, so that every
-nonce is 0. Nothing here changes once it is made: a message can be answered, and an answer be
-opened, more than once, each time with other keys of their own.
+It follows The Noise Protocol Framework, revision 34 (sections 5, 7.5 and 9), with the names used
+there. Each derived key encrypts one payload, so every nonce is 0. All objects are immutable: a
+message can be answered, and an answer opened, more than once, each time with different keys.
 """
 
 import hashlib
@@ -22,7 +21,7 @@ NAME = b"Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s"
 KEY_BYTES = 32
 """Size of every key, secret or public [B]."""
 TAG_BYTES = 16
-"""Length that sealing adds to a payload [B]."""
+"""Length that encryption adds to a payload [B]."""
 MESSAGE_BYTES = KEY_BYTES + TAG_BYTES
 """Length that a message of the handshake adds to its payload [B]."""
 
@@ -30,7 +29,7 @@ _NONCE = bytes(12)
 
 
 class NoiseError(Exception):
-    """A message of the handshake is not the peer's, or not of this handshake."""
+    """A message of the handshake is not from the peer, or of another handshake."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -38,9 +37,9 @@ class Keys:
     """Keys of the two directions, Split() of the handshake."""
 
     forth: bytes
-    """Key of what the initiator sends."""
+    """Key for packets of the initiator."""
     back: bytes
-    """Key of what the responder sends."""
+    """Key for packets of the responder."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -50,9 +49,9 @@ class Symmetric:
     chaining: bytes
     """Chaining key ck."""
     digest: bytes
-    """Hash h of all that was said."""
+    """Hash h of the handshake so far."""
     key: bytes = b""
-    """Key k of the payload that comes next."""
+    """Key k of the next payload."""
 
     def mix_hash(self, data: bytes) -> "Symmetric":
         """MixHash(data)."""
@@ -69,19 +68,19 @@ class Symmetric:
         return Symmetric(chaining, _hash(self.digest + data), key)
 
     def mix_ephemeral(self, public: bytes) -> "Symmetric":
-        """Token "e" where there is a pre-shared key, section 9.2."""
+        """Token "e" with a pre-shared key, section 9.2."""
         return self.mix_hash(public).mix_key(public)
 
     def seal(self, payload: bytes) -> tuple["Symmetric", bytes]:
-        """EncryptAndHash(payload): what follows, and the sealed payload."""
+        """EncryptAndHash(payload): the next state, and the encrypted payload."""
         sealed = ChaCha20Poly1305(self.key).encrypt(_NONCE, payload, self.digest)
         return self.mix_hash(sealed), sealed
 
     def open(self, sealed: bytes) -> tuple["Symmetric", bytes]:
-        """DecryptAndHash(sealed): what follows, and the payload.
+        """DecryptAndHash(sealed): the next state, and the payload.
 
         Raises:
-            NoiseError: it was not sealed in this state.
+            NoiseError: it was not encrypted in this state.
         """
         try:
             payload = ChaCha20Poly1305(self.key).decrypt(_NONCE, sealed, self.digest)
@@ -96,13 +95,13 @@ class Symmetric:
 
 
 class Initiator:
-    """The end that speaks first.
+    """The end that sends the first message.
 
     Args:
         psk: pre-shared key, 32 bytes.
-        prologue: what both ends must have said before in the same words.
+        prologue: data that must be equal at both ends.
         private: private ephemeral key, 32 bytes that were never used.
-        payload: what the first message carries.
+        payload: payload of the first message.
     """
 
     def __init__(self, psk: bytes, prologue: bytes, private: bytes, payload: bytes) -> None:
@@ -115,7 +114,7 @@ class Initiator:
         """First message."""
 
     def open(self, message: bytes) -> tuple[bytes, Keys]:
-        """Payload of the second message, and the keys that both ends have now.
+        """Payload of the second message, and the derived keys.
 
         Raises:
             NoiseError: it does not answer the first message.
@@ -131,11 +130,11 @@ class Responder:
 
     Args:
         psk: pre-shared key, 32 bytes.
-        prologue: what both ends must have said before in the same words.
+        prologue: data that must be equal at both ends.
         message: first message of the initiator.
 
     Raises:
-        NoiseError: it is none, or of another key or prologue.
+        NoiseError: the message is invalid, or of another key or prologue.
     """
 
     def __init__(self, psk: bytes, prologue: bytes, message: bytes) -> None:
@@ -146,14 +145,14 @@ class Responder:
         """Payload of the first message."""
 
     def answer(self, private: bytes, payload: bytes) -> tuple[bytes, Keys]:
-        """Second message, and the keys that both ends have with it.
+        """Second message, and the derived keys.
 
         Args:
             private: private ephemeral key, 32 bytes that were never used.
-            payload: what the message carries.
+            payload: payload of the message.
 
         Raises:
-            NoiseError: the initiator's ephemeral key is none.
+            NoiseError: the initiator's ephemeral key is invalid.
         """
         ephemeral = X25519PrivateKey.from_private_bytes(private)
         public = ephemeral.public_key().public_bytes_raw()
@@ -164,7 +163,7 @@ class Responder:
 
 def _begin(psk: bytes, prologue: bytes) -> Symmetric:
     """Initialize() and token "psk"."""
-    name = _hash(NAME)  # as it is longer than a hash
+    name = _hash(NAME)  # hashed because it is longer than a hash
     return Symmetric(name, name).mix_hash(prologue).mix_key_and_hash(psk)
 
 

@@ -52,22 +52,22 @@ PAYLOAD_BYTES_MAX = 1200
 
 AXES_MAX = 3
 TEXT_MAX = 32
-"""Characters of a text in the terms."""
+"""Largest number of characters of a text in the terms."""
 INPUTS_MAX = 270
-"""Inputs of all axes in one horizon: what fits beside the other fields."""
+"""Largest number of inputs of all axes in one horizon, limited by the packet size."""
 KNOTS_MAX = 16
-"""Knots in one trajectory."""
+"""Largest number of knots in one trajectory."""
 STAMPS = 2**32
-"""Number of microseconds that stamps are told apart of: 71 minutes."""
+"""Modulus of time stamps [µs]: 71 minutes."""
 
 LED_P = 0
-"""Column of `Horizon.feedback`: position x̄ at the horizon's step [m]."""
+"""Column of `Horizon.feedback`: position of x̄ at the horizon's step [m]."""
 LED_V = 1
-"""Column of `Horizon.feedback`: velocity x̄ there [m/s]."""
+"""Column of `Horizon.feedback`: velocity of x̄ at that step [m/s]."""
 LED = [LED_P, LED_V]
 """Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
-"""Column of `Horizon.feedback`: disturbance ŵ that was reckoned with [m/s]."""
+"""Column of `Horizon.feedback`: disturbance ŵ that the inputs compensate [m/s]."""
 GAIN_P = 3
 """Column of `Horizon.feedback`: K on position [1/s]."""
 GAIN_V = 4
@@ -77,12 +77,13 @@ FEEDBACK = 5
 
 NO_FEEDBACK = np.empty((0, 0), np.float32)
 FLOAT_MAX = float(np.finfo(np.float32).max)
-"""Largest number of a state that can be told [m, m/s]."""
+"""Largest number that fits in a state on the wire [m, m/s]."""
 NO_INPUT = np.empty(0)
-"""`Observation.input` with the scheme "trajectory", where nobody reads it."""
+"""`Observation.input` with the scheme "trajectory", which does not use it."""
 
 INPUT_TOLERANCE = 1.001
-"""Factor by which an input may exceed its bound (float32 rounds) before the packet is refused."""
+"""Factor by which an input may exceed its bound before the packet is refused, since float32
+rounds."""
 
 
 class Refusal(IntEnum):
@@ -93,9 +94,9 @@ class Refusal(IntEnum):
     OTHER_TERMS = 1
     """The vehicle has other terms."""
     FULL = 2
-    """The server has no room."""
+    """The server is full."""
     TAKEN = 3
-    """Another client flies under the vehicle's number."""
+    """Another client uses the vehicle's number."""
 
     def __str__(self) -> str:
         return self.name.lower().replace("_", " ")
@@ -118,13 +119,13 @@ class Welcome(NamedTuple):
 
     vehicle: int
     session: int
-    """Number of the session, 0 where there is none."""
+    """Number of the session; 0 if there is none."""
     boot_id: int
-    """The vehicle's own, echoed: an answer to another life of the vehicle is not for this one."""
+    """Boot id of the HELLO: an answer to another run of the client is dropped."""
     server_boot_id: int
     server_ns: int
     refusal: int
-    """Why there is none, one of `Refusal`."""
+    """Why there is no session, one of `Refusal`."""
     terms: Terms
 
 
@@ -132,83 +133,83 @@ class Mode(IntEnum):
     """Mode of a vehicle, see `client.failsafe`."""
 
     INIT = 0
-    """Vehicle without a session."""
+    """No session yet."""
     SYNC = 1
-    """Vehicle whose link is not good for long enough yet."""
+    """Waits until the link has been good for long enough."""
     READY = 2
-    """Vehicle that waits for a horizon, and to be armed."""
+    """Waits for a horizon, and to be armed."""
     TRACK = 3
-    """Vehicle that flies a horizon."""
+    """Flies a horizon."""
     COAST = 4
-    """Vehicle that flies on along a horizon for want of a newer one."""
+    """Flies on along a horizon without a newer one."""
     BRAKE = 5
-    """Vehicle that takes the input that it flew last to zero."""
+    """Brakes from its last input."""
     HOVER = 6
-    """Vehicle that stands still."""
+    """Stands still."""
     LAND = 7
-    """Vehicle that descends, and stays down."""
+    """Descends, and stays down."""
     FAULT = 8
-    """Vehicle with a fault aboard: stands still, and flies nothing more."""
+    """Has a fault: stands still, and flies nothing more."""
     MANUAL = 9
-    """Vehicle that a pilot or nobody flies: nothing is sent to its autopilot."""
+    """Flown by a pilot or nobody: nothing is sent to its autopilot."""
     RETURN = 10
-    """Vehicle that its autopilot flies home, and lands there."""
+    """Flown home by its autopilot, and landed there."""
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
 class Observation(NamedTuple):
-    """The vehicle's state at the start of one step, and what it does from there on."""
+    """The vehicle's state at the start of a step, and what it does from there on."""
 
     vehicle: int
     session: int
     step: int
-    """Step k at whose begin the state was sampled, on the vehicle's grid."""
+    """Step k at whose start the state was sampled, on the vehicle's grid."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
     """First step that was flown with that horizon."""
     backward_us: int
-    """Stamp: when the newest packet of the server came, by the time since the vehicle's step 0,
-    less the server's clock when it was sent."""
+    """Time stamp: arrival of the server's newest packet, in time since the vehicle's step 0, minus
+    the server's clock when it was sent."""
     heard: int
-    """Number of packets of the server that have come, modulo NUMBERS."""
+    """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
     """Mode of the vehicle, one of `Mode`."""
     takes: int
-    """1 if a horizon that comes now would be flown, else 0."""
+    """1 if a horizon that arrives now would be flown, else 0."""
     state: Array
-    """Position [m] and velocity [m/s]; shape (axes, 2). It is told as float32."""
+    """Position [m] and velocity [m/s]; shape (axes, 2). Sent as float32."""
     input: Array
     """Desired velocity that is flown from `step` on [m/s]; shape (axes,), or NO_INPUT with the
-    scheme "trajectory". It is told as float32."""
+    scheme "trajectory". Sent as float32."""
     number: int = 0
     """Number of packets that the vehicle has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the vehicle asks of the server [half steps]; 0 for none."""
+    """Longest silence that the vehicle asks of the server [half steps]; 0 for no bound."""
 
 
 class Horizon(NamedTuple):
-    """The control horizon U(k) of eq. (8), after the committed inputs where there are any."""
+    """Control horizon U(k) of eq. (8), after the committed inputs if there are any."""
 
     vehicle: int
     session: int
     step: int
     """Step k of the first input, on the vehicle's grid."""
     server_us: int
-    """Stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when it was sent."""
     age: int
-    """Steps from the newest observation that the server had to `step`."""
+    """Steps from the server's newest observation to `step`."""
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """Parameters of the feedback aboard, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
-    (axes, 0) where the inputs are to be flown as they are."""
+    (axes, 0) without feedback."""
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
 
 
 class Trajectory(NamedTuple):
@@ -219,9 +220,9 @@ class Trajectory(NamedTuple):
     step: int
     """Step k of the first knot, on the vehicle's grid."""
     server_us: int
-    """Stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when it was sent."""
     age: int
-    """Steps from the newest observation that the server had to `step`."""
+    """Steps from the server's newest observation to `step`."""
     spacing: int
     """Steps from one knot to the next."""
     knots: NDArray[np.float32]
@@ -229,18 +230,18 @@ class Trajectory(NamedTuple):
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
 
 
 class Idle(IntEnum):
     """Why the server makes no plan for a vehicle."""
 
     PLANS = 0
-    """Plans are made, and the trigger has sent what was worth sending."""
+    """Plans are made, and sent when the trigger asks for it."""
     OBSERVATION = 1
-    """The newest observation is older than `link.age_max_s`, or would be before a plan began."""
+    """The newest observation is older than `link.age_max_s`, or would be when a plan began."""
     DELAY = 2
-    """The delay to the vehicle is longer than a horizon has room for."""
+    """The delay to the vehicle is longer than a horizon can cover."""
     UNSOLVED = 3
     """The solver has found no plan."""
 
@@ -257,20 +258,20 @@ IDLE_TEXTS = {
 
 
 class Heartbeat(NamedTuple):
-    """Sign of life of a server that has nothing else to say."""
+    """Heartbeat of a server that has nothing else to send."""
 
     vehicle: int
     session: int
     server_us: int
-    """Stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when it was sent."""
     idle: int
     """Why no plan is made for the vehicle, one of `Idle`."""
     degraded: int
-    """1 if the server sleeps through more of its ticks than it may, else 0."""
+    """1 if the server misses too many ticks, else 0."""
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for none."""
+    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
 
 
 class Close(NamedTuple):
@@ -281,33 +282,33 @@ class Close(NamedTuple):
 
 
 class Time(NamedTuple):
-    """Time of day at which a vehicle's step 0 began; sent where the vehicle's host knows it."""
+    """Time of day at which a vehicle's step 0 began; sent if the vehicle's host knows it."""
 
     vehicle: int
     session: int
     step: int
-    """Step k in which it is told, on the vehicle's grid."""
+    """Step k in which it is sent, on the vehicle's grid."""
     epoch_us: int
-    """Stamp: the time since 1970 at which step 0 began."""
+    """Time stamp: the time since 1970 at which step 0 began."""
     error_us: int
-    """Largest error of that [µs]."""
+    """Largest error of that time [µs]."""
 
 
-# With a tenth of all packets lost, all three are lost once in a thousand times.
+# With 10 % loss, all three are lost once in a thousand times.
 CLOSES = 3
-"""Number of times that CLOSE is said, for some of them may be lost."""
+"""Number of times that CLOSE is sent, since some may be lost."""
 
 
 def stamp_us(time_ns: int) -> int:
-    """Stamp of a time, or of a difference of two clocks: whole microseconds modulo STAMPS."""
+    """Time stamp of a time, or of a difference of two clocks: whole microseconds modulo STAMPS."""
     # Python's % is never negative, so a negative difference of two clocks has a stamp as well.
     return time_ns // MICROSECOND_NS % STAMPS
 
 
 def stamped_ns(stamp: int, near_ns: int) -> int:
-    """Time that a stamp tells [ns]: of all that have the stamp the one nearest to `near_ns`.
+    """Time with a given stamp that is nearest to `near_ns` [ns].
 
-    It is the right one, but for its part of a microsecond, where that is known to half an hour.
+    Correct to the microsecond if the time is known to within half an hour.
     """
     near = near_ns // MICROSECOND_NS
     half = STAMPS // 2
@@ -318,14 +319,14 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
 Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time
 
 _Check = range | Callable[[object, Terms], object]
-"""The integers a field may be, or what makes the field of what was sent, or refuses it."""
+"""Range of an integer field, or a function that converts or refuses the received value."""
 
 
 def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
-    """Values, one for each check, each as its check returns it."""
+    """Received values after their checks."""
     for i, check in enumerate(checks):
         if type(check) is range:
-            # `type`, not `isinstance`: True is no integer on this wire.
+            # `type`, not `isinstance`: True is not an integer on this wire.
             if type(values[i]) is not int or values[i] not in check:
                 raise ProtocolError(Drop.FIELD)
         else:
@@ -334,18 +335,18 @@ def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> 
 
 
 def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms: they may differ from ours, but must be of the same kind."""
+    """The peer's terms: they may differ from ours, but must have the same types."""
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
-        # Exact types: True would pass for 1, and 1 for 1.0.
+        # Exact types: otherwise True would pass for 1, and 1 for 1.0.
         if type(theirs) is not type(our) or not _is_plain(theirs):
             raise ProtocolError(Drop.FIELD)
     return Terms._make(value)
 
 
 def _is_plain(value: object) -> bool:
-    """Whether a term is a finite number, a short text, yes or no, or a number for each axis."""
+    """Whether a term is a finite number, a short text, a flag, or a number per axis."""
     match value:
         case float():
             return math.isfinite(value)
@@ -358,17 +359,17 @@ def _is_plain(value: object) -> bool:
 
 
 def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
-    """State and input of an observation; the input is NO_INPUT where nobody reads it."""
+    """State and input of an observation; the input is NO_INPUT if the scheme does not use it."""
     axes = ours.axes
     told = _FLOATS[axes * (2 if ours.splines else 3)]
     if type(value) is not bytes or len(value) != told.size:
         raise ProtocolError(Drop.SHAPE)
     # Struct takes 0.2 µs for six numbers, np.frombuffer and tolist 0.7 µs.
     numbers = told.unpack(value)
-    # Numbers that were float32 have a finite sum, unless one of them is not finite.
+    # The sum of float32 numbers is finite unless one of them is not.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
-    # Without inputs there is nothing left to be held against a bound.
+    # Without inputs there is nothing to compare with a bound.
     for u, bound in zip(numbers[2 * axes :], ours.u_max, strict=False):
         if abs(u) > bound * INPUT_TOLERANCE:
             raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
@@ -377,7 +378,9 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
 
 
 def _delay(value: object, ours: Terms) -> int | None:  # noqa: ARG001 - see `_Check`
-    """Steps from the one that a horizon was made for to the first flown with it; None for none."""
+    """Steps from the one that a horizon was made for to the first flown with it; None without
+    one.
+    """
     if value is not None and (type(value) is not int or value not in _AGE):
         raise ProtocolError(Drop.FIELD)
     return value
@@ -418,18 +421,18 @@ def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def committed_max(terms: Terms) -> int:
-    """Largest number of committed steps that a horizon has room for beside its plan; 1 or more."""
+    """Largest number of committed steps that fit in a horizon beside its plan; 1 or more."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
-    """Array of `axes` rows, with at least and at most so many numbers each."""
+    """Array of `axes` rows, with a number of columns within `counts`."""
     if type(value) is not bytes:
         raise ProtocolError(Drop.SHAPE)
     count, rest = divmod(len(value), axes * dtype.itemsize)
     if rest or not counts[0] <= count <= counts[1]:
         raise ProtocolError(Drop.SHAPE)
-    # A read-only view of the datagram's own bytes: nothing is copied.
+    # A read-only view of the datagram's own bytes, without copying.
     return np.ndarray((axes, count), dtype, value)
 
 
@@ -442,7 +445,7 @@ _U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
-# Negative where the server's clock was set and its clock map lags: the step then lies before the
+# Negative if the server's clock was set and its clock map lags: the step then lies before the
 # observation.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
@@ -466,7 +469,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
 
 _OBSERVATION = 3
-"""Type number of the message that a server hears most."""
+"""Type number of the message that a server receives most."""
 _WIRE: dict[_Check, Any] = {
     _motion: bytes,
     _delay: Annotated[int, Meta(ge=_AGE.start, le=_AGE.stop - 1)] | None,
@@ -483,14 +486,14 @@ _QUICK = msgspec.msgpack.Decoder(
         ),
     ]
 )
-"""Decoder of an observation that checks types and ranges at once. A packet that it refuses is read
-again field by field, which finds the reason."""
+"""Decoder of an observation that checks types and ranges at once. A packet that it refuses is
+decoded again field by field, which finds the reason."""
 _MOTION = _TYPES[_OBSERVATION - 1][1].index(_motion)
 # 0x90 + n is msgpack's header of an array of n < 16 elements.
 _QUICK_START = bytes([0x90 | (2 + len(_TYPES[_OBSERVATION - 1][1])), VERSION, _OBSERVATION])
 
 _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
-# One packer for all messages: packb, which makes one for each, takes three times as long.
+# One packer for all messages: packb makes one for each, and takes three times as long.
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
@@ -499,8 +502,8 @@ def _told(said: Observation) -> list[object]:
     made_for, since = said.in_force, said.since
     numbers = said.state.ravel().tolist() + said.input.tolist()
     return [
-        # Steps are told as differences and mode and `takes` in one number: a byte each as a rule,
-        # where the numbers themselves took up to five.
+        # Steps are sent as differences, mode and `takes` as one number: usually a byte each instead
+        # of up to five.
         VERSION,
         _NUMBERS[Observation],
         said.vehicle,
@@ -518,11 +521,11 @@ def _told(said: Observation) -> list[object]:
 
 
 def _observation(told: list[Any]) -> Observation:
-    """Observation of its fields on the wire, each of which has been checked."""
+    """Observation from its fields on the wire, each of which has been checked."""
     vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = told
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
-    # Differences may lead below step 0 though each of them is within its range.
+    # Differences may lead below step 0 even if each of them is within its range.
     if since < 0 or (delay is not None and in_force < 0):
         raise ProtocolError(Drop.FIELD)
     mode, takes = divmod(does, 2)
@@ -545,7 +548,7 @@ def _observation(told: list[Any]) -> Observation:
 
 
 def encode(message: Message) -> bytes:
-    """The datagram of a message; arrays travel as little-endian bytes."""
+    """Datagram of a message; arrays are sent as little-endian bytes."""
     if type(message) is Observation:
         payload: bytes = _PACKER.pack(_told(message))
     else:
@@ -573,9 +576,10 @@ def encode_horizon(
 
 
 def kind_of(payload: bytes) -> int | None:
-    """Type number of a message, from its first bytes; None of one that is none of ours.
+    """Type number of a message, from its first bytes; None if it is not one of ours.
 
-    Array, version and type must be in msgpack's shortest form, so that it is what it looks like.
+    Array header, version and type must be in msgpack's shortest form, so that the bytes are
+    unambiguous.
     """
     head = payload[:3]
     if len(head) < 3 or head[0] & 0xF0 != 0x90 or max(head[1:]) >= 0x80:
@@ -584,12 +588,12 @@ def kind_of(payload: bytes) -> int | None:
 
 
 def decode(payload: bytes, terms: Terms) -> Message:
-    """The message in a datagram, every field checked against our own terms.
+    """Message in a datagram, every field checked against our own terms.
 
     Raises:
-        ProtocolError: it is none of ours.
+        ProtocolError: it is not one of our messages.
     """
-    # The first check of all: nothing is parsed of a packet that is too long.
+    # First of all checks: nothing is parsed of a packet that is too long.
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
     if payload.startswith(_QUICK_START):
@@ -598,7 +602,7 @@ def decode(payload: bytes, terms: Terms) -> Message:
             told[_MOTION] = _motion(told[_MOTION], terms)
             return _observation(told)
     try:
-        # No message has a map or an extension, so that none is ever built of a stranger's bytes.
+        # No message has a map or an extension, so none is ever built from a stranger's bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
     except (ValueError, msgpack.UnpackException) as error:
         raise ProtocolError(Drop.NOT_MSGPACK) from error
