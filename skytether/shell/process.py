@@ -46,7 +46,7 @@ from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
 from skytether.shell.recording import RecordFile
-from skytether.shell.time_of_day import host_time
+from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
 
 # for type checking alone: they are slow to import, and a process that flies does without
@@ -172,6 +172,7 @@ class Process:
             CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
         """
         options, feed, journal = self.options, self.feed, self.journal
+        clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
         running = journal.running(endpoint) if journal else Running(endpoint, options.config)
         if feed:
             feed.open(opened(self.name, options.scenario, running, feed))
@@ -220,11 +221,10 @@ class Process:
                 return counted | ({"feed": feed.figures()} if feed else {})
 
             def each_second(*, last: bool = False) -> None:
-                for source in (self.recording, memory):
+                for source in (self.recording, memory, *clocks):
                     if source and (news := source.news()):
                         out.say(news)
                 out.each_second(last=last)
-                _learn_time(endpoint, options)
                 snapshot = figures() if feed or served else {}
                 if feed:
                     feed.count(snapshot)
@@ -304,12 +304,6 @@ def begin(
 def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.void]) -> Recorder:
     recorder.follow(feed.part(part, columns))
     return recorder
-
-
-def _learn_time(endpoint: Endpoint, options: ProcessOptions) -> None:
-    """Tell an endpoint the time of day, where it is asked for and known."""
-    if options.config.link.time_of_day == "host" and (told := host_time()):
-        endpoint.learn_time(told.utc_ns, told.error_ns, now_ns=told.now_ns)
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 What disciplines the clock sets that error: chrony and ntpd count half of the round trip to their
 source in it, so that no delay of theirs makes it false. systemd-timesyncd sets it to 0 and tells no
-estimate, which is no error at all; such a clock counts as unknown.
+estimate, which is no error at all; such a clock counts as unknown. So does that of a chrony without
+`rtcsync`, which leaves the kernel's clock marked as not synchronised.
 """
 
 import ctypes
@@ -11,6 +12,8 @@ from functools import cache
 from typing import NamedTuple
 
 from skytether.shared.base.units import MICROSECOND_NS
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.core.events import TimeUnknown
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
 """Status bit, and answer of the kernel, of a clock that nothing disciplines."""
@@ -67,3 +70,21 @@ def host_time() -> HostTime | None:
     # sides, and what has passed is added to the error.
     before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     return HostTime(utc_ns, error_ns + after_ns - before_ns, after_ns)
+
+
+class TimeTeller:
+    """Tells an endpoint the time of day of this host for as long as that is known."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = endpoint
+        self._is_known = True
+
+    def news(self) -> TimeUnknown | None:
+        """Tell the endpoint the time of day now; event for the operator once it is unknown."""
+        time_of_day, was_known = host_time(), self._is_known
+        self._is_known = time_of_day is not None
+        if time_of_day is None:
+            return TimeUnknown() if was_known else None
+        utc_ns, error_ns, now_ns = time_of_day
+        self._endpoint.learn_time(utc_ns, error_ns, now_ns=now_ns)
+        return None
