@@ -13,7 +13,7 @@ import msgspec
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.probe.listener import Listener
-from skytether.probe.outcome import ProbeOutcome, DirectionFigures, outcome, rows, trace
+from skytether.probe.outcome import DirectionFigures, ProbeOutcome, outcome, rows, trace
 from skytether.probe.prober import BYTES_MIN, PROBES_MAX, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate

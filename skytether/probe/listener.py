@@ -36,8 +36,8 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of the
-host with the most."""
+"""Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of
+the host with the most."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536

@@ -1,4 +1,4 @@
-"""Results of a measurement: figures of each direction, and the scenario text of the fitted models."""
+"""Results of a measurement: figures of each direction, and the fitted models as scenario text."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -142,7 +142,7 @@ SIH = Frame(
     rate_gain=60.0,
     rate_damping=3.0,
 )
-"""PX4's simulation in hardware: `sih_params.c` of PX4 1.17, with rotors of 1000 rad/s as in rotorpy.
+"""PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors of 1000 rad/s as in rotorpy.
 Its drag of 1 N for each m/s is applied here as rotor drag in hover. It has no battery: that of the
 1.5 kg frame is used."""
 

@@ -137,7 +137,7 @@ def parse(
 
 
 def _laid(scenario: Scenario, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Table of a scenario with values of keys; an unknown key is kept in it, for the check to find."""
+    """Table of a scenario with values of keys; unknown keys stay in it, for the check to find."""
     whole = {f"network.{way}": way for way in reading.DIRECTIONS}
     directions = {whole[key]: text for key, text in values.items() if key in whole}
     table = reading.to_table(reading.with_directions(scenario, directions))

@@ -136,7 +136,7 @@ class Shell:
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer for every datagram: copying out of it costs less than a new buffer of full size."""
+        """Buffer for every datagram: to copy out of it costs less than a new one of full size."""
         self._batches: dict[int, Batch | None] = {}
         """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns

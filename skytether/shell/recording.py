@@ -1,5 +1,4 @@
-"""File of a part of the record, written in a thread: a slow or full disk does not disturb a flight.
-"""
+"""File of a part of the record, written in a thread: a slow or full disk disturbs no flight."""
 
 import os
 from typing import BinaryIO
