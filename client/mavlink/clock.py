@@ -90,6 +90,11 @@ class BootClock:
         return self._taken >= KNOWN
 
     @property
+    def heard_ns(self) -> int:
+        """Time of the newest answer [ns; the client's clock]; the clock must be known."""
+        return self._heard[-1][0]
+
+    @property
     def wrong_rate(self) -> float | None:
         """Speed of the autopilot's clock, 1 for ours, where it cannot be followed; else None."""
         if len(self._heard) < KNOWN:

@@ -40,6 +40,7 @@ from skytether.shared.core.aboard import (
     AutopilotMode,
     AutopilotMoved,
     AutopilotRefused,
+    ClockSilent,
     NotTakenOff,
     PositionsDropped,
     SecondCommander,
@@ -58,6 +59,8 @@ HEARTBEAT_NS = SECOND_NS
 """Time between two heartbeats of ours [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Time between two questions for the autopilot's clock [ns]: before it is known, and then."""
+CLOCK_SILENT_NS = 10 * SECOND_NS
+"""Time without an answer after which that is told [ns]."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
 SETPOINTS_MAX_HZ = 50.0
@@ -171,7 +174,7 @@ class Port(Endpoint):
         self.now_ns = 0
         """Time of the newest call."""
         self._began_ns: int | None = None
-        self._jumps, self._unusable = 0, False
+        self._jumps, self._unusable, self._is_clock_silent = 0, False, False
         """Jumps of the clock before it was set up; whether it was told that positions are
         dropped."""
         self._tick_ns = 0
@@ -570,6 +573,7 @@ class Port(Endpoint):
                 self._give_up("not heard", why)
             return
         self._await_clock(now_ns)
+        self._watch_clock(now_ns)
         if now_ns >= self._clock_ns:
             self._clock_ns = now_ns + (CLOCK_NS if self._clock.is_known else CLOCK_BEGIN_NS)
             self._say(dialect.MAVLink_timesync_message(0, self._clock.ask(now_ns=now_ns)))
@@ -610,6 +614,16 @@ class Port(Endpoint):
             self._set_up_ns = now_ns
         elif now_ns - self._set_up_ns > seconds_to_ns(self._keys.patience_s):
             self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
+
+    def _watch_clock(self, now_ns: int) -> None:
+        """Say once that the autopilot, which is heard, does not tell its clock any more."""
+        was_silent, clock = self._is_clock_silent, self._clock
+        is_heard = self._condition.is_fresh(now_ns=now_ns)
+        silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0
+        self._is_clock_silent = silent_ns > CLOCK_SILENT_NS
+        if self._is_clock_silent and not was_silent:
+            silent_s = silent_ns / SECOND_NS
+            self._events.append(ClockSilent(vehicle=self._vehicle, silent_s=silent_s))
 
     def _give_up(self, doing: str, why: str) -> None:
         """Fail: something has not come in time."""
