@@ -10,7 +10,6 @@ vehicle is planned for at every step, for planning is a small part of what a ste
 
 from collections import Counter
 from collections.abc import Callable
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from skytether.server.budget import SharedBudget
 from skytether.server.common import splines
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import DOUBTS, Batch, Figures, Scheme, foresight
+from skytether.server.common.scheme import DOUBTS, Batch, Figures, Fleet, Scheme, foresight
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
-from skytether.server.schemes.table import SCHEMES, Entry, Fleet
+from skytether.server.schemes import table
 from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
@@ -51,18 +50,18 @@ def _mission(fleet: Fleet) -> Scheme:
         fleet.desired.number,
         fleet.clock,
     )
-    return MissionPlanner(fleet.scenario, fleet.terms, fleet.block, state)
+    return MissionPlanner(fleet, state)
 
 
-MISSION = Entry(_mission, (missions, splines))
-"""Scheme of vehicles that keep apart."""
+MISSION_KERNELS = (missions, splines)
+"""Modules and packages whose kernels are called where vehicles keep apart."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
     """Names of the modules whose kernels are not called where a scenario is flown."""
-    entry = MISSION if scenario.is_mission else SCHEMES[scenario.control.scheme]
-    every = chain.from_iterable(each.kernels for each in (MISSION, *SCHEMES.values()))
-    names = tuple(f"{each.__name__}." for each in {*every}.difference(entry.kernels))
+    own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
+    every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
+    names = tuple(f"{each.__name__}." for each in every.difference(own))
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
@@ -115,14 +114,25 @@ class Controller:
             self._uplink_max_ns = UNSEEN  # whenever it comes, its first input is flown
         self.desired = Desired(scenario, terms, room, block, references)
         """Desired trajectories as far as they are known."""
-        is_mission = scenario.is_mission and references is not None
-        entry = MISSION if is_mission else SCHEMES[scenario.control.scheme]
-        fleet = Fleet(scenario, terms, room, block, clock, self.desired, references, stopwatch)
-        self.scheme = entry.make(fleet)
-        """What is believed of vehicles, planned and sent."""
-        self._terms, self._room, self._block = terms, room, block
         self.faults: list[str] = []
-        """Tracebacks of mistakes in plug-ins' policies, one for each policy, to be told."""
+        """Tracebacks of plug-ins' mistakes, one for the scheme and each policy, to be told."""
+        fleet = Fleet(
+            scenario,
+            terms,
+            room,
+            block,
+            clock,
+            self.desired,
+            references,
+            stopwatch,
+            self.faults.append,
+        )
+        is_mission = scenario.is_mission and references is not None
+        self.scheme = _mission(fleet) if is_mission else table.make(fleet)
+        """What is believed of vehicles, planned and sent."""
+        self.columns = control.properties.figures
+        """Figures of plans that are recorded."""
+        self._terms, self._room, self._block = terms, room, block
         self._sent_step = np.full(room, -1, dtype=np.int64)
         """Step at which each vehicle was sent a horizon last, or -1; shape (room,)."""
         self._heartbeat_due: Flags = np.zeros(room, dtype=np.bool_)

@@ -25,10 +25,9 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
-from skytether.shared.telemetry.record import FIGURES, Recorder
+from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
@@ -98,7 +97,6 @@ class Ticker:
     """Decides for all vehicles in session, sends them horizons and heartbeats, and records.
 
     Args:
-        terms: what is agreed upon with every vehicle.
         sessions: who flies.
         clock: tells the step of each.
         controller: plans.
@@ -112,7 +110,6 @@ class Ticker:
 
     def __init__(
         self,
-        terms: Terms,
         sessions: Sessions,
         clock: ClockMap,
         controller: Controller,
@@ -133,8 +130,6 @@ class Ticker:
         self._events = events
         self._recorder, self._plans = recorder, plans
         self._records = recorder is not None or plans is not None
-        self._columns = [str(each) for each in FIGURES[terms.scheme]]
-        """Columns of the record that figures of plans are written to."""
         self.durations = Histogram(TICK_BIN_NS)
         """Duration of each tick, while the stopwatch runs."""
 
@@ -263,7 +258,8 @@ class Ticker:
     def _figures(self, decisions: Decisions) -> dict[str, Array | float]:
         """Figures of plans for the record: NaN where there is none."""
         figures, verdict, nothing = decisions.figures, decisions.verdict, float("nan")
-        told: dict[str, Array | float] = {column: figures[column] for column in self._columns}
+        columns = self._controller.columns
+        told: dict[str, Array | float] = {column: figures[column] for column in columns}
         solved = figures["solved"]
         if not solved.all():
             told = {name: np.where(solved, figure, nothing) for name, figure in told.items()}

@@ -5,10 +5,13 @@ from typing import Any
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
+from skytether.server.common.desired import Desired
+from skytether.server.common.scheme import Fleet
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import SentMotion
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.motion import Motion, resting
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import swap
@@ -38,8 +41,11 @@ def alone() -> MissionPlanner:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
-    state = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    return MissionPlanner(flown, flown.terms(), 2, state)
+    terms, clock = flown.terms(), exact(2)
+    state = MissionState(flown, terms, 2, 2, goals.of, lambda row: row + 1, clock)
+    desired = Desired(flown, terms, 2, 2, goals.of)
+    fleet = Fleet(flown, terms, 2, 2, clock, desired, goals.of, Stopwatch(), print)
+    return MissionPlanner(fleet, state)
 
 
 def exact(vehicles: int) -> ClockMap:

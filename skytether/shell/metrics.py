@@ -98,6 +98,8 @@ counts/unsolved server_unsolved_total
     Steps for which no plan was found.
 counts/horizons_lost server_lost_horizons_total
     Horizons that were sent but did not come into force in time.
+counts/scheme_errors server_scheme_errors_total
+    Steps of vehicles at which a plug-in's scheme failed.
 dropped/{reason} server_dropped_datagrams_total
     Datagrams that came from no vehicle or could not be read, by reason.
 refused/{reason} server_refused_vehicles_total

@@ -431,7 +431,7 @@ class State:
             self.name = opened.name
             self.scenario = scenario
             control, axes = self.scenario.control, self.scenario.model.axes
-            follows = control.scheme == "trajectory"
+            follows = control.properties.splines
             self.network = Network(TRAJECTORY_BYTES if follows else 4 * axes * control.horizon)
         columns: dict[str, np.dtype[np.void]] = {}
         for part, described in opened.parts.items():

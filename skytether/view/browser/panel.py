@@ -119,7 +119,7 @@ class Panel:
         titles = [each.title for each in flights]
         scenarios = [each.state.scenario for each in flights]
         axes = max(each.model.axes for each in scenarios)
-        solves = any(each.control.scheme != "trajectory" for each in scenarios)
+        solves = any(not each.control.properties.splines for each in scenarios)
         panel = gui.add_panel()
         self._plots = []
         flies = any(each.state.flies for each in flights)
