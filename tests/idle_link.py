@@ -101,7 +101,6 @@ class _Unsealed:
     """Way back of a session without encryption."""
 
     def seal(self, payload: bytes) -> bytes:
-        """See `WayBack`."""
         return payload
 
 

@@ -22,7 +22,6 @@ DT_S = 0.05
 
 
 def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: Any) -> Scenario:
-    """Vehicles that swap places."""
     table = reading.to_table(reading.load("swap"))
     table |= {"duration": duration, "seed": keys.pop("seed", 1)}
     table["reference"]["shape"] = f"swap({vehicles})"
@@ -32,7 +31,6 @@ def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: A
 
 
 def observation(step: int, in_force: int, place: tuple[float, float]) -> Observation:
-    """An observation of a vehicle at rest."""
     state = np.array([[place[0], 0.0], [place[1], 0.0]])
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
