@@ -93,12 +93,12 @@ def write(
     document: Path = DOCUMENT,
     folder: Path = DOCUMENT.parent,
 ) -> None:
-    """Merge new figures with those of other sections, and write all into the document.
+    """Merge new figures with those of other sections; write the tables that the document has.
 
     Args:
         results: measured figures, by section.
         file: file of the figures.
-        document: document with the tables.
+        document: document with places for some of the tables; the others are only printed.
         folder: folder for pictures.
     """
     if "tick" in results:
@@ -110,7 +110,9 @@ def write(
     tables = {"machine": machines(merged), "packages": packages(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)
-    files.write(document, refresh(document.read_text(), tables).encode())
+    text = document.read_text()
+    placed = {name: each for name, each in tables.items() if f"<!-- table: {name} -->" in text}
+    files.write(document, refresh(text, placed).encode())
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
