@@ -116,14 +116,18 @@ def write(
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
-    """Machine that each section was measured on, and how late it woke a sleeping process."""
-    rows = []
+    """Sections that were measured alike, and how late a sleeping process woke meanwhile."""
+    alike: dict[tuple[str, ...], list[Section]] = {}
     for name, figures in results.items():
-        on, wake = figures["machine"], figures.get("wake")
-        late = [f"{wake[share]:.2f}" for share in wake] if wake else ["", "", ""]
+        on = figures["machine"]
         where = f"{on['cores']} x {on['cpu']}, Python {on['python']}"
-        rows.append([name, where, on["commit"] or "", on["date"], *late])
-    headings = ["measured", "on", "commit", "date", "wakes late, p50 [ms]", "p99", "max"]
+        alike.setdefault((where, on["commit"] or "", on["date"]), []).append(name)
+    rows = []
+    for place, names in alike.items():
+        late_ms = [results[name]["wake"]["p99_ms"] for name in names if "wake" in results[name]]
+        worst = f"{max(late_ms):.2f}" if late_ms else ""
+        rows.append([", ".join(names), *place, worst])
+    headings = ["measured", "on", "commit", "date", "wakes late, largest p99 [ms]"]
     return TextTable(headings, rows)
 
 
