@@ -93,12 +93,12 @@ def write(
     document: Path = DOCUMENT,
     folder: Path = DOCUMENT.parent,
 ) -> None:
-    """Merge new figures with those of other sections, and write all into the document.
+    """Merge new figures with those of other sections; write the tables that the document has.
 
     Args:
         results: measured figures, by section.
         file: file of the figures.
-        document: document with the tables.
+        document: document with places for some of the tables; the others are only printed.
         folder: folder for pictures.
     """
     if "tick" in results:
@@ -110,18 +110,24 @@ def write(
     tables = {"machine": machines(merged), "packages": packages(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)
-    files.write(document, refresh(document.read_text(), tables).encode())
+    text = document.read_text()
+    placed = {name: each for name, each in tables.items() if f"<!-- table: {name} -->" in text}
+    files.write(document, refresh(text, placed).encode())
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
-    """Machine that each section was measured on, and how late it woke a sleeping process."""
-    rows = []
+    """Sections that were measured alike, and how late a sleeping process woke meanwhile."""
+    alike: dict[tuple[str, ...], list[Section]] = {}
     for name, figures in results.items():
-        on, wake = figures["machine"], figures.get("wake")
-        late = [f"{wake[share]:.2f}" for share in wake] if wake else ["", "", ""]
+        on = figures["machine"]
         where = f"{on['cores']} x {on['cpu']}, Python {on['python']}"
-        rows.append([name, where, on["commit"] or "", on["date"], *late])
-    headings = ["measured", "on", "commit", "date", "wakes late, p50 [ms]", "p99", "max"]
+        alike.setdefault((where, on["commit"] or "", on["date"]), []).append(name)
+    rows = []
+    for place, names in alike.items():
+        late_ms = [results[name]["wake"]["p99_ms"] for name in names if "wake" in results[name]]
+        worst = f"{max(late_ms):.2f}" if late_ms else ""
+        rows.append([", ".join(names), *place, worst])
+    headings = ["measured", "on", "commit", "date", "wakes late, largest p99 [ms]"]
     return TextTable(headings, rows)
 
 

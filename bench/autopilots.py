@@ -227,13 +227,9 @@ HEADINGS = [
     "set-points",
     "RMSE xy [m]",
     "least to most",
-    "largest error [m]",
-    "packets up /s",
-    "down /s",
-    "bytes up /s",
-    "down /s",
     f"largest error in a cut of {HEALED_S - CUT_S:g} s [m]",
-    "flies on after it",
+    "packets/s up, down",
+    "bytes/s up, down",
 ]
 
 
@@ -264,7 +260,7 @@ def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
 
 
 def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
-    """Row of a contender: means over its flights; for errors also the largest."""
+    """Row of a contender: means over its flights; of a cut the largest error, and who ended."""
     errors = [each.whole.rmse_xy or np.nan for each in flights]
 
     def a_second(key: str) -> float:
@@ -274,17 +270,14 @@ def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
 
     flying = {str(Mode.TRACK), str(Mode.COAST)}
     on = sum(each.cut.mode in flying for each in flights)
+    ended = "" if on == len(flights) else f", {on} of {len(flights)} fly on"
     return [
         name,
         f"{np.mean(errors):.3f}",
         f"{min(errors):.3f} to {max(errors):.3f}",
-        f"{max(each.whole.error_max or np.nan for each in flights):.2f}",
-        f"{a_second('uplink_packets'):.1f}",
-        f"{a_second('downlink_packets'):.1f}",
-        f"{a_second('uplink_bytes'):.0f}",
-        f"{a_second('downlink_bytes'):.0f}",
-        f"{max(each.largest_m for each in flights):.2f}",
-        f"{on} of {len(flights)}",
+        f"{max(each.largest_m for each in flights):.2f}{ended}",
+        f"{a_second('uplink_packets'):.1f}, {a_second('downlink_packets'):.1f}",
+        f"{a_second('uplink_bytes'):.0f}, {a_second('downlink_bytes'):.0f}",
     ]
 
 

@@ -10,7 +10,6 @@ planned for at every step, since planning is a small part of the cost of a step.
 
 from collections import Counter
 from collections.abc import Callable
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from skytether.server.budget import SharedBudget
 from skytether.server.common import splines
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import DOUBTS, Batch, Figures, Scheme, foresight
+from skytether.server.common.scheme import DOUBTS, Batch, Figures, Fleet, Scheme, foresight
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
-from skytether.server.schemes.table import SCHEMES, Entry, Fleet
+from skytether.server.schemes import table
 from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
@@ -51,18 +50,18 @@ def _mission(fleet: Fleet) -> Scheme:
         fleet.desired.number,
         fleet.clock,
     )
-    return MissionPlanner(fleet.scenario, fleet.terms, fleet.block, state)
+    return MissionPlanner(fleet, state)
 
 
-MISSION = Entry(_mission, (missions, splines))
-"""Scheme of vehicles on a mission."""
+MISSION_KERNELS = (missions, splines)
+"""Modules and packages whose kernels are called where vehicles keep apart."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
-    """Names of the modules whose kernels a scenario does not use."""
-    entry = MISSION if scenario.is_mission else SCHEMES[scenario.control.scheme]
-    every = chain.from_iterable(each.kernels for each in (MISSION, *SCHEMES.values()))
-    names = tuple(f"{each.__name__}." for each in {*every}.difference(entry.kernels))
+    """Names of the modules whose kernels are not called where a scenario is flown."""
+    own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
+    every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
+    names = tuple(f"{each.__name__}." for each in every.difference(own))
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
@@ -116,14 +115,25 @@ class Controller:
             self._uplink_max_ns = UNSEEN  # its first input is flown whenever it arrives
         self.desired = Desired(scenario, terms, capacity, block, references)
         """Desired trajectories."""
-        is_mission = scenario.is_mission and references is not None
-        entry = MISSION if is_mission else SCHEMES[scenario.control.scheme]
-        fleet = Fleet(scenario, terms, capacity, block, clock, self.desired, references, stopwatch)
-        self.scheme = entry.make(fleet)
-        """Scheme, which predicts, plans and encodes."""
-        self._terms, self._capacity, self._block = terms, capacity, block
         self.faults: list[str] = []
-        """Tracebacks of errors in plug-ins' policies, one per policy, to be reported."""
+        """Tracebacks of errors in plug-ins, one for the scheme and each policy, to be reported."""
+        fleet = Fleet(
+            scenario,
+            terms,
+            capacity,
+            block,
+            clock,
+            self.desired,
+            references,
+            stopwatch,
+            self.faults.append,
+        )
+        is_mission = scenario.is_mission and references is not None
+        self.scheme = _mission(fleet) if is_mission else table.make(fleet)
+        """Scheme, which predicts, plans and encodes."""
+        self.columns = control.properties.figures
+        """Figures of plans that are recorded."""
+        self._terms, self._capacity, self._block = terms, capacity, block
         self._sent_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest horizon sent to each vehicle, or -1; shape (capacity,)."""
         self._heartbeat_due: Flags = np.zeros(capacity, dtype=np.bool_)

@@ -124,7 +124,6 @@ class Server(Endpoint):
             events=self._events,
         )
         self._ticker = Ticker(
-            terms,
             self.sessions,
             self._clock,
             self.controller,

@@ -25,10 +25,9 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
-from skytether.shared.telemetry.record import FIGURES, Recorder
+from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
@@ -112,7 +111,6 @@ class Ticker:
 
     def __init__(
         self,
-        terms: Terms,
         sessions: Sessions,
         clock: ClockMap,
         controller: Controller,
@@ -133,8 +131,6 @@ class Ticker:
         self._events = events
         self._recorder, self._plans = recorder, plans
         self._records = recorder is not None or plans is not None
-        self._columns = [str(each) for each in FIGURES[terms.scheme]]
-        """Columns of the record for the figures of plans."""
         self.durations = Histogram(TICK_BIN_NS)
         """Duration of each tick, while the stopwatch runs."""
 
@@ -262,7 +258,8 @@ class Ticker:
     def _figures(self, decisions: Decisions) -> dict[str, Array | float]:
         """Figures of plans for the record; NaN if there is none."""
         figures, verdict, missing = decisions.figures, decisions.verdict, float("nan")
-        columns: dict[str, Array | float] = {column: figures[column] for column in self._columns}
+        names = self._controller.columns
+        columns: dict[str, Array | float] = {name: figures[name] for name in names}
         solved = figures["solved"]
         if not solved.all():
             columns = {name: np.where(solved, figure, missing) for name, figure in columns.items()}

@@ -34,6 +34,7 @@ reorders and loses their packets.
   scenarios             what can be flown
   triggers              policies for control.trigger, a sentence each
   reports               policies for vehicle.report, a sentence each
+  schemes               what the server sends, for control.scheme, a sentence each
   references            shapes for reference.shape, a sentence each
   impairments           what a network does to packets, a sentence each
   vehicles              what may fly, for vehicle.kind, a sentence each
@@ -89,6 +90,7 @@ COMMANDS = {
     "scenarios": "skytether.__main__:list_scenarios",
     "triggers": "skytether.cli.names:triggers",
     "reports": "skytether.cli.names:reports",
+    "schemes": "skytether.cli.names:schemes",
     "references": "skytether.cli.names:references",
     "impairments": "skytether.cli.names:impairments",
     "vehicles": "skytether.cli.names:vehicles",

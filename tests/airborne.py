@@ -14,7 +14,7 @@ from skytether.autopilot.faults import parse as parse_fault
 from skytether.autopilot.flavours import FlavourName
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
-from skytether.client.memory import Kept, recall
+from skytether.client.memory import SavedState, recall
 from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
@@ -84,7 +84,6 @@ class Tap(Endpoint):
         self._reader = Codec(9, 9)
 
     def heard(self, since_ns: int = 0) -> list[tuple[int, Message]]:
-        """Messages that came, and when [ns]."""
         return [
             (time_ns, message)
             for time_ns, payload in self._heard
@@ -93,21 +92,17 @@ class Tap(Endpoint):
         ]
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._heard.append((now_ns, datagram.payload))
         if not self.deaf:
             self.inner.receive(datagram, now_ns=now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self.inner.wake(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         return self.inner.next_wake_ns()
 
     def outbox(self) -> list[Datagram]:
-        """See `Endpoint`."""
         sent = self.inner.outbox()
         if self.alter is not None:
             sent = [self._altered(datagram) for datagram in sent]
@@ -126,7 +121,6 @@ class Tap(Endpoint):
         return extra
 
     def events(self) -> Sequence[Event]:
-        """See `Endpoint`."""
         return self.inner.events()
 
 
@@ -188,7 +182,7 @@ class Air:
         server = Server(self.scenario, boot_id=2**60, entropy=bytes)
         self.world.add("server", server, clock=Clock(OFFSET_NS))
 
-    def _client(self, life: int, before: Kept | None) -> Client:
+    def _client(self, life: int, before: SavedState | None) -> Client:
         return Client(
             self.scenario,
             self.flies,
@@ -222,12 +216,10 @@ class Air:
 
     @property
     def flight(self) -> Any:
-        """The scripted flight, as it truly is."""
         return self.autopilot.flight
 
     @property
     def now_s(self) -> float:
-        """Time of the world [s]."""
         return self.world.now_ns / 1e9
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
@@ -240,38 +232,30 @@ class Air:
         return (self.world.now_ns - began_ns) / 1e9
 
     def fly(self, seconds: float = 60.0) -> None:
-        """Let time pass until the pilot flies."""
         self.run(seconds, lambda: bool(self.client._pilot.step))
         assert self.client._pilot.step, [str(event) for _, _, event in self.events]
 
     def end(self, seconds: float = 120.0) -> None:
-        """Let time pass until the client has ended."""
         self.run(seconds, lambda: self.client.finished)
         assert self.client.finished, self.said("client")[-5:]
 
     def rows(self) -> Rows:
-        """Rows that the client recorded."""
         return parse(self._sink.getvalue())
 
     def said(self, host: str = "client") -> list[str]:
-        """Sentences of a host's events."""
         return [str(event) for _, name, event in self.events if name == host]
 
     def of(self, kind: type[Event]) -> list[Any]:
-        """The client's events of a kind."""
         return [event for _, name, event in self.events if name == "client" and type(event) is kind]
 
     def heard(self, kind: str, since_ns: int = 0) -> list[tuple[int, Message]]:
-        """Messages of a kind that came to the autopilot."""
         heard = self.tap.heard(since_ns)
         return [(time_ns, each) for time_ns, each in heard if each.get_type() == kind]
 
     def setpoints(self, since_ns: int = 0) -> list[tuple[int, Message]]:
-        """Setpoints that came to the autopilot, and when [ns]."""
         return self.heard("SET_POSITION_TARGET_LOCAL_NED", since_ns)
 
     def commands(self, command: int) -> list[Message]:
-        """Commands of a number that came to the autopilot."""
         return [each for _, each in self.heard("COMMAND_LONG") if each.command == command]
 
     def figures(self) -> dict[str, Any]:
@@ -288,11 +272,9 @@ class Air:
         return float(np.sqrt(np.mean(np.sum(error[times > settle_s] ** 2, axis=1))))
 
     def json(self) -> list[dict[str, Any]]:
-        """The client's events, as a program reads them."""
         told = [event for _, name, event in self.events if name == "client"]
         return [msgspec.json.decode(msgspec.json.encode(event)) for event in told]
 
 
 def modes(air: Air) -> list[tuple[str, str]]:
-    """Modes of the failsafe and their reasons, as far as they are told."""
     return [(each.after, each.reason) for each in air.of(ModeChanged)]

@@ -70,7 +70,6 @@ class BadLine(Endpoint):
         """Messages of the client's, but heartbeats and questions, and when [ns]."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         from_client = datagram.peer == CLIENT
         receiver = AUTOPILOT if from_client else CLIENT
         if from_client:
@@ -109,7 +108,6 @@ class BadLine(Endpoint):
         heappush(self._held, (now_ns + self._draw(LATE_NS), len(self._held), payload, receiver))
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         while self._held and self._held[0][0] <= now_ns:
             _, _, payload, receiver = heappop(self._held)
             self.send(payload, receiver)
@@ -118,7 +116,6 @@ class BadLine(Endpoint):
             self._talk(now_ns // MILLISECOND_NS)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         if not self.is_bad:
             return None
         return min([self._others_ns, *(each[0] for each in self._held[:1])])
@@ -238,11 +235,9 @@ class OverLine(Air):
         return [(each.mode, each.armed) for each in self.of(AutopilotMode)]
 
     def sent(self, command: int) -> list[int]:
-        """Times at which the client sent a command [ns]."""
         return [t for t, each in self.line.sent if getattr(each, "command", None) == command]
 
     def setpoints_from_client(self, since_ns: int) -> int:
-        """Number of setpoints that the client has sent."""
         return sum(t >= since_ns and not hasattr(each, "command") for t, each in self.line.sent)
 
 
@@ -253,8 +248,6 @@ def is_in_order(part: list[Any], whole: list[Any]) -> bool:
 
 
 class Figures(NamedTuple):
-    """Figures of a flight."""
-
     flavour: FlavourName
     seed: int
     rmse_m: float
@@ -336,7 +329,6 @@ def main() -> None:
 
 
 def compared(flavour: FlavourName, seed: int) -> str:
-    """Line about a flight, beside that over a good line."""
     bad, good = fly(flavour, seed), fly(flavour, seed, is_bad=False)
     named = ", ".join(f"{name} {value:.4g}" for name, value in list(bad._asdict().items())[2:])
     return f"{flavour} {seed}: {named}; {bad.rmse_m / good.rmse_m:.2f} times that of a good line"

@@ -36,7 +36,6 @@ SHOWN_S = 25.0
 
 @contextmanager
 def chromium() -> "Iterator[Browser]":
-    """Run Chromium."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -71,7 +70,6 @@ def served(*arguments: str) -> Iterator[str]:
 
 @contextmanager
 def opened(browser: "Browser", address: str, size: str = "wide") -> "Iterator[Page]":
-    """Open a page in a window of a size."""
     width, height = SIZES[size]
     page = browser.new_page(viewport={"width": width, "height": height})
     page.goto(address)
@@ -80,11 +78,6 @@ def opened(browser: "Browser", address: str, size: str = "wide") -> "Iterator[Pa
 
 
 def until(true: Callable[[], object], what: str) -> None:
-    """Wait until a condition holds.
-
-    Raises:
-        TimeoutError: the condition did not hold in time.
-    """
     ends_s = time.monotonic() + PATIENCE_S
     while not true():
         if time.monotonic() > ends_s:
@@ -93,7 +86,6 @@ def until(true: Callable[[], object], what: str) -> None:
 
 
 def status(page: "Page", place: int = 0) -> str:
-    """Status text of a flight; empty before any."""
     words = page.locator(".skytether-status")
     return words.nth(place).inner_text() if words.count() > place else ""
 
@@ -146,7 +138,6 @@ def _flown_long_enough(page: "Page") -> bool:
 
 
 def pictures(browser: "Browser", address: str, folder: Path) -> None:
-    """Take pictures of a flight's page, in each size, dark and light."""
     for size in SIZES:
         with opened(browser, address, size) as page:
             until(partial(_tracks, page), "it flies a plan")

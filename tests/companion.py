@@ -68,15 +68,12 @@ class Companion:
 
     @property
     def flight(self) -> Any:
-        """True state of the vehicle."""
         return self.autopilot.flight
 
     def send(self, message: Message, *, address: tuple[str, int] = ADDRESS) -> None:
-        """Send a message, and hear what is answered at once."""
         self.deliver(self.codec.encode(message), address=address)
 
     def deliver(self, payload: bytes, *, address: tuple[str, int] = ADDRESS) -> None:
-        """Have some bytes come to the autopilot."""
         self.autopilot.receive(Datagram(payload, address), now_ns=self.now_ns)
         self._hear()
 
@@ -104,7 +101,6 @@ class Companion:
         return (self.now_ns - began_ns) / 1e9
 
     def setpoint(self, mask: int | None = None) -> None:
-        """Send the setpoint once."""
         x, y, z = turned(self.position or (0.0, 0.0, 0.0))
         vx, vy, vz = turned(self.velocity or (0.0, 0.0, 0.0))
         if mask is None:
@@ -124,14 +120,12 @@ class Companion:
         return int(ack.result)
 
     def mode(self, kind: FlightMode) -> int:
-        """Ask for the first mode of a kind; returns the result."""
         number = self.flavour.number(kind)
         if self.flavour.bytewise:
             return self.command(176, 1.0, number >> 16 & 0xFF, number >> 24)
         return self.command(176, 1.0, number)
 
     def arm(self) -> int:
-        """Ask it to arm; returns the result."""
         return self.command(400, 1.0)
 
     def climb(self, altitude: float = 5.0) -> float:
@@ -151,19 +145,15 @@ class Companion:
         return took
 
     def stream(self, rate: float, number: int = LOCAL) -> None:
-        """Ask for a message at a rate [Hz]."""
         assert self.command(511, number, 1e6 / rate) == 0
 
     def last(self, name: str) -> Message:
-        """Newest message of a kind."""
         return next(message for _, message in reversed(self.heard) if message.get_type() == name)
 
     def all(self, name: str) -> list[Message]:
-        """Messages of a kind."""
         return [message for _, message in self.heard if message.get_type() == name]
 
     def texts(self) -> list[str]:
-        """Texts that the autopilot has sent."""
         texts = Texts()
         said = [texts.take(message) for message in self.all("STATUSTEXT")]
         return [text for text in said if text is not None]

@@ -46,7 +46,6 @@ os.environ["XDG_STATE_HOME"] = _STATES
 
 @cache
 def has_ipv6() -> bool:
-    """Whether this machine has an IPv6 loopback."""
     try:
         with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
             sock.bind(("::1", 0))
@@ -62,7 +61,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def _skip_without_ipv6(item: pytest.Item) -> None:
-    """Skip what needs IPv6 where there is none."""
     if item.get_closest_marker("ipv6") and not has_ipv6():
         pytest.skip("this machine has no IPv6")
 
@@ -71,7 +69,6 @@ class Here(Executor):
     """Does everything in this process, which takes no time to begin."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do it at once."""
         future: Future[Any] = Future()
         future.set_result(fn(*args, **kwargs))
         return future

@@ -79,8 +79,6 @@ class Track(NamedTuple):
 
 
 class _Life(NamedTuple):
-    """A life of a client."""
-
     client: Client
     sink: io.BytesIO
     """Rows that it has recorded."""
@@ -192,7 +190,6 @@ class Lives:
         return client
 
     def _plan(self, restart: Restart) -> None:
-        """Schedule a death, and the next life."""
         number, name, world = restart.vehicle, f"client {restart.vehicle}", self.world
         begins_ns = seconds_to_ns(restart.at_s)
         ends_ns = begins_ns + seconds_to_ns(restart.down_s)
@@ -216,12 +213,10 @@ class Lives:
         world.at(ends_ns, live)
 
     def fly(self, until_s: float | None = None) -> None:
-        """Fly the mission to its end, or to a time [s]."""
         limit_s = self.scenario.duration + 10.0 if until_s is None else until_s
         self.world.run(lambda: False, limit_ns=seconds_to_ns(limit_s))
 
     def track(self, number: int) -> Track:
-        """Path of a vehicle."""
         times, places = list[Array](), list[Array]()
         for life in self._lives[number]:
             rows = parse(life.sink.getvalue())

@@ -5,10 +5,13 @@ from typing import Any
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
+from skytether.server.common.desired import Desired
+from skytether.server.common.scheme import Fleet
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import SentMotion
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.motion import Motion, resting
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import swap
@@ -19,7 +22,6 @@ DT_S = 0.05
 
 
 def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: Any) -> Scenario:
-    """Vehicles that swap places."""
     table = reading.to_table(reading.load("swap"))
     table |= {"duration": duration, "seed": keys.pop("seed", 1)}
     table["reference"]["shape"] = f"swap({vehicles})"
@@ -29,7 +31,6 @@ def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: A
 
 
 def observation(step: int, in_force: int, place: tuple[float, float]) -> Observation:
-    """An observation of a vehicle at rest."""
     state = np.array([[place[0], 0.0], [place[1], 0.0]])
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
@@ -38,8 +39,11 @@ def alone() -> MissionPlanner:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
-    state = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    return MissionPlanner(flown, flown.terms(), 2, state)
+    terms, clock = flown.terms(), exact(2)
+    state = MissionState(flown, terms, 2, 2, goals.of, lambda row: row + 1, clock)
+    desired = Desired(flown, terms, 2, 2, goals.of)
+    fleet = Fleet(flown, terms, 2, 2, clock, desired, goals.of, Stopwatch(), print)
+    return MissionPlanner(fleet, state)
 
 
 def exact(vehicles: int) -> ClockMap:

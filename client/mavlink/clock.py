@@ -90,6 +90,11 @@ class BootClock:
         return self._taken >= KNOWN
 
     @property
+    def heard_ns(self) -> int:
+        """Time of the newest answer [ns; the client's clock]; the clock must be known."""
+        return self._answers[-1][0]
+
+    @property
     def wrong_rate(self) -> float | None:
         """Rate of the autopilot's clock relative to ours if it cannot be followed; otherwise
         None.

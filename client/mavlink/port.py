@@ -40,6 +40,7 @@ from skytether.shared.core.aboard import (
     AutopilotMode,
     AutopilotMoved,
     AutopilotRefused,
+    ClockSilent,
     NotTakenOff,
     PositionsDropped,
     SecondCommander,
@@ -58,6 +59,8 @@ HEARTBEAT_NS = SECOND_NS
 """Interval between our heartbeats [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Interval between questions for the autopilot's clock [ns]: before it is known, and after."""
+CLOCK_SILENT_NS = 10 * SECOND_NS
+"""Time without an answer about the clock after which that is reported [ns]."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a silent pilot counts as gone [ns]; then no set-point is sent."""
 SETPOINTS_MAX_HZ = 50.0
@@ -171,9 +174,9 @@ class Port(Endpoint):
         self.now_ns = 0
         """Time of the newest call."""
         self._began_ns: int | None = None
-        self._jumps, self._reported_unusable = 0, False
+        self._jumps, self._reported_unusable, self._reported_silent_clock = 0, False, False
         """Clock jumps up to the newest check of the parameters, and whether it was reported that
-        positions cannot be used."""
+        positions cannot be used, and that the clock is not answered."""
         self._tick_ns = 0
         self._heartbeat_ns = self._clock_ns = 0
         """Times of the next heartbeat, and of the next question for the clock."""
@@ -577,6 +580,7 @@ class Port(Endpoint):
                 self._give_up("not heard", why)
             return
         self._await_clock(now_ns)
+        self._watch_clock(now_ns)
         if now_ns >= self._clock_ns:
             self._clock_ns = now_ns + (CLOCK_NS if self._clock.is_known else CLOCK_BEGIN_NS)
             self._say(dialect.MAVLink_timesync_message(0, self._clock.ask(now_ns=now_ns)))
@@ -618,6 +622,16 @@ class Port(Endpoint):
             self._set_up_ns = now_ns
         elif now_ns - self._set_up_ns > seconds_to_ns(self._keys.patience_s):
             self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
+
+    def _watch_clock(self, now_ns: int) -> None:
+        """Report once that the autopilot, which is heard, no longer answers about its clock."""
+        was_reported, clock = self._reported_silent_clock, self._clock
+        is_heard = self._condition.is_fresh(now_ns=now_ns)
+        silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0
+        self._reported_silent_clock = silent_ns > CLOCK_SILENT_NS
+        if self._reported_silent_clock and not was_reported:
+            silent_s = silent_ns / SECOND_NS
+            self._events.append(ClockSilent(vehicle=self._vehicle, silent_s=silent_s))
 
     def _give_up(self, doing: str, why: str) -> None:
         """Fail because something did not arrive in time."""

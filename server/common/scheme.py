@@ -1,18 +1,26 @@
 """Interface of the schemes of delay compensation, and the predictions that they share.
 
-`server.schemes.table` has the table of all; on a mission `server.missions.mission_planner` is one.
+`shared.scenario.schemes` has the table of all; on a mission `server.missions.mission_planner` is
+one.
 """
 
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.server.common.clock import ClockMap
+from skytether.server.common.desired import Desired
 from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
+from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
@@ -173,6 +181,26 @@ class SentPlans(NamedTuple):
     """Planned inputs [m/s]; shape (m, axes, H)."""
 
 
+class Fleet(NamedTuple):
+    """What a scheme is made for."""
+
+    scenario: Scenario
+    terms: Terms
+    """The same, as far as both ends agree on it."""
+    capacity: int
+    """Largest number of vehicles."""
+    block: int
+    """Largest number of them that are decided on together."""
+    clock: ClockMap
+    desired: Desired
+    """Desired trajectories as far as they are known."""
+    references: Callable[[int], Reference] | None
+    """Where each vehicle of a mission wants to be, by its number."""
+    stopwatch: Stopwatch
+    tell: Callable[[str], None]
+    """Told the traceback of a plug-in's first mistake in flight."""
+
+
 class Scheme(ABC):
     """A scheme of delay compensation: what the server believes of its vehicles, plans and sends.
 
@@ -180,17 +208,22 @@ class Scheme(ABC):
     `remember`, and `encode`.
     """
 
-    observed_step: Indices
-    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
-    counts: Counter[str]
-    """Events that the scheme counted, by name."""
-    figures: Figures
-    """Costs of the newest plans; those of a block come first."""
-    planned: Array
-    """States that the newest plans begin with by the plans before [m, m/s]; shape (block, axes,
-    2)."""
+    properties: ClassVar[SchemeProperties]
+    """What a plug-in's scheme says of itself; ours say it in `shared.scenario.schemes`."""
     solve_ns = -1
     """Time that planning for the last block took [ns], or -1 where nobody measures it."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.terms = fleet.terms
+        self.observed_step: Indices = np.full(fleet.capacity, -1, dtype=np.int64)
+        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+        self.counts: Counter[str] = Counter()
+        """Events that the scheme counted, by name."""
+        self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
+        """Costs of the newest plans; those of a block come first."""
+        self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
+        """States that the newest plans begin with by the plans before [m, m/s]; shape (block,
+        axes, 2)."""
 
     @abstractmethod
     def forget(self, row: int) -> None:
@@ -220,8 +253,9 @@ class Scheme(ABC):
             found: what is foreseen of them; its horizons are filled in.
         """
 
-    @abstractmethod
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+    def remember(  # noqa: B027 - many need not know what is sent
+        self, rows: Indices, step: Indices, found: Foresight, event: Flags
+    ) -> None:
         """Take note of what was computed for the steps from k on, and which of it is sent.
 
         Args:

@@ -5,59 +5,53 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from skytether.server.common.compiled import Axes, axes_of, axis_at, bounded
-from skytether.server.common.scheme import Batch, Head, SentPlans
+from skytether.server.common.scheme import Batch, Head, Scheme, SentPlans
 from skytether.shared.base.kernel import F1, F3, I1, kernel, shared
 from skytether.shared.law import spline
-from skytether.shared.law.model import Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import Trajectory, encode
 
 along = shared(spline.along)
 
 
-def trajectories(
-    batch: Batch, observed_step: Indices, head: Callable[[int], Head]
-) -> Iterator[tuple[int, bytes]]:
-    """Messages with the splines of `Foresight.told`, see `Scheme.encode`.
+class SplineScheme(Scheme):
+    """A scheme that sends the splines of `Foresight.told`."""
 
-    Args:
-        batch, head: see `Scheme.encode`.
-        observed_step: step of the newest observation of each vehicle; shape (capacity,).
-    """
-    sent, told = batch.sent, batch.found.told
-    rows, back = batch.rows[sent], told.back[sent]
-    step = batch.step[sent] - back
-    age = step - observed_step[rows]
-    # A motion that is sent again is older than the newest observation, from which it was not
-    # planned; its age is 0. Others have a negative age if the server's clock was set and the clock
-    # map lags, as a horizon has: it must name an existing observation.
-    age = np.where(back > 0, np.maximum(age, 0), age)
-    columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
-    for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
-        knots = told.knots[i, :, : 2 * n].reshape(-1, n, 2)
-        vehicle, session, sent_us, number, silence = head(row)
-        yield (
-            row,
-            encode(Trajectory(vehicle, session, k, sent_us, o, spacing, knots, number, silence)),
+    properties = SchemeProperties(flown_as="trajectory", feedback=True)
+
+    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+        """See `Scheme`."""
+        sent, told = batch.sent, batch.found.told
+        rows, back = batch.rows[sent], told.back[sent]
+        step = batch.step[sent] - back
+        age = step - self.observed_step[rows]
+        # A motion that is sent again is older than the newest observation, from which it was not
+        # planned; its age is 0. Others have a negative age if the server's clock was set and the
+        # clock map lags, as a horizon has: it must name an existing observation.
+        age = np.where(back > 0, np.maximum(age, 0), age)
+        columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
+        for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
+            knots = told.knots[i, :, : 2 * n].reshape(-1, n, 2)
+            vehicle, session, sent_us, number, silence = head(row)
+            said = (vehicle, session, k, sent_us, o, spacing, knots, number, silence)
+            yield row, encode(Trajectory(*said))
+
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """See `Scheme`."""
+        terms, sent, told = self.terms, batch.sent, batch.found.told
+        step = batch.step[sent] - told.back[sent]
+        knots = told.knots[sent].astype(np.float64)
+        inputs = np.empty((len(sent), terms.axes, terms.horizon))
+        inputs_along(
+            axes_of(terms.model),
+            np.array(terms.u_max),
+            terms.dt_s,
+            knots,
+            told.number[sent],
+            told.spacing[sent],
+            inputs,
         )
-
-
-def sent_splines(batch: Batch, terms: Terms) -> SentPlans:
-    """Splines of `Foresight.told` that are sent, see `Scheme.sent_plans`."""
-    sent, told = batch.sent, batch.found.told
-    step = batch.step[sent] - told.back[sent]
-    knots = told.knots[sent].astype(np.float64)
-    inputs = np.empty((len(sent), terms.axes, terms.horizon))
-    inputs_along(
-        axes_of(terms.model),
-        np.array(terms.u_max),
-        terms.dt_s,
-        knots,
-        told.number[sent],
-        told.spacing[sent],
-        inputs,
-    )
-    return SentPlans(step, step + batch.found.ahead[sent], knots[:, :, :2], inputs)
+        return SentPlans(step, step + batch.found.ahead[sent], knots[:, :, :2], inputs)
 
 
 @kernel

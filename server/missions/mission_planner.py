@@ -26,22 +26,13 @@ vehicle, and `yielding` which vehicle makes way for another.
 """
 
 import math
-from collections.abc import Callable, Iterator
 from functools import partial
 from operator import sub
 
 import numpy as np
 
-from skytether.server.common.scheme import (
-    FIGURES,
-    Batch,
-    Figures,
-    Foresight,
-    Head,
-    Scheme,
-    SentPlans,
-)
-from skytether.server.common.splines import sent_splines, trajectories
+from skytether.server.common.scheme import FIGURES, Fleet, Foresight
+from skytether.server.common.splines import SplineScheme
 from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes
@@ -56,8 +47,6 @@ from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import SPACING, Motion
-from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 
@@ -88,20 +77,19 @@ SILENT = np.zeros((), dtype=FIGURES)
 SILENT["gap"], SILENT["solved"] = 1, True
 
 
-class MissionPlanner(Scheme):
+class MissionPlanner(SplineScheme):
     """Scheme "trajectory" for missions: motions that keep apart.
 
     Args:
-        scenario: scenario with its mission, and the seed of random directions.
-        terms: terms of the flight.
-        block: number of vehicles that are decided on at a time.
+        fleet: what is asked for, as its scenario's `mission` says it, and the seed of directions.
         state: vehicles, and the motions that each may fly.
     """
 
-    def __init__(self, scenario: Scenario, terms: Terms, block: int, state: MissionState) -> None:
-        self.figures: Figures = np.repeat(SILENT, block)
-        self.planned = np.zeros((block, terms.axes, 2))
-        self._state, self._terms = state, terms
+    def __init__(self, fleet: Fleet, state: MissionState) -> None:
+        super().__init__(fleet)
+        scenario, terms = fleet.scenario, fleet.terms
+        self.figures = np.repeat(SILENT, fleet.block)
+        self._state = state
         self.counts = state.counts
         self._inside: list[tuple[int, str]] = []
         self.observed_step = state.observed_step
@@ -203,13 +191,7 @@ class MissionPlanner(Scheme):
             if not vehicle.repeat:
                 self._state.note_sent(int(rows[i]), k, motion)
 
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
-        return trajectories(batch, self.observed_step, head)
-
-    def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
-        return sent_splines(batch, self._terms)
+    # -- zones -------------------------------------------------------------------------------------
 
     def change_zones(self, zones: Zones) -> None:
         """Use other zones from now on, to which `objection` had no objection."""

@@ -12,6 +12,11 @@ iterations. The set may cycle instead (long steps, a tiny R, corners of the refe
 the input with the largest violation changes, one per iteration. If that does not converge either,
 DAQP, a dual active-set method, solves the QP, and its answer is used only if it meets the
 optimality conditions.
+
+One vehicle alone would be served as well by DAQP (24 µs for 10 in a hot loop, the same in a paced
+one). This solver is kept for many: it solves vehicles side by side, and takes 0.9 to 1.7 µs for
+each of 64 and 0.8 to 1.8 µs for each of 1000, where DAQP, called for one after the other, takes
+13 to 17 and 21 to 29 µs (axes 2, H = 50; measured in one run at commit df76e24).
 """
 
 from typing import NamedTuple

@@ -30,9 +30,12 @@ import numpy as np
 
 from skytether.server.common.clock import ClockMap, Seen
 from skytether.server.common.compiled import lasting, laws_of
-from skytether.server.common.scheme import Foresight
+from skytether.server.common.scheme import Fleet, Foresight
+from skytether.server.mpc import exact, hierarchical
+from skytether.server.schemes import horizons, sent_horizons
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance
+from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.loss_scenarios import doubt
 from skytether.server.schemes.observer import decay_of
 from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
@@ -51,6 +54,7 @@ from skytether.server.schemes.sent_horizons import (
 from skytether.shared.base.kernel import I1, kernel
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import (
     DISTURBANCE,
@@ -149,6 +153,16 @@ class Replay:
     def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
         """See `Scheme`; only what was sent counts."""
         remember(self._settings, self._memory, rows, step, found, event)
+
+
+def make(fleet: Fleet) -> HorizonScheme:
+    """The scheme "committed"."""
+    control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
+    return HorizonScheme(Replay(fleet.terms, control, gain, fleet.capacity, fleet.clock), fleet)
+
+
+KERNELS = (sent_horizons, horizons, hierarchical, exact)
+"""See `server.schemes.table`."""
 
 
 @kernel

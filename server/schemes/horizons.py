@@ -10,11 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
-from skytether.server.common.scheme import Batch, Foresight, Head, Scheme, SentPlans
+from skytether.server.common.scheme import Batch, Fleet, Foresight, Head, Scheme, SentPlans
 from skytether.server.mpc.hierarchical import Planner
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import FEEDBACK, Observation, committed_max, encode_horizon
 
 NOTHING = memoryview(b"")
@@ -40,20 +40,57 @@ class Predictor(Protocol):
         """See `Scheme`."""
 
 
-class HorizonScheme(Scheme):
-    """A predictor and a planner.
+class InputScheme(Scheme):
+    """A scheme that sends the inputs of `Foresight.horizons`."""
 
-    Args:
-        predictor: knows where vehicles are, and what they have been told.
-        planner: plans from there.
-        terms: the rule of flight.
-    """
+    properties = SchemeProperties(flown_as="predictive")
 
-    def __init__(self, predictor: Predictor, planner: Planner, terms: Terms) -> None:
-        self.predictor, self.planner, self._terms = predictor, planner, terms
-        self.observed_step, self.counts = predictor.observed_step, predictor.counts
-        self.figures, self.planned = planner.figures, planner.planned
+    def __init__(self, fleet: Fleet) -> None:
+        super().__init__(fleet)
+        terms = fleet.terms
         self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
+
+    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+        """See `Scheme`."""
+        # Bytes of one input on all axes, and of what goes with a horizon.
+        width = 4 * self.terms.axes
+        feedback, told = NOTHING, 0
+        if self.terms.feedback:
+            feedback, told = batch.found.feedback.data.cast("B"), width * FEEDBACK
+        heads, inputs = self._packing.pack(batch, self.observed_step)
+        begin = 0
+        for i, row, k, o, d in heads:
+            end = begin + width * (d + self.terms.planned)
+            vehicle, session, sent_us, number, silence = head(row)
+            extra = feedback[i * told : (i + 1) * told]
+            some, begin = inputs[begin:end], end
+            yield (
+                row,
+                encode_horizon(vehicle, session, k, sent_us, o, some, extra, number, silence),
+            )
+
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """See `Scheme`."""
+        sent, found = batch.sent, batch.found
+        step, ahead = batch.step[sent], found.ahead[sent]
+        # Behind d committed inputs, another d of each vehicle.
+        stages = ahead[:, None] + np.arange(self.terms.planned)
+        inputs = np.take_along_axis(found.horizons[sent], stages[:, None], axis=2)
+        return SentPlans(step, step + ahead, found.start[sent], inputs)
+
+
+class HorizonScheme(InputScheme):
+    """A predictor, which knows where vehicles are and what they have been told, and a planner."""
+
+    def __init__(self, predictor: Predictor, fleet: Fleet) -> None:
+        super().__init__(fleet)
+        control, terms, stopwatch = fleet.scenario.control, fleet.terms, fleet.stopwatch
+        self.predictor = predictor
+        self.planner = Planner(
+            control, terms, fleet.desired, fleet.capacity, fleet.block, stopwatch
+        )
+        self.observed_step, self.counts = predictor.observed_step, predictor.counts
+        self.figures, self.planned = self.planner.figures, self.planner.planned
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
@@ -76,34 +113,6 @@ class HorizonScheme(Scheme):
         """See `Scheme`."""
         self.planner.plan(rows, step, found)
         self.solve_ns = self.planner.solve_ns
-
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
-        # Bytes of one input on all axes, and of what goes with a horizon.
-        width = 4 * self._terms.axes
-        feedback, told = NOTHING, 0
-        if self._terms.feedback:
-            feedback, told = batch.found.feedback.data.cast("B"), width * FEEDBACK
-        heads, inputs = self._packing.pack(batch, self.observed_step)
-        begin = 0
-        for i, row, k, o, d in heads:
-            end = begin + width * (d + self._terms.planned)
-            vehicle, session, sent_us, number, silence = head(row)
-            extra = feedback[i * told : (i + 1) * told]
-            some, begin = inputs[begin:end], end
-            yield (
-                row,
-                encode_horizon(vehicle, session, k, sent_us, o, some, extra, number, silence),
-            )
-
-    def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
-        sent, found = batch.sent, batch.found
-        step, ahead = batch.step[sent], found.ahead[sent]
-        # Behind d committed inputs, another d of each vehicle.
-        stages = ahead[:, None] + np.arange(self._terms.planned)
-        inputs = np.take_along_axis(found.horizons[sent], stages[:, None], axis=2)
-        return SentPlans(step, step + ahead, found.start[sent], inputs)
 
 
 class Packing:

@@ -19,11 +19,15 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.common.compiled import Laws, advance, laws_of
-from skytether.server.common.scheme import Foresight
+from skytether.server.common.scheme import Fleet, Foresight
+from skytether.server.mpc import exact, hierarchical
+from skytether.server.schemes import horizons
+from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.observer import decay_of, learned
 from skytether.shared.base.kernel import F2, F3, I1, S3, kernel, part
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import (
     DISTURBANCE,
@@ -147,6 +151,16 @@ class Estimator:
         Source: eq. (12).
         """
         _write_down(self._memory.inputs, self._memory.last, rows, step, found.horizons)
+
+
+def make(fleet: Fleet) -> HorizonScheme:
+    """The scheme "predictive", and "none"."""
+    control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
+    return HorizonScheme(Estimator(fleet.terms, control, gain, fleet.capacity), fleet)
+
+
+KERNELS = (horizons, hierarchical, exact)
+"""See `server.schemes.table`."""
 
 
 @part

@@ -1,91 +1,49 @@
-"""Table of the schemes of delay compensation, by their names in `control.scheme`."""
+"""Code of the schemes: that of ours is the module of its name in this package.
 
-from collections.abc import Callable
+Such a module has
+
+- `make`, which makes the scheme of a `Fleet`, and
+- KERNELS, modules and packages whose kernels it calls, beside its own and those that all call.
+"""
+
+from importlib import import_module
 from types import ModuleType
-from typing import NamedTuple
 
 from skytether.server.common import splines
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import Scheme
-from skytether.server.mpc import exact, hierarchical
-from skytether.server.mpc.hierarchical import Planner
-from skytether.server.schemes import (
-    committed,
-    horizons,
-    knots,
-    predictive,
-    sent_horizons,
-    trajectory,
-)
-from skytether.server.schemes.committed import Replay
-from skytether.server.schemes.horizons import HorizonScheme, Predictor
-from skytether.server.schemes.predictive import Estimator
-from skytether.server.schemes.trajectory import Guidance
-from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.gain import feedback_gain, regulator
-from skytether.shared.scenario.reference import Reference
-from skytether.shared.scenario.schema import Scenario
+from skytether.server.common.scheme import Fleet, Scheme
+from skytether.server.schemes import horizons
+from skytether.server.schemes.guarded import GuardedScheme
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import schemes
+from skytether.shared.scenario.registry import SCHEMES
 
-
-class Fleet(NamedTuple):
-    """What a scheme is made for."""
-
-    scenario: Scenario
-    terms: Terms
-    """The same, as far as both ends agree on it."""
-    capacity: int
-    """Largest number of vehicles."""
-    block: int
-    """Largest number of them that are decided on together."""
-    clock: ClockMap
-    desired: Desired
-    """Desired trajectories as far as they are known."""
-    references: Callable[[int], Reference] | None
-    """Where each vehicle of a mission wants to be, by its number."""
-    stopwatch: Stopwatch
-
-
-class Entry(NamedTuple):
-    """A scheme."""
-
-    make: Callable[[Fleet], Scheme]
-    kernels: tuple[ModuleType, ...]
-    """Modules and packages whose kernels it calls, beside those that all call."""
-
-
-def _with_planner(fleet: Fleet, predictor: Predictor) -> Scheme:
-    control, terms = fleet.scenario.control, fleet.terms
-    planner = Planner(control, terms, fleet.desired, fleet.capacity, fleet.block, fleet.stopwatch)
-    return HorizonScheme(predictor, planner, terms)
-
-
-def _predictive(fleet: Fleet) -> Scheme:
-    control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
-    return _with_planner(fleet, Estimator(fleet.terms, control, gain, fleet.capacity))
-
-
-def _committed(fleet: Fleet) -> Scheme:
-    control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
-    return _with_planner(fleet, Replay(fleet.terms, control, gain, fleet.capacity, fleet.clock))
-
-
-def _trajectory(fleet: Fleet) -> Scheme:
-    return Guidance(
-        fleet.terms,
-        fleet.scenario.control,
-        regulator(fleet.scenario),
-        fleet.desired,
-        fleet.clock,
-        fleet.capacity,
-        fleet.block,
-    )
-
-
-SCHEMES = {
-    "predictive": Entry(_predictive, (predictive, horizons, hierarchical, exact)),
-    "none": Entry(_predictive, (predictive, horizons, hierarchical, exact)),
-    "committed": Entry(_committed, (committed, sent_horizons, horizons, hierarchical, exact)),
-    "trajectory": Entry(_trajectory, (trajectory, knots, splines, exact)),
+OURS = {
+    name: import_module(f"{__package__}.{name}") for name, entry in SCHEMES.items() if entry.is_ours
 }
+"""Module of each of our schemes."""
+
+
+def make(fleet: Fleet) -> Scheme:
+    """The scheme that a scenario names.
+
+    Raises:
+        ConfigError: a plug-in's scheme cannot be made.
+    """
+    text = fleet.scenario.control.scheme
+    entry, numbers = schemes.entry(text)
+    if entry.is_ours:
+        made: Scheme = OURS[text].make(fleet)
+        return made
+    try:
+        inner = entry.make(fleet, *entry.numbers(numbers, fleet.scenario.control))
+    except Exception as error:
+        wrong = f"a scheme that can be made ({type(error).__name__}: {error})"
+        raise ConfigError(f"control.scheme: got {text!r}, expected {wrong}") from error
+    return GuardedScheme(text, inner, fleet)
+
+
+def kernels(text: str) -> tuple[ModuleType, ...]:
+    """Modules and packages whose kernels a scheme calls, beside those that all call."""
+    if text in OURS:
+        return (OURS[text], *OURS[text].KERNELS)
+    return (splines if schemes.properties(text).splines else horizons,)

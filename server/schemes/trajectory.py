@@ -29,27 +29,19 @@ come into force the vehicle hovers where it was observed.
 This is the scheme "trajectory", and stands in place of its planner.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterator
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.clock import ClockMap, Seen
-from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import (
-    FIGURES,
-    Batch,
-    Figures,
-    Foresight,
-    Head,
-    Scheme,
-    SentPlans,
-    Splines,
-)
-from skytether.server.common.splines import sent_splines, trajectories
+from skytether.server.common import splines
+from skytether.server.common.clock import Seen
+from skytether.server.common.desired import Window
+from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
+from skytether.server.common.splines import SplineScheme
+from skytether.server.mpc import exact
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
+from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
 from skytether.server.schemes.knots import fewest_knots, spline_at
@@ -76,9 +68,8 @@ from skytether.shared.base.kernel import (
     shared,
 )
 from skytether.shared.law import spline
-from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.law.model import Flags, Indices
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
 ROOM = 64
@@ -147,36 +138,20 @@ class Memory(NamedTuple):
     (capacity, ROOM, axes, 2 KNOTS_MAX)."""
 
 
-class Guidance(Scheme):
-    """The `Scheme` "trajectory" for up to `capacity` vehicles, and what is sent to them.
+class Guidance(SplineScheme):
+    """The scheme "trajectory", and what is sent to its vehicles."""
 
-    Args:
-        terms: the rule of flight.
-        control: weights and `delay_bound`.
-        regulator: K and λ of the regulator aboard; shape (axes, 3).
-        desired: what the server knows of the desired trajectories.
-        clock: knows half of the smallest round trip, which is a first guess at the delay bound.
-        block: number of vehicles that are decided on at a time.
-    """
-
-    def __init__(
-        self,
-        terms: Terms,
-        control: ControlConfig,
-        regulator: Array,
-        desired: Desired,
-        clock: ClockMap,
-        capacity: int,
-        block: int,
-    ) -> None:
-        axes = terms.axes
+    def __init__(self, fleet: Fleet) -> None:
+        super().__init__(fleet)
+        terms, control, desired = fleet.terms, fleet.scenario.control, fleet.desired
+        capacity, block, axes = fleet.capacity, fleet.block, terms.axes
+        gain = regulator(fleet.scenario)
         # TINY: weights that ask for no gain on position would divide by 0.
-        lead_s = (1.0 + regulator[:, 1]) / np.maximum(regulator[:, 0], TINY)
+        lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
         # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
         # the spline goes straight on: measured, such plans led up to 12 m away (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
-        self.counts: Counter[str] = Counter()
-        self._desired, self._clock, self._terms = desired, clock, terms
+        self._desired, self._clock = desired, fleet.clock
         self._loop_gain = np.array(terms.gain)
         self._settings = Settings(
             dt_s=terms.dt_s,
@@ -194,12 +169,7 @@ class Guidance(Scheme):
             trajectories=np.zeros((capacity, ROOM), dtype=TRAJECTORY),
             knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
         )
-        self.observed_step: Indices = self._memory.sent.observed
-        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
-        self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """Costs of flying on; those of a block come first."""
-        self.planned = np.zeros((block, axes, 2))
-        """States at k of the trajectories sent last [m, m/s]; shape (block, axes, 2)."""
+        self.observed_step = self._memory.sent.observed
         self._nominal = make_nominal(terms, control, capacity if plans else 0)
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
         """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
@@ -228,7 +198,9 @@ class Guidance(Scheme):
         found.estimate[:n] = found.start[:n] = self._memory.state[rows]
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in `figures` and `planned`, and the velocity of now in place of a plan.
+        """Fill in `figures`, of flying on, and the velocity of now in place of a plan.
+
+        `planned` are the states at k of the trajectories sent last.
 
         Args:
             rows: the vehicles; shape (n,).
@@ -259,13 +231,10 @@ class Guidance(Scheme):
         intended = self._intended
         _remember(self._settings, self._memory, intended, rows, step, event, found.told)
 
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
-        return trajectories(batch, self.observed_step, head)
 
-    def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
-        return sent_splines(batch, self._terms)
+make = Guidance
+KERNELS = (knots, splines, exact)
+"""See `server.schemes.table`."""
 
 
 @inline

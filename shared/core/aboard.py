@@ -142,6 +142,19 @@ class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: positions of its autopilot are dropped: {self.why}"
 
 
+class ClockSilent(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle's autopilot is heard, and does not answer questions for its clock any more."""
+
+    silent_s: float
+    """Time since its newest answer [s]."""
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: its autopilot has not answered TIMESYNC for "
+            f"{self.silent_s:.0f} s: its clock is followed as it ran until then"
+        )
+
+
 class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
     """The autopilot has changed its mode, or was armed or disarmed."""
 
@@ -245,6 +258,7 @@ AboardEvent = (
     | AutopilotElsewhere
     | AutopilotMoved
     | PositionsDropped
+    | ClockSilent
     | AutopilotMode
     | ArmingAwaited
     | OriginAwaited

@@ -519,6 +519,17 @@ class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: {self.what}"
 
 
+class TimeUnknown(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The time of day is to narrow what is known of clocks, and this host does not know it."""
+
+    def __str__(self) -> str:
+        return (
+            'link.time_of_day is "host", and the kernel of this host does not say how wrong its '
+            "clock is: delays alone tell of clocks (chrony needs `rtcsync` in its configuration; "
+            "systemd-timesyncd states no error)"
+        )
+
+
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
     """The fence limits the input of a vehicle."""
 
@@ -646,6 +657,7 @@ Event = (
     | StateDoubted
     | InZone
     | ClockContradicted
+    | TimeUnknown
     | LeftTube
     | StateLeapt
     | FenceHolds

@@ -25,6 +25,16 @@ class Difference(msgspec.Struct, frozen=True):
     """Value at the other end."""
 
 
+FLOWN_AS = ("committed", "predictive", "trajectory", "none")
+"""Ways to fly what a scheme sends, by the names of the schemes that brought them."""
+INDEXED = ("committed", "predictive")
+"""Those in which the vehicle reads a horizon by the step it is at, and not always its first."""
+COMMITTING = ("committed",)
+"""Those in which horizons begin with committed inputs."""
+ALONG_SPLINES = ("trajectory",)
+"""Those in which a spline of the desired trajectory is sent, and no inputs."""
+
+
 class Terms(NamedTuple):
     """Values on which both ends must agree before a flight: plain numbers and texts."""
 
@@ -43,7 +53,7 @@ class Terms(NamedTuple):
     u_max: tuple[float, ...]
     """Bound of the input, eq. (6), on each axis [m/s]."""
     scheme: str
-    """Scheme of delay compensation, as in `control.scheme`."""
+    """How what is sent is flown, one of FLOWN_AS: for a scheme of ours its name."""
     feedback: bool
     """Whether horizons contain feedback."""
     exhausted: str
@@ -92,17 +102,17 @@ class Terms(NamedTuple):
     @property
     def indexed(self) -> bool:
         """Whether the vehicle reads a horizon at the present stage, not always at its first."""
-        return self.scheme not in ("trajectory", "none")
+        return self.scheme in INDEXED
 
     @property
     def commits(self) -> bool:
         """Whether horizons begin with committed inputs."""
-        return self.scheme == "committed"
+        return self.scheme in COMMITTING
 
     @property
     def splines(self) -> bool:
         """Whether splines of the desired trajectory are sent instead of inputs."""
-        return self.scheme == "trajectory"
+        return self.scheme in ALONG_SPLINES
 
     @property
     def planned(self) -> int:

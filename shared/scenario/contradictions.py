@@ -9,7 +9,7 @@ import numpy as np
 
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
-from skytether.shared.scenario import policies
+from skytether.shared.scenario import policies, schemes
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.fence import inner, is_home_inside, margins
 from skytether.shared.scenario.mission import Mission, given, written
@@ -84,10 +84,10 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
             repr(sensor.filter),
             "'kalman' with sensor.velocity_every_s = 'never'",
         )
-    if control.scheme == "trajectory" and not control.feedback:
-        yield "control.feedback", "false", "true with control.scheme = 'trajectory'"
-    if control.scheme == "none" and control.feedback:
-        yield "control.feedback", "true", "false with control.scheme = 'none'"
+    wrong = list(_no_scheme(scenario))
+    yield from wrong
+    if wrong:
+        return
     yield from _no_mission(scenario)
     yield from list(_no_impairments(scenario)) or _too_late(scenario)
     yield from _no_trigger(control)
@@ -111,6 +111,21 @@ def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradictio
     yield from wrong
 
 
+def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
+    """Why there is no such scheme, or it does not fly what is asked for."""
+    control = scenario.control
+    try:
+        said = control.properties
+    except policies.PolicyError as error:
+        yield "control.scheme", repr(error.given), error.expected
+        return
+    if said.feedback not in (None, control.feedback):
+        feedback, needed = (str(each).lower() for each in (control.feedback, said.feedback))
+        yield "control.feedback", feedback, f"{needed} with control.scheme = {control.scheme!r}"
+    if scenario.is_mission and not said.missions:
+        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
+
+
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
     """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
@@ -124,8 +139,6 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
             expected = "none without a mission: reference.shape = 'mission', or a swap"
             yield "mission.goals", repr(scenario.mission.goals), expected
         return
-    if control.scheme != "trajectory":
-        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
     if control.trigger != "expected_gap":
         yield "control.trigger", repr(control.trigger), "'expected_gap' on a mission"
     if vehicle.exhausted != "brake":
@@ -247,9 +260,10 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound
-    if control.scheme == "predictive" and H * dt < delay_s - TINY:
+    said = control.properties
+    if said.indexed and not said.commits and H * dt < delay_s - TINY:
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
-    if control.commits:
+    if said.commits:
         if bound_s != "auto" and bound_s < delay_s - TINY:
             yield "control.delay_bound", bound_s, f"at least {seen}"
         steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))
@@ -259,7 +273,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
         if most < H:
             fit = f"at most {most} beside {steps} committed steps with {axes} axes"
             yield "control.horizon", H, f"{fit}, to fit one datagram"
-    ahead_s = bound_s if control.commits and bound_s != "auto" else up.mean_s
+    ahead_s = bound_s if said.commits and bound_s != "auto" else up.mean_s
     trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
     if link.age_max_s < trip_s - TINY:
         yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
@@ -270,7 +284,7 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.path.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
-    plans = control.scheme in ("committed", "predictive")
+    plans = control.properties.indexed
     if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
         what = "what" if lossy else "half of what"
         lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
@@ -325,9 +339,10 @@ def _no_policies(
         yield key, repr(error.given), error.expected
         return
     for name in (part.name for part in policies.policies(expression)):
-        schemes = table[name].schemes
-        if schemes and control.scheme not in schemes:
-            expected = f"{' or '.join(map(repr, schemes))} with the {key.split('.')[1]} {name}"
+        needs = table[name].needs
+        if needs and needs not in control.properties.computes:
+            able = " or ".join(map(repr, schemes.that_compute(needs)))
+            expected = f"{able or 'one with ' + needs} with the {key.split('.')[1]} {name}"
             yield "control.scheme", repr(control.scheme), expected
 
 

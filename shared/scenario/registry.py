@@ -115,8 +115,8 @@ class Entry:
     parameters: tuple[Parameter, ...]
     about: str
     """First paragraph of its docstring."""
-    schemes: tuple[str, ...] = ()
-    """Schemes (`control.scheme`) with which it can be named; empty for all."""
+    needs: str = ""
+    """What a scheme must compute for it (`schemes.SchemeProperties.computes`); empty: nothing."""
     version: str = ""
     """Digest of a plug-in's file, or name and version of its package; empty for ours."""
 
@@ -198,11 +198,11 @@ class PluginTable(dict[str, Entry]):
 
     @overload
     def __call__(
-        self, make: None = None, *, name: str = "", schemes: tuple[str, ...] = ()
+        self, make: None = None, *, name: str = "", needs: str = ""
     ) -> Callable[[F], F]: ...
 
     def __call__(
-        self, make: F | None = None, *, name: str = "", schemes: tuple[str, ...] = ()
+        self, make: F | None = None, *, name: str = "", needs: str = ""
     ) -> F | Callable[[F], F]:
         """Add an entry: `@table`, or `@table(...)` with a name that is not the function's own.
 
@@ -211,12 +211,12 @@ class PluginTable(dict[str, Entry]):
         """
 
         def add(make: F) -> F:
-            self.add(make, name or make.__name__, schemes)
+            self.add(make, name or make.__name__, needs)
             return make
 
         return add(make) if make else add
 
-    def add(self, make: Callable[..., Any], name: str, schemes: tuple[str, ...] = ()) -> None:
+    def add(self, make: Callable[..., Any], name: str, needs: str = "") -> None:
         """Add an entry; that of the same module with this name gives way to it.
 
         Raises:
@@ -228,10 +228,12 @@ class PluginTable(dict[str, Entry]):
         there = self.get(name)
         if there and there.source != make.__module__:
             raise ConfigError(f"{what}: expected another name, {there.source} has one of this name")
+        if lacking := sorted(getattr(make, "__abstractmethods__", ())):
+            raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
         given = self._class if isinstance(make, type) else self._given
         parameters = _parameters(what, make, given, texts=self._texts)
         about = inspect.cleandoc(make.__doc__ or "").partition("\n\n")[0]
-        self[name] = Entry(make, parameters, " ".join(about.split()), schemes)
+        self[name] = Entry(make, parameters, " ".join(about.split()), needs)
 
 
 def _parameters(
@@ -298,6 +300,9 @@ REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'"
 `shared.scenario.observing`; no plug-in adds to them."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
 """Shapes of `reference.shape`, given the `Scenario`. See `shared.scenario.trajectories`."""
+SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'", given=0, class_=1)
+"""Schemes of `control.scheme`: of ours a function that says its properties, of a plug-in the class
+itself, given a `server.common.scheme.Fleet`. See `shared.scenario.schemes`."""
 VEHICLES = PluginTable(
     "vehicle", "a vehicle such as 'simulated', or 'name(1.5)'", given=2, class_=2
 )
@@ -311,5 +316,5 @@ IMPAIRMENTS = PluginTable(
     texts=True,
 )
 """Impairments of a direction of the network: classes. See `shared.scenario.air`."""
-TABLES = (TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
+TABLES = (SCHEMES, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """All tables that plug-ins add to."""

@@ -25,7 +25,7 @@ from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Clearances, bend_m
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario import policies, zones
+from skytether.shared.scenario import policies, schemes, zones
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.mission import Mission
@@ -44,6 +44,7 @@ from skytether.shared.scenario.owners import (
     Term,
 )
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, VEHICLES, Entry
+from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
@@ -104,10 +105,9 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
-    scheme: Term[Literal["committed", "predictive", "trajectory", "none"]] = "trajectory"
-    """Delay compensation: the desired trajectory, which the server sends as a spline and the
-    vehicle follows by itself, with the regulator that the weights in its own scenario ask for;
-    plans of inputs, committed ones first; the paper's, eq. (11) and (13); or none."""
+    scheme: Term[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "trajectory"
+    """Delay compensation, see `skytether schemes`. With `trajectory` the vehicle follows what is
+    sent by itself, with the regulator that the weights in its own scenario ask for."""
     feedback: Term[bool] = True
     """Whether a horizon carries the state that it starts from and a feedback gain, with which the
     vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
@@ -154,9 +154,13 @@ class ControlConfig(Section, frozen=True):
     """Whether R weighs u - v_ref instead of u, so that R does not ask for standing still."""
 
     @property
-    def commits(self) -> bool:
-        """Whether horizons begin with committed inputs."""
-        return self.scheme == "committed"
+    def properties(self) -> SchemeProperties:
+        """What the scheme says of itself.
+
+        Raises:
+            PolicyError: there is none such.
+        """
+        return schemes.properties(self.scheme)
 
 
 MISSIONS = ("swap", "sphere", "mission")
@@ -603,7 +607,7 @@ class Scenario(Section, frozen=True):
             gain=tuple(self.model_gain.tolist()),
             dead_time_s=tuple(self._per_axis(self.model.dead_time_s).tolist()),
             u_max=tuple(self.u_max.tolist()),
-            scheme=control.scheme,
+            scheme=control.properties.flown_as,
             feedback=control.feedback,
             exhausted=vehicle.exhausted,
             brake_mps2=vehicle.brake_mps2,
@@ -680,7 +684,8 @@ class Scenario(Section, frozen=True):
         return found.to_the_sky() if self.lands else found
 
     def entries(self) -> Iterator[Entry]:
-        """Policies and shape that the scenario names."""
+        """Scheme, policies and shape that the scenario names."""
+        yield schemes.entry(self.control.scheme)[0]
         for policy in policies.policies(policies.parse(self.control.trigger)):
             yield TRIGGERS[policy.name]
         yield REFERENCES[policies.shape(self.reference.shape, REFERENCES).name]

@@ -23,6 +23,7 @@ from skytether.shared.law.model import Array, Flags, Indices, Model
 from skytether.shared.scenario.policies import PERIOD_MAX, Combination, Expression, parse
 from skytether.shared.scenario.registry import TRIGGERS, DefaultKey
 from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.schemes import HELD, that_compute
 
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a class like `Trigger`."""
@@ -90,12 +91,11 @@ class Situation(NamedTuple):
         (n, axes, H).
 
         Raises:
-            ValueError: the scheme is not "committed", and they are not known.
+            ValueError: the scheme does not know them.
         """
         if self.known.held is None:
-            raise ValueError(
-                "held: expected control.scheme = 'committed', the only scheme that knows it"
-            )
+            able = " or ".join(map(repr, that_compute(HELD)))
+            raise ValueError(f"held: expected control.scheme = {able}")
         return self.known.held[: len(self.rows)].copy()
 
     @property
@@ -289,7 +289,7 @@ class Periodic(Trigger):
         self._sent_step[rows] = figures["step"]
 
 
-@trigger(name="state_gap", schemes=("committed", "predictive", "none"))
+@trigger(name="state_gap", needs="state_gap")
 class StateGap(Trigger):
     """Sends where the estimate is off the plan by more than eq. (16) allows, V(k) > S(k).
 
@@ -331,7 +331,7 @@ class StateGap(Trigger):
         self._event_step[rows], self._event_gap[rows] = figures["step"], figures["state_gap"]
 
 
-@trigger(schemes=("committed", "trajectory"))
+@trigger(needs="cost_gap")
 def cost_gap(
     situation: Situation, c: Annotated[float, Meta(ge=0), DefaultKey("cost_gap")]
 ) -> Verdict:
@@ -339,7 +339,7 @@ def cost_gap(
     return above(situation, Compared.COST_GAP, c)
 
 
-@trigger(name="expected_gap", schemes=("committed", "trajectory"))
+@trigger(name="expected_gap", needs="expected_gap")
 class ExpectedGap(Trigger):
     """Sends where flying on is expected to cost more than c, as packets in flight may be lost."""
 
@@ -358,7 +358,7 @@ class ExpectedGap(Trigger):
         return above(situation, Compared.EXPECTED_GAP, self._most)
 
 
-@trigger(schemes=("committed", "trajectory"))
+@trigger(needs="deviation_m")
 def deviation(
     situation: Situation, metres: Annotated[float, Meta(ge=0), DefaultKey("deviation_m")]
 ) -> Verdict:
@@ -383,7 +383,7 @@ class Silence(Periodic):
         steps = int(
             seconds / control.dt + 1e-9
         )  # as much as floating point may take from 0.35 / 0.05
-        if control.scheme != "trajectory":
+        if not control.properties.splines:
             steps = min(steps, control.horizon // 2)
         super().__init__(control, capacity, steps)
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 from struct import Struct
-from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.core.events import Event, Failure, RecordIncomplete
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.schemes import properties
 from skytether.shared.scenario.triggers import Compared
 
 Rows = NDArray[np.void]
@@ -130,22 +130,6 @@ def client_columns(axes: int) -> np.dtype[np.void]:
     )
 
 
-FIGURES: Mapping[str, tuple[Compared, ...]] = MappingProxyType(
-    {
-        "committed": (
-            Compared.STATE_GAP,
-            Compared.COST_GAP,
-            Compared.EXPECTED_GAP,
-            Compared.DEVIATION_M,
-        ),
-        "predictive": (Compared.STATE_GAP,),
-        "none": (Compared.STATE_GAP,),
-        "trajectory": (Compared.COST_GAP, Compared.EXPECTED_GAP, Compared.DEVIATION_M),
-    }
-)
-"""Figures of plans computed by each scheme."""
-
-
 def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
@@ -168,7 +152,7 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("observed_step", "<i8"),  # of the observation behind x̂
             # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without
             # a plan, or without a trigger that asks for expected_gap
-            *((str(figure), "<f8") for figure in FIGURES[scheme]),
+            *((figure, "<f8") for figure in properties(scheme).figures),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, else NaN
             ("threshold", "<f8"),  # what is compared, in its unit; 0 where nothing is
             ("compared", "<u1"),  # figure that it is compared with, a `Compared`

@@ -16,7 +16,7 @@ from skytether.autopilot.faults import Script, ScriptedFault
 from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
 from skytether.autopilot.flight import TICK_NS, PilotedVehicle, Result
 from skytether.autopilot.px4 import PX4
-from skytether.autopilot.telling import HEARTBEAT, STREAMS, Telling
+from skytether.autopilot.telemetry import HEARTBEAT, STREAMS, Telemetry
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -133,7 +133,7 @@ class Autopilot(Endpoint):
         self.flight = PILOTS[flavour](
             self._flavour, quadrotor, ready_s, stream(scenario.seed, "estimate")
         )
-        self._telling = Telling(self.flight)
+        self._telemetry = Telemetry(self.flight)
         self.script = Script(faults)
         """Scripted faults."""
         self._recorder = recorder
@@ -257,7 +257,7 @@ class Autopilot(Endpoint):
     def _tell(self, peer: Peer, number: int) -> bool:
         """Send a peer a message of the vehicle's state; returns whether that message exists."""
         make = STREAMS.get(number)
-        message = make(self._telling) if make else None
+        message = make(self._telemetry) if make else None
         if message is not None:
             self._send(peer, message)
         return make is not None
@@ -279,7 +279,7 @@ class Autopilot(Endpoint):
             return
         names = list(self.flight.parameters)
         for name in names[peer.listed : peer.listed + LISTED_EACH_TICK]:
-            self._send(peer, self._telling.parameter(name))
+            self._send(peer, self._telemetry.parameter(name))
         peer.listed += LISTED_EACH_TICK
         if peer.listed >= len(names):
             peer.listed = None
@@ -303,7 +303,7 @@ class Autopilot(Endpoint):
         if 0 <= index < len(names):
             name = names[index]
         if name in self.flight.parameters:
-            self._send(peer, self._telling.parameter(name))
+            self._send(peer, self._telemetry.parameter(name))
 
     def _on_parameter_list(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         peer.listed = 0
@@ -317,7 +317,7 @@ class Autopilot(Endpoint):
         if value is not None:
             self.flight.set(name, round(value) if isinstance(before, int) else float(value))
         for each in self._peers.values():
-            self._send(each, self._telling.parameter(name))
+            self._send(each, self._telemetry.parameter(name))
 
     def _on_mode(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         self._acknowledge(

@@ -21,7 +21,7 @@ DRIFT: Vector = (3.5, 0.0, 0.0)
 COMMANDED: Vector = (3.0, 0.0, 0.0)
 """Velocity that a second commander sends with the fault `commander` [m/s]."""
 COMMANDED_NS = 20 * MILLISECOND_NS
-"""Time between two of his set-points [ns]."""
+"""Time between two set-points of a second commander [ns]."""
 LEAP: Vector = (-12.0, 0.0, 0.0)
 """Displacement of the reported position with the fault `leap` [m]."""
 LOW_CHARGE = 0.05

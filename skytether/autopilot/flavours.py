@@ -57,7 +57,7 @@ class SimulatedFlavour:
     """Time from the take-off command until it climbs [s]."""
     wander_mps: float
     """Standard deviation of the error of its velocity estimate, along each axis [m/s]. The true
-    velocity is off by this error from the one that it controls."""
+    velocity differs by this error from the one that the loops control."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]

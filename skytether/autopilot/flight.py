@@ -127,7 +127,7 @@ class PilotedVehicle(ABC):
         self.estimates = True
         """Whether its position estimate is valid, once it is ready."""
         self.drift: Vector = REST
-        """True velocity minus the one it estimates, as where accelerometers have failed [m/s]."""
+        """True velocity minus the estimated one, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
         """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST
@@ -470,12 +470,12 @@ class PilotedVehicle(ABC):
         return x, y, z
 
     def velocity(self) -> Vector:
-        """Velocity, as it estimates it [m/s]."""
+        """Estimated velocity [m/s]."""
         x, y, z = (self.quadrotor.velocity() - self.drift - self._wander).tolist()
         return x, y, z
 
     def estimate(self) -> Vector:
-        """Position, as it estimates it [m]."""
+        """Estimated position [m]."""
         lag = WANDER_TIME_S * self._wander
         x, y, z = (self.quadrotor.position() + self.displaced - lag).tolist()
         return x, y, z

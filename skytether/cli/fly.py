@@ -38,7 +38,7 @@ from skytether.view.browser.access import HOST_PORT
 
 UNSEEN = Fault, ReferenceTooFast
 """Events that are printed after a flight in virtual time as well."""
-TOLD = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
+PRINTED = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
 """Events that are printed during the flight."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open [s]."""
@@ -258,5 +258,5 @@ def _missing(scenario: Scenario, flown: Record) -> str | None:
 def _tell(event: Event) -> None:
     """Print events of the link and of the record above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
-    if isinstance(event, TOLD) and not begins:
+    if isinstance(event, PRINTED) and not begins:
         page_process.say(event)

@@ -6,6 +6,7 @@ from functools import partial
 
 from skytether.client.vehicles import vehicle
 from skytether.shared.scenario import registry
+from skytether.shared.scenario.schemes import scheme
 from skytether.shell import command, options
 
 
@@ -30,6 +31,7 @@ triggers = partial(
 reports = partial(
     names, "reports", registry.REPORTS, "List what vehicle.report is made of, a sentence each."
 )
+schemes = partial(names, "schemes", scheme, "List what control.scheme may be, a sentence each.")
 references = partial(
     names, "references", registry.REFERENCES, "List what reference.shape may be, a sentence each."
 )

@@ -87,6 +87,6 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
 
 def say(line: object) -> None:
     """Print lines on stderr, whether or not anybody can read them."""
-    # The terminal may be gone: this is no reason to end the flight.
+    # The flight goes on without a terminal.
     with contextlib.suppress(OSError):
         print("\n".join(map(printable, str(line).splitlines())), file=sys.stderr)

@@ -13,7 +13,7 @@ import msgspec
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.probe.listener import Listener
-from skytether.probe.outcome import ProbeOutcome, WayTold, outcome, rows, trace
+from skytether.probe.outcome import DirectionFigures, ProbeOutcome, outcome, rows, trace
 from skytether.probe.prober import BYTES_MIN, PROBES_MAX, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate
@@ -280,7 +280,7 @@ def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
     print(f"skytether fly demo --virtual {' '.join(traces)}")
 
 
-def _figures(way: WayTold) -> dict[str, str]:
+def _figures(way: DirectionFigures) -> dict[str, str]:
     """Figures of a direction, formatted for printing."""
     found = {
         "packets sent, arrived": f"{way.sent}, {way.came}",
@@ -304,7 +304,7 @@ def _figures(way: WayTold) -> dict[str, str]:
     return found
 
 
-def _models(ways: dict[str, WayTold]) -> "Table":
+def _models(ways: dict[str, DirectionFigures]) -> "Table":
     """Best models of both directions, each with its distance from the best in BIC."""
     from rich.table import Table
     from rich.text import Text
@@ -320,7 +320,7 @@ def _models(ways: dict[str, WayTold]) -> "Table":
     return table
 
 
-def _table(ways: dict[str, WayTold]) -> "Table":
+def _table(ways: dict[str, DirectionFigures]) -> "Table":
     """Table of both directions' figures, side by side."""
     from rich.table import Table
     from rich.text import Text

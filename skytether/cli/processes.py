@@ -66,7 +66,7 @@ LINES_MAX = 20
 
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
-"""Events of a flight that goes on, but with a loss that is reported at the end."""
+"""Events after which a flight goes on, and which its command reports at the end."""
 
 
 @dataclass(slots=True)

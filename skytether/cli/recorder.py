@@ -225,7 +225,7 @@ class Live:
             self._write(Recording.flush)
 
     def _write(self, action: Callable[[Recording], None]) -> None:
-        """Call a method of the recording, unless its file has failed before."""
+        """Call a method of the recording, unless its file has failed already."""
         with self._changed:
             if self._recording is None:
                 return

@@ -132,8 +132,6 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
 together decide what is sent."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 """Keys of the schemes that have a disturbance observer."""
-OBSERVE = ("committed", "predictive")
-"""Schemes that have a disturbance observer."""
 MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
 """Figures of a point that are averaged over the seeds."""
 HERE = "here"
@@ -176,9 +174,9 @@ class Rmse:
         searched for.
         """
         control, table = self.scenario.control, plain(self.scenario)
-        observer = OBSERVER_KEYS if control.scheme in OBSERVE else ()
+        observer = OBSERVER_KEYS if control.properties.observes else ()
         weights: Sequence[Free] = WEIGHTS
-        if control.scheme == "trajectory":
+        if control.properties.splines:
             ahead = self.scenario.reference.preview != "none"
             weights = (*REGULATOR, *SPLINE_KEYS) if ahead else REGULATOR
         keys = [*weights, *trigger_keys(control.trigger), *observer]

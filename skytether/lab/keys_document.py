@@ -19,16 +19,15 @@ from skytether.shared.scenario.schema import Scenario, Section
 HEAD = """# Keys of a scenario
 
 Every key that a scenario's file may have; each is also a flag of every command that flies. This
-page is for looking up, and made from `shared/scenario/schema.py` by `make keys`.
+page is for looking up; `make keys` makes it from `shared/scenario/schema.py`.
 
+- **Values** are written as in TOML, with the unit in brackets; bounds of a list hold for each of
+  its numbers.
 - The **owner** of a key is the process that uses its value. A key of *both ends* is a
-  [term](protocol.md#terms): where the ends differ in it, there is no flight. Keys with another
-  owner may differ. With *each end*, both use a value of their own. Keys of *virtual time* are not
-  used over UDP.
-- Keys with "yes" under **in flight** may be
-  [changed in flight](operating.md#change-keys-in-flight); position and velocity of a point
-  only where `reference.shape = "live"`.
-- **Values** are written as in TOML; *list of numbers, 0 to 1* bounds each number.
+  [term](protocol.md#terms): if the ends differ in it, there is no flight. Other keys may differ;
+  with *each end*, both use a value of their own. Keys of *virtual time* are not used over UDP.
+- A key *in flight* may be [changed in flight](operating.md#change-keys-in-flight); position and
+  velocity of a point only with `reference.shape = "live"`.
 - Meanings use the terms of the [glossary](glossary.md), such as [horizon](glossary.md#horizon),
   [trigger](glossary.md#trigger) and [scheme](glossary.md#scheme).
 """
@@ -52,22 +51,21 @@ def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
             inner = told.get(field.name) or inspect.getdoc(field.type) or ""
             within += _tables(field.type, f"{name}.", inner)
     yield f"## {prefix.rstrip('.') or 'scenario'}\n\n{about}\n"
-    yield "| key | unit | values | default | owner | in flight | meaning |"
-    yield "|---|---|---|---|---|---|---|"
+    yield "| key | values | default | owner | meaning |"
+    yield "|---|---|---|---|---|"
     yield "\n".join(rows) + "\n"
     yield from within
 
 
 def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
-    """Row of a key; its unit has its own column."""
+    """Row of a key; its unit stands behind its values."""
     key = KEYS[name]
+    units = ", ".join(dict.fromkeys(re.findall(r"\[(.*?)\]", sentence)))
     cells = (
         f"`{name}`",
-        ", ".join(dict.fromkeys(re.findall(r"\[(.*?)\]", sentence))),
-        values(field.type),
+        values(field.type) + (f" [{units}]" if units else ""),
         f"`{_toml(field.default)}`",
-        key.owner.value,
-        "yes" if key.in_flight else "",
+        key.owner.value + (", in flight" if key.in_flight else ""),
         re.sub(r" \[.*?\]", "", sentence),
     )
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
@@ -87,14 +85,21 @@ def values(kind: Any) -> str:
             return each.replace("list of", "list of lists of")
         return f"{'list of' if parts[-1] is Ellipsis else len(parts)} numbers, {each}"
     if parts:
-        return " or ".join(map(values, parts))
+        return _either([values(part) for part in parts])
     return {bool: "`true`, `false`", str: "text"}[kind]
 
 
+def _either(kinds: list[str]) -> str:
+    """Allowed values of a union, its words first; a number or a list of such has one range."""
+    if kinds[1] == f"list of numbers, {kinds[0]}":
+        return f"number or {kinds[1]}"
+    return " or ".join(sorted(kinds, key=lambda each: not each.startswith("`")))
+
+
 def _bounded(kind: type, meta: msgspec.Meta) -> str:
-    """Range of a number, or length of a text."""
+    """Range of a number; texts have a bound that nobody comes near."""
     if kind is str:
-        return f"text of at most {meta.max_length} characters"
+        return "text"
     low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
     return f"{'whole number, ' * (kind is int)}{low} to {_number(meta.le)}"
 

@@ -306,7 +306,7 @@ def reordered(way: Way) -> float:
 
 
 def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
-    """Rate of the narrowest part of a path; None where trains show no finite one.
+    """Rate of the bottleneck of a path; None if the packet trains give no finite rate.
 
     Args:
         delay_s: delays of all packets, with any constant offset; those of lost ones are ignored

@@ -1,14 +1,13 @@
-"""Far end of a measurement: it answers each probe with one packet that is no longer.
+"""Far end of a measurement: it answers each probe with one packet, no longer than the probe.
 
 An answer has the listener's time, and lists the arrivals that the prober has not acknowledged, the
-oldest first: so a lost answer loses no arrival. The probes of a train are answered together once
-all have come, so that the answers are a train as well.
+oldest first, so that a lost answer loses no arrival. The probes of a train are answered together
+once all have arrived, so that the answers form a train as well.
 
 A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
 kept from the first PROBE on, which only a sender that receives packets at that address can send.
-Without keys a session is answered at that address alone: whoever knows it may send in any sender's
-name, and nobody is to get packets that he has not asked for. With keys a sender may change its
-address.
+Without keys a session is answered at that address alone: otherwise whoever knows the session could
+direct answers at a third party. With keys a sender may change its address.
 """
 
 import hashlib
@@ -37,15 +36,15 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; then one gives way that had no probe for IDLE_NS, or one of a host
-with more than others have."""
+"""Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of
+the host with the most."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
 """Most arrivals kept until the prober has acknowledged them; older ones are dropped."""
 HOLD_NS = 200 * MILLISECOND_NS
 """Time to wait for the rest of a train after each of its packets [ns]."""
-_TOLD_MAX = PAYLOAD_BYTES_MAX // 12
+_ARRIVALS_MAX = PAYLOAD_BYTES_MAX // 12
 """Most arrivals that fit an answer."""
 
 
@@ -146,10 +145,10 @@ class Listener(Endpoint):
         return session
 
     def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
-        """Session that gives way to a new one of a sender, where there is no room; or None.
+        """Session to end so that a sender can have a new one; None if none may be ended.
 
-        Nobody keeps others out with many sessions: of the host with the most, the oldest gives way
-        to a host with fewer.
+        A host with many sessions cannot keep others out: the oldest session of the host with the
+        most is ended for a host with fewer.
         """
         name, session = next(iter(self._sessions.items()), (None, None))
         if session is None or now_ns - session.heard_ns > IDLE_NS:
@@ -190,7 +189,7 @@ class Listener(Endpoint):
     def _answer(self, session: ProbeSession, name: bytes, held: HeldPacket, now_ns: int) -> None:
         log, line = session.log, held.call.line
         first = session.logged - len(log)
-        arrivals = tuple(islice(log, _TOLD_MAX))
+        arrivals = tuple(islice(log, _ARRIVALS_MAX))
         answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))

@@ -1,4 +1,4 @@
-"""Results of a measurement: figures of each direction, and the text that flies them."""
+"""Results of a measurement: figures of each direction, and the fitted models as scenario text."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ ORDERED_SHARE = 0.01
 is called ordered."""
 
 
-class ModelTold(msgspec.Struct, frozen=True):
+class ModelFigures(msgspec.Struct, frozen=True):
     """Fitted model, for the output."""
 
     text: str
@@ -31,7 +31,7 @@ class ModelTold(msgspec.Struct, frozen=True):
     """Bayesian information criterion: the smaller, the better."""
 
 
-class WayTold(msgspec.Struct, frozen=True, kw_only=True):
+class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of one direction. Delays and losses are those of packets that were sent alone."""
 
     sent: int
@@ -68,15 +68,15 @@ class WayTold(msgspec.Struct, frozen=True, kw_only=True):
     """Number of trains of which enough packets arrived."""
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
-    delay_models: list[ModelTold]
+    delay_models: list[ModelFigures]
     """Models of the delay, without the transmission time at the rate, the best first."""
-    loss_models: list[ModelTold]
+    loss_models: list[ModelFigures]
     """Models of the losses, the best first."""
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
 
 
-class PathTold(msgspec.Struct, frozen=True, kw_only=True):
+class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a path, as written with --json."""
 
     listener: str
@@ -101,9 +101,9 @@ class PathTold(msgspec.Struct, frozen=True, kw_only=True):
     """Sum of both least delays [s]."""
     unreported: int
     """Number of arrivals that the listener dropped before it could report them."""
-    uplink: WayTold
+    uplink: DirectionFigures
     """Direction from the listener to the prober."""
-    downlink: WayTold
+    downlink: DirectionFigures
     """Direction from the prober to the listener."""
 
 
@@ -114,7 +114,7 @@ class ProbeOutcome:
     clocks: Clocks
     delays: Mapping[str, Delays]
     """Packets of the uplink and of the downlink."""
-    told: PathTold
+    told: PathFigures
 
 
 def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutcome:
@@ -132,7 +132,7 @@ def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutc
     delays = {"uplink": up, "downlink": down}
     told = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
     near = measured.downlink.sent_ns
-    path = PathTold(
+    path = PathFigures(
         listener=listener,
         secure=secure,
         seconds=float(near[-1] - near[0]) / SECOND_NS,
@@ -150,7 +150,7 @@ def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutc
     return ProbeOutcome(clocks, delays, path)
 
 
-def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
+def _way_told(way: Way, delays: Delays, size: int) -> DirectionFigures:
     rate = delays.rate
     service_s = (size + HEADER_BYTES) / rate.bytes_per_s if rate else 0.0
     lost = ~delays.came
@@ -167,14 +167,14 @@ def _way_told(way: Way, delays: Delays, size: int) -> WayTold:
     reordered = analysis.reordered(way)
     spacing_s = float(apart_s[0]) if len(apart_s) else np.inf
     lasting_s = correlation_s if correlation_s > TEXT_CORRELATION_MIN * spacing_s else 0.0
-    models = [ModelTold(fit.text(lasting_s), fit.bic) for fit in delay_models]
-    losses = [ModelTold(fit.text(), fit.bic) for fit in loss_models]
+    models = [ModelFigures(fit.text(lasting_s), fit.bic) for fit in delay_models]
+    losses = [ModelFigures(fit.text(), fit.bic) for fit in loss_models]
     parts = [each[0].text for each in (models, losses) if each]
     if rate:
         parts.append(f"rate({rate.bytes_per_s:.4g})")
     if models and not reordered and _would_reorder(delays) > ORDERED_SHARE:
         parts.append("ordered")
-    return WayTold(
+    return DirectionFigures(
         sent=len(lost),
         came=len(delay_s),
         copies=way.copies,
@@ -215,7 +215,7 @@ def trace(delays: Delays) -> str:
     begin = float(delays.time_s[0])
     for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # of two at one instant, which a trace cannot hold, the first
+        if at > last:  # a trace holds one packet for each instant: the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"

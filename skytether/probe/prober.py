@@ -1,4 +1,4 @@
-"""Near end of a measurement: it sends probes on a time grid, and keeps the fate of each.
+"""Near end of a measurement: it sends probes on a time grid, and records what became of each.
 
     HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
     the last answers have had time to come

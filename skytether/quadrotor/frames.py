@@ -87,11 +87,11 @@ CRAZYFLIE = Frame(
     rate_gain=72.0,
     rate_damping=3.0,
 )
-"""Crazyflie 2.0: body, rotors and lag as in rotorpy 3.0 (`crazyflie_params.py`), which has them of
-Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zürich 2015, of
-Bitcraze's measurements, and the lag of Eschmann et al., "Data-Driven System Identification of
-Quadrotors Subject to Motor Delays", 2024. Battery and its current: 250 mAh and a flight of 7
-minutes, as Bitcraze says; the resistance is assumed, of a cell of that size."""
+"""Crazyflie 2.0: body, rotors and lag as in rotorpy 3.0 (`crazyflie_params.py`). Its sources are
+Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zürich 2015,
+measurements by Bitcraze, and for the lag Eschmann et al., "Data-Driven System Identification of
+Quadrotors Subject to Motor Delays", 2024. Battery and current: 250 mAh and 7 minutes of flight, as
+stated by Bitcraze; the resistance is assumed, typical of a cell of that size."""
 
 KG15 = Frame(
     mass_kg=1.5,
@@ -115,10 +115,10 @@ KG15 = Frame(
     rate_gain=60.0,
     rate_damping=1.0,
 )
-"""3DR Iris, 1.5 kg: body, rotors and drag as PX4's model for Gazebo (`models/iris/iris.sdf`) has
-them; its rotors are 0.22 m (front) and 0.20 m (back) to the side, and lag 0.0125 s up and 0.025 s
-down, where these are in between. Battery: the Iris' 5.1 Ah in three cells and its flight of 16 to
-22 minutes; the resistance is assumed, of a battery of that size."""
+"""3DR Iris, 1.5 kg: body, rotors and drag as in PX4's model for Gazebo (`models/iris/iris.sdf`).
+Means are used where that model has two values: rotors 0.22 m (front) and 0.20 m (back) to the side,
+lags of 0.0125 s upwards and 0.025 s downwards. Battery: the Iris' 5.1 Ah in three cells, for 16 to
+22 minutes; the resistance is assumed, typical of a battery of that size."""
 
 SIH = Frame(
     mass_kg=1.0,
@@ -142,9 +142,9 @@ SIH = Frame(
     rate_gain=60.0,
     rate_damping=3.0,
 )
-"""PX4's simulator in hardware: `sih_params.c` of PX4 1.17, with the 1000 rad/s that rotorpy
-gives its rotors. Its drag of 1 N for each m/s is that of the rotors here, in hover. It has no
-battery: this one is a 1.5 kg frame's."""
+"""PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors of 1000 rad/s as in rotorpy.
+Its drag of 1 N for each m/s is applied here as rotor drag in hover. It has no battery: that of the
+1.5 kg frame is used."""
 
 FRAMES = {"crazyflie": CRAZYFLIE, "1.5kg": KG15, "sih": SIH}
 """Frames by name."""

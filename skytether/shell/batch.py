@@ -2,13 +2,12 @@
 
 `recvmmsg` and `sendmmsg` take an array of message headers, which this module lays out once in
 memory that stays where it is. With each datagram `recvmmsg` can hand over the time at which the
-kernel has received it, so one that is read late is not taken for one that came late. A third way,
+kernel received it: a datagram that is read late then does not count as delayed. A third way,
 UDP segmentation offload, sends datagrams of one size to one peer as a single long one, which the
 kernel cuts up as late as it can.
 
-None of them says which datagram failed and why. Where one does not do all of its work, the caller
-repeats the first datagram that is left by the plain call of its socket, which raises the error that
-belongs to it.
+None of these calls says which datagram failed, or why. If one sends or receives fewer than asked,
+the caller tries the first remaining datagram by the socket's plain call, which raises its error.
 """
 
 import contextlib
@@ -176,8 +175,9 @@ class Batch:
 
         Returns:
             payloads, senders, and when each has arrived [ns; CLOCK_MONOTONIC], in the order of
-            arrival; none where nothing came, or an error. Times follow from stamps of the clock
-            that tells the time of day, which may be set meanwhile; where nobody knows it is now.
+            arrival; none if nothing came, or an error did. Times are computed from the kernel's
+            stamps, which show the time of day and so jump when that clock is set; a datagram
+            without a stamp gets the present time.
         """
         rows, size = self._in, self._name_bytes
         rows.stamp_sizes[:] = _WHOLE

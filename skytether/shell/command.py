@@ -101,7 +101,8 @@ def parse(
 ) -> O:
     """Parse a command line; returns its options, laid over the scenario it names.
 
-    Contradictions are looked for once, in the final values: a flag may end one that the file has.
+    The scenario is checked once, in its final values: a flag may repair what contradicts in the
+    file.
 
     Args:
         defaults: options where nothing is given.
@@ -136,7 +137,7 @@ def parse(
 
 
 def _laid(scenario: Scenario, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Table of a scenario with values of keys; a key that there is not is in it as well."""
+    """Table of a scenario with values of keys; unknown keys stay in it, for the check to find."""
     whole = {f"network.{way}": way for way in reading.DIRECTIONS}
     directions = {whole[key]: text for key, text in values.items() if key in whole}
     table = reading.to_table(reading.with_directions(scenario, directions))

@@ -25,7 +25,7 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
         kernels: kernels to compile; those that take longest should come first.
         on_done: called after each kernel, from any thread.
     """
-    kept = deque(each for each in kernels if each.is_kept)
+    kept = deque(each for each in kernels if each.is_stored)
     cores = min(len(os.sched_getaffinity(0)), len(kept))
     if cores > 1:
         with ThreadPoolExecutor(cores) as helpers:
@@ -34,7 +34,7 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
     for each in kernels:
         # What others have compiled is only read now; what they have failed to is compiled.
         each.compile()
-        if cores < 2 or not each.is_kept:
+        if cores < 2 or not each.is_stored:
             on_done()
 
 

@@ -1,4 +1,4 @@
-"""The socket through which keys are changed in flight: a Unix one, which only its owner can use.
+"""Control socket, through which keys are changed in flight: a Unix socket for its owner alone.
 
 A datagram is a request of `shared.core.change`, and its answer goes back to the sender. After each
 request the socket pauses, so a flood of requests delays the sender and not the endpoint. An answer

@@ -1,8 +1,8 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-All of asyncio and signals is in here and in `shell.timer`, all of sockets in `shell.udp` and
-`shell.batch`. The shell knows nothing of control or of the protocol: datagrams and time go in,
-datagrams and events come out.
+asyncio and signals are used here and in `shell.timer` alone, sockets in `shell.udp` and
+`shell.batch` alone. The shell knows nothing of control or of the protocol: datagrams and time go
+in, datagrams and events come out.
 """
 
 import asyncio
@@ -42,10 +42,10 @@ from skytether.shell.udp import (
 BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
 TOGETHER_MIN = 4
-"""Fewest datagrams that are sent by one `sendmmsg`, or that come within the endpoint's patience to
-a socket that stays crowded: fewer take less time one by one."""
+"""Smallest number of datagrams for one `sendmmsg`, and for a socket to stay crowded, within the
+endpoint's patience: fewer than that are faster one by one."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Fewest datagrams within the endpoint's patience that make a socket crowded."""
+"""Smallest number of datagrams, within the endpoint's patience, that makes a socket crowded."""
 BATCHES_MAX = 4
 """Most batches read from one socket before timers and other sockets have their turn."""
 SOCKET = itemgetter(2)
@@ -84,19 +84,19 @@ class Shell:
         bind: address of its socket 0, where port 0 takes a free one, or that socket itself; None
             takes a free port from which the peers can be reached. Other sockets open as the
             endpoint uses them.
-        peers: addresses the endpoint will send to, names or numbers; the endpoint sees each as it
-            is written here, in place of whatever the kernel calls it.
+        peers: addresses the endpoint will send to, names or numbers; the endpoint sees each address
+            as it is written here, and not in the kernel's form.
         stopwatch: measures receiving and sending.
         forms: forms of the datagrams that may come to socket 0; without any, all may.
-        control: heeds changes in flight.
-        feed: tells readers what is recorded and said.
-        line: where socket 1 leads, of an endpoint that talks to hardware beside its peers.
-        is_patient: whether the endpoint is driven although a peer's name cannot be found yet; the
-            name is looked up again until it is.
-        memory: file of what the endpoint keeps for its next life.
+        control: accepts changes of keys in flight.
+        feed: sends rows and events to readers.
+        line: address of a line to hardware, which becomes socket 1.
+        is_patient: whether to start although a peer's name cannot be resolved yet; it is then
+            looked up until it can.
+        memory: file of what the endpoint keeps for the next run of its process.
 
     Raises:
-        AddressError: the address cannot be bound, or a name cannot be found.
+        AddressError: the address cannot be bound, or a name cannot be resolved.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Shell:
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer of every datagram: making room for the longest costs more than to copy."""
+        """Buffer for every datagram: to copy out of it costs less than a new one of full size."""
         self._batches: dict[int, Batch | None] = {}
         """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns
@@ -145,7 +145,7 @@ class Shell:
         self._crowded: dict[int, Batch] = {}
         """Sockets that are read in slices of time, and the arrays that read them."""
         self._heard_ns = 0
-        """Time that the endpoint was shown last: it may not go back."""
+        """Newest time that the endpoint was given [ns]; later ones may not be earlier."""
         self._woken_ns = 0
         """Time of its last wake."""
         self._segments = Segments()
@@ -154,13 +154,13 @@ class Shell:
 
     @property
     def is_local(self) -> bool:
-        """Whether no other machine can reach it, nor be reached."""
+        """Whether its socket and all its peers are on this machine."""
         if self._names.missing:
             return False
         return is_loopback(self.address) and is_loopback(self._elsewhere)
 
     def _add(self, line: Line) -> None:
-        """Let a line be socket 1."""
+        """Use a line as socket 1."""
         if line.kind in ("tcp", "serial"):
             self._stream = ByteStream(line, self._hear_line)
         elif line.kind == "udp":
@@ -225,7 +225,7 @@ class Shell:
         self._loop.add_reader(self._sockets[number], self._hear, number)
 
     def _hear(self, number: int) -> None:
-        """Hear the datagrams that have come to a socket, read one by one, at most BURST_MAX."""
+        """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch = self._stopwatch
@@ -249,7 +249,7 @@ class Shell:
             self._after()
 
     def _count(self, number: int, count: int) -> None:
-        """Count datagrams that came to a socket, which is read in slices where they are many."""
+        """Count datagrams at a socket, and begin to read it in slices of time if they are many."""
         now_ns = time.monotonic_ns()
         came = self._arrivals.setdefault(number, Arrivals(now_ns))
         if now_ns - came.since_ns >= self._patience_ns:
@@ -262,7 +262,7 @@ class Shell:
             self._crowd(number, now_ns)
 
     def _crowd(self, number: int, now_ns: int) -> None:
-        """Read a socket in slices of time from now on, where the system has a call for batches."""
+        """Read a socket in slices of time from now on, if the system has a call for batches."""
         sock = self._sockets[number]
         batch = self._batch(sock)
         if batch is None or self._slices is None:
@@ -273,7 +273,7 @@ class Shell:
         self._slices.set(now_ns + self._patience_ns)
 
     def _hear_slice(self) -> None:
-        """Hear what has come to crowded sockets since the last slice."""
+        """Hand over the datagrams at crowded sockets, at the end of a slice."""
         try:
             self._read_slice()
         finally:
@@ -282,8 +282,8 @@ class Shell:
     def _read_slice(self) -> None:
         """Read what has come to crowded sockets since the last slice, at most BATCHES_MAX each.
 
-        Datagrams that are handled one after the other take half the time of as many that wake the
-        process one by one, with cold caches. The kernel's stamps tell when each has come.
+        Datagrams that are handled in a row take half the time of those that wake the process one by
+        one, with cold caches. The kernel's stamps tell when each arrived.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -307,7 +307,7 @@ class Shell:
             except Exception as error:  # a fault of ours is told, and the next datagram is heard
                 self._loop.call_exception_handler({"message": str(error), "exception": error})
         for number in nothing_came:
-            self._hear(number)  # there may be an error, which the plain call tells apart
+            self._hear(number)  # the plain call shows whether there was an error
         if self._crowded and self._slices:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
@@ -343,7 +343,7 @@ class Shell:
     def _still_here(
         self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
     ) -> tuple[list[bytes], list[Address], list[int]]:
-        """Keep of some datagrams those that came over an interface that is still there."""
+        """Datagrams among these that came over an interface which still exists."""
         kept: list[bytes] = []
         peers: list[Address] = []
         kept_ns: list[int] = []
@@ -367,12 +367,12 @@ class Shell:
             self._after()
 
     def _changed(self) -> None:
-        """Go on after a change, which has shown the endpoint the present time."""
+        """Go on after a change of keys, at which the endpoint was given the present time."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 
     def _after(self) -> None:
-        """Send what the endpoint wants sent, arm its timer, hand on its events and its rows."""
+        """Send the endpoint's datagrams, arm its timer, and hand on its events and rows."""
         endpoint = self.endpoint
         self._stopwatch.start()
         out = endpoint.outbox()
@@ -403,7 +403,7 @@ class Shell:
             for first in range(0, len(same), BURST_MAX):
                 row = same[first : first + BURST_MAX]
                 sent = self._send_together(row) if len(row) > 1 else 0
-                # What was not sent together is sent alone: what failed there fails here, too.
+                # The rest is sent one by one; a datagram that failed in the batch fails here, too.
                 for datagram in row[sent:]:
                     self._send(datagram)
 
@@ -447,7 +447,7 @@ class Shell:
             self._learn(await found)
 
     def _learn(self, found: dict[Address, Address]) -> None:
-        """Use these addresses of peers from now on, and say which could not be found before."""
+        """Use these addresses of peers from now on; report those that were missing before."""
         late = [(host, found[host, port][0]) for host, port in self._names.missing.keys() & found]
         self._names.learn(found)
         if not late:
@@ -456,7 +456,7 @@ class Shell:
             self._on_event(HostFound(host=host, address=number))
         elsewhere = within_reach_of(self._names.numbers())
         if elsewhere != self._elsewhere:
-            # Socket 0 was bound without knowing where to: the peer may be of the other family.
+            # Socket 0 was bound before the peer's address family was known.
             self._elsewhere = elsewhere
             self._drops += kernel_drops(self._sockets[0])
             self._loop.remove_reader(self._sockets[0])

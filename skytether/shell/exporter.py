@@ -5,8 +5,8 @@
 
 The loop hands over its figures once a second; threads render them and answer, and never touch the
 endpoint. A connection has a bounded time, and the oldest is closed where there are too many, so
-that no client keeps others out; at most 50 are accepted per second. Who comes by the name of a
-website is refused: a stranger may have pointed it here.
+that no client keeps others out; at most 50 are accepted per second. A request whose Host header is
+a website's name is refused: its owner may have pointed that name at this machine (DNS rebinding).
 """
 
 import io
@@ -45,7 +45,7 @@ REST_S = 0.02
 FRESH_S = 3.0
 """Age from which figures count as stale, and the process as stuck [s]."""
 BY_NAME = b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
-"""Answer to who comes by the name of a website."""
+"""Answer to a request under the name of a website."""
 
 
 class MetricsError(OSError):
@@ -123,7 +123,7 @@ class _Bounded(io.BufferedReader):
 
 
 class _Handler(WSGIRequestHandler):
-    """Reader of a request; answers to what is no request have the common headers as well."""
+    """Handler of a request; error answers have the common headers, too."""
 
     def setup(self) -> None:
         """Prepare to read."""
@@ -233,7 +233,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         return [body]
 
     def _is_ours(self, host: str | None) -> bool:
-        """Whether a Host header is no name that a stranger can point at this machine."""
+        """Whether a Host header names this machine in a way that no website's owner can imitate."""
         if host is None or "," in host:  # there is none, or there are several
             return host is None
         name = host_name(host)

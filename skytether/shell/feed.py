@@ -1,8 +1,8 @@
-"""The feed's socket: a process sends its readers rows and events, and never waits for them.
+"""The feed's socket: a process sends rows and events to its readers, and never waits for them.
 
-All of it happens in the process's own loop, between two steps, and nothing in it blocks: what a
-reader does not take at once waits for it, up to a bound, and a reader whose bound is full is
-dropped. `shared.telemetry.feed` has the frames; `Subscriber` is the other end.
+It runs in the process's own event loop, between two steps, and never blocks: bytes that a reader
+has not taken are queued, up to a bound, and a reader whose queue is full is dropped.
+`shared.telemetry.feed` defines the frames; `Subscriber` is the other end.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
 """Journal of what an operator has set in flight, beside the control socket of its process.
 
 What is set by `skytether set` or on the page outlives the process: zones, goals, whether a vehicle
-is armed. It is written before it is acknowledged, and read when the process starts again. A journal
-that is damaged, of another scenario or of another day is refused, and the process does not begin: a
+is armed. A value is written before it is acknowledged, and read when the process starts again. If
+the journal is damaged, of another scenario or older than a day, the process refuses to start: a
 server that has lost a zone must not plan.
 """
 
@@ -41,7 +41,7 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True):
     values: dict[str, Any]
     """Values that were set, by key."""
     digest: str = ""
-    """Digest of the others."""
+    """Digest of the other fields."""
 
     def sealed(self) -> "_Entry":
         """Copy with the digest that belongs to it."""
@@ -87,7 +87,7 @@ class Journal:
         return SettingsRecalled(path=str(self._path), values=dict(entry.values))
 
     def running(self, endpoint: Endpoint) -> Running:
-        """Keys that an endpoint flies with, which was made with the scenario of this journal."""
+        """Keys of an endpoint that was made with the scenario of this journal."""
         return Running(endpoint, self.scenario, self.values)
 
     def _check(self, entry: _Entry) -> None:
@@ -138,7 +138,7 @@ class TakenUp(NamedTuple):
     """Journal of what will be set; None without a control socket."""
     scenario: Scenario
     news: list[Event]
-    """News for the operator about what is in force again."""
+    """Events that tell the operator which values are in force again."""
 
 
 def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
@@ -147,7 +147,7 @@ def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> Ta
     Args:
         control: path of the socket; None without one.
         scenario: scenario that the process is started with.
-        new_flight: whether what was set before does not count.
+        new_flight: whether values that were set before are discarded.
 
     Raises:
         CommandError: there is a journal that cannot be followed.

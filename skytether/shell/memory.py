@@ -1,10 +1,10 @@
-"""Memory of a client on the disk of its computer, where the next life of the process finds it.
+"""File in which a client keeps its memory, so that the next run of the process finds it.
 
-    MAGIC | digest of the rest, with the vehicle's key | host, time and identity | what is kept
+    MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
 
-A file is written beside its place by a thread, and renamed: a step never waits for a disk, and a
-file is whole or the one before. It need not outlive the computer: there the motion in it is over.
-One that is damaged, or of another vehicle, key or flight, is refused in words, and not followed.
+A thread writes it beside its place and renames it: no step waits for a disk, and the file is always
+whole. It need not survive a reboot, which outlasts any motion. A file that is damaged, or of
+another vehicle, key or flight, is refused with its reason.
 """
 
 import asyncio
@@ -34,23 +34,23 @@ AGAIN_S = 1.0
 
 
 class MemoryRefused(ValueError):
-    """Error: a file is there that cannot be followed; the message says why."""
+    """Error: there is a file that must not be used; the message says why."""
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """Frame of a file: whose it is, when it was written, and the content."""
+    """Content of a file, with its owner and the time of writing."""
 
     host: str
-    """Run of the host; empty where the system does not tell it."""
+    """Boot id of the host; empty if the system has none."""
     written_ns: int
     """Monotonic clock of the host when it was written [ns]."""
     identity: dict[str, str]
-    """Whose it is."""
+    """Names and values that the reader must have, too: vehicle, flight."""
     content: bytes
 
 
 def folder(given: str) -> Path:
-    """Folder of the memory that a scenario asks for.
+    """Folder for the memory file that a scenario asks for.
 
     Args:
         given: `vehicle.memory`: a path, or "auto" for the state folder of a service of systemd,
@@ -70,8 +70,8 @@ class MemoryFile:
 
     Args:
         path: its path; the folder is made where there is none.
-        identity: whose it is: names and values, all of which must be the same to be followed.
-        secret: key of the vehicle, with which nobody else can make such a file; empty without.
+        identity: names and values that a file must have in order to be used: vehicle, flight.
+        secret: key of the vehicle, so that nobody else can make such a file; empty without keys.
 
     Raises:
         OSError: the folder cannot be made, or another process has this file.
@@ -93,8 +93,8 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._told = ""
-        """Why the newest content could not be written, and what of that was told; empty where it
-        was."""
+        """Why the newest content could not be written, and the reason that was reported last;
+        empty if it was written."""
 
     @property
     def path(self) -> Path:
@@ -102,12 +102,12 @@ class MemoryFile:
         return self._path
 
     def read(self) -> tuple[bytes, int | None] | None:
-        """Content that the life before has kept, and its time; None of nothing.
+        """Content that the previous run has kept, and the time of writing; None without a file.
 
-        The time is of the monotonic clock [ns], and None where that has begun anew since.
+        The time is of the monotonic clock [ns]; None if the host was booted since.
 
         Raises:
-            MemoryRefused: there is a file that cannot be followed.
+            MemoryRefused: there is a file that must not be used.
         """
         try:
             held = files.read(self._path, FILE_BYTES_MAX, private=True)
@@ -137,7 +137,7 @@ class MemoryFile:
         return blake2b(body, key=self._secret, digest_size=DIGEST_BYTES, person=b"memory").digest()
 
     def sealed(self, content: bytes, written_ns: int) -> bytes:
-        """File of this content."""
+        """Bytes of the file for a content."""
         envelope = _Envelope(self._host, written_ns, self._identity, content)
         body = msgspec.msgpack.encode(envelope)
         return MAGIC + self._digest(body) + body
@@ -153,13 +153,13 @@ class MemoryFile:
     # -- in flight -----------------------------------------------------------------------------
 
     def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
-        """Start the thread that writes what an endpoint wants kept, and says when it is done."""
+        """Start the thread that writes the content of an endpoint and acknowledges it."""
         self._endpoint, self._loop = endpoint, loop
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def look(self) -> None:
-        """Take over what the endpoint wants kept; it is written by the thread."""
+        """Fetch new content from the endpoint, for the thread to write."""
         now_ns = time.monotonic_ns()
         content = self._endpoint.keep(now_ns=now_ns)
         if content is not None:
@@ -174,7 +174,7 @@ class MemoryFile:
         return NotKept(reason=failure) if failure and failure != told else None
 
     def close(self) -> None:
-        """Write what is left, for a bounded time, and let another process have the file."""
+        """Write the rest, within a bounded time, and release the file's lock."""
         with self._changed:
             self._ends = True
             self._changed.notify()
@@ -212,7 +212,7 @@ class MemoryFile:
                     self._loop.call_soon_threadsafe(self._tell)
 
     def _tell(self) -> None:
-        """Tell the endpoint that what it handed out last is written, if it still is the last."""
+        """Tell the endpoint that its newest content is written, unless there is newer content."""
         if self._wanted is None:
             self._endpoint.kept()
 

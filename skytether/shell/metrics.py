@@ -1,7 +1,7 @@
 """Tables of metrics: names, units and labels of a process's figures for Prometheus, and its health.
 
 Each figure of an endpoint (`Endpoint.figures`) is either exported by a metric or left out on
-purpose; one that is neither is counted, and a test finds it. Names follow Prometheus: base units,
+purpose; a figure that is neither is counted, and fails a test. Names follow Prometheus: base units,
 `_total` for counters. `shell.exporter` serves the metrics.
 """
 
@@ -22,8 +22,8 @@ class Metric(NamedTuple):
     """Metric, and the figure that it exports."""
 
     figure: str
-    """Path of the figure: the names of its groups and its own, with slashes between them. A name in
-    braces stands for any name, which is the value of a label."""
+    """Path of the figure: names of its groups and its own, with slashes between them. `{label}`
+    matches any name, which becomes the value of that label."""
     name: str
     """Name of the metric, without the prefix."""
     labels: Mapping[str, str]
@@ -98,6 +98,8 @@ counts/unsolved server_unsolved_total
     Steps for which no plan was found.
 counts/horizons_lost server_lost_horizons_total
     Horizons that were sent but did not come into force in time.
+counts/scheme_errors server_scheme_errors_total
+    Steps of vehicles at which a plug-in's scheme failed.
 dropped/{reason} server_dropped_datagrams_total
     Datagrams that came from no vehicle or could not be read, by reason.
 refused/{reason} server_refused_vehicles_total
@@ -239,7 +241,7 @@ LEFT_OUT = {
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:
-    """Metrics made of figures, and the paths of figures that no table has.
+    """Metrics of some figures, and the paths of figures that are in no table.
 
     Args:
         process: server, netem or client; another process has no table, and figures of its own that

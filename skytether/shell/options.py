@@ -1,9 +1,9 @@
 """Options of a command on its command line: a dataclass, and a scenario whose keys are flags.
 
 Flags of keys, as in `--control.trigger always`, are read here and checked with the scenario. tyro
-reads the options, shows the help and reports wrong flags. But importing it takes longer than most
-else until a vehicle's first packet, and keeps the memory: so plain flags, with which processes are
-started, are read here, too, and tyro knows of a scenario's keys in the help alone.
+reads the options, shows the help and reports wrong flags. But to import it takes 0.2 s and 9 MB at
+each start of a process. So simple flags, as commands use to start processes, are read here as well,
+and tyro is given a scenario's keys for the help alone.
 """
 
 import dataclasses
@@ -103,7 +103,7 @@ def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str,
 
 
 def _slipped(flag: str) -> bool:
-    """Whether an unknown flag is much like a key that stands in no section."""
+    """Whether an unknown flag resembles a top-level key of the scenario."""
     import difflib  # for mistakes alone
 
     keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
@@ -153,10 +153,10 @@ def toml_value(text: str) -> Any:
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
-    """Options of a line of plain flags, as tyro would read them; None where only tyro can tell.
+    """Options of a line of simple flags, as tyro would read them; None if tyro has to read it.
 
-    Plain flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at most
-    one positional value. A value is a text, a path, a number or a literal, and begins with no
+    Simple flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at
+    most one positional value. A value is a text, a path, a number or a literal, without a leading
     hyphen.
     """
     fields = dataclasses.fields(default)  # type: ignore[arg-type]
@@ -220,7 +220,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
 
 
 def _tell_tyro(options: type, *, keys: bool) -> None:
-    """Add tyro's annotations that correspond to the options' own; keys of a scenario, or none."""
+    """Add tyro's annotations to options, from their own; with a scenario's keys or without."""
     from tyro import conf
 
     def told(hint: Any) -> Any:
@@ -241,5 +241,5 @@ def _tell_tyro(options: type, *, keys: bool) -> None:
 
 @cache
 def _hints(options: type) -> Mapping[str, Any]:
-    """Annotations of options, as they are written."""
+    """Annotations of options, with their extras."""
     return get_type_hints(options, include_extras=True)

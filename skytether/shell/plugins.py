@@ -22,6 +22,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
     REFERENCES,
+    SCHEMES,
     TABLES,
     TRIGGERS,
     VEHICLES,
@@ -31,6 +32,7 @@ FLAG = "--plugin"
 FILE_BYTES_MAX = 1_000_000
 """Largest size of a plug-in's file [B]."""
 GROUPS = {
+    "skytether.schemes": SCHEMES,
     "skytether.triggers": TRIGGERS,
     "skytether.references": REFERENCES,
     "skytether.vehicles": VEHICLES,
@@ -132,7 +134,8 @@ def _import(plugin: Plugin) -> None:
                 if entry.source == path:
                     table[name], found = replace(entry, version=version), found + 1
         if not found:
-            expected = "@trigger, @reference, @vehicle or @impairment on something, see docs"
+            kinds = "@trigger, @scheme, @reference, @vehicle or @impairment"
+            expected = f"{kinds} on something, see docs"
             raise ConfigError(f"{FLAG}: {path}: adds nothing, expected {expected}")
 
 

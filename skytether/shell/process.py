@@ -1,4 +1,4 @@
-"""One endpoint as a process: its record, its feed and its figures, from start to end."""
+"""One endpoint as a process, with its record, its feed and its counters, from start to end."""
 
 import signal
 import tempfile
@@ -46,7 +46,7 @@ from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
 from skytether.shell.recording import RecordFile
-from skytether.shell.time_of_day import host_time
+from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
 
 # for type checking alone: they are slow to import, and a process that flies does without
@@ -64,21 +64,21 @@ class ProcessOptions(ScenarioOptions):
     """File for the process's part of the record; one that ends in .mcap becomes a recording with
     all that it says, see `skytether join`."""
     json: Path | None = None
-    """File for what was counted, and the CPU time it took."""
+    """File for the process's counters and its CPU time, as JSON."""
     control: Path | None = None
     """Unix socket to make, through which keys change in flight, see `skytether set`."""
     new_flight: bool = False
-    """Begin a new flight: what was set in flight in an earlier run, and lies beside the socket of
-    --control, does not count. A person says so; the command of a service must not."""
+    """Begin a new flight: discard what was set in flight in an earlier run, and is kept beside the
+    socket of --control. For a person to say; never put it into the command of a service."""
     feed: Path | None = None
-    """Unix socket to make, at which whoever looks on reads what is recorded and said."""
+    """Unix socket to make, at which other programs read the rows and events of this process."""
     metrics: str | None = None
     """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
 
 
 @contextmanager
 def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a file; a disk that fails in flight makes the command fail, but not the flight.
+    """Record into a file; if the disk fails in flight, the flight goes on and the command fails.
 
     Raises:
         CommandError: the file cannot be opened; at the end, it does not hold all rows.
@@ -96,7 +96,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; where none can be made, nothing is recorded.
+    """Record into a temporary file; if none can be made, nothing is recorded.
 
     Raises:
         CommandError: at the end, the file does not hold all rows.
@@ -134,7 +134,7 @@ class Process:
     warnings: list[Event]
     """Warnings and news for the operator, said at the start."""
     recording: RecordFile | None
-    """File of its rows, which is waited for at the end."""
+    """File of its rows; the process waits at the end until they are written."""
     feed: Feed | None
     """Feed of its rows and events."""
     recorder: Recorder | None
@@ -172,6 +172,7 @@ class Process:
             CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
         """
         options, feed, journal = self.options, self.feed, self.journal
+        clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
         running = journal.running(endpoint) if journal else Running(endpoint, options.config)
         if feed:
             feed.open(opened(self.name, options.scenario, running, feed))
@@ -220,11 +221,10 @@ class Process:
                 return counted | ({"feed": feed.figures()} if feed else {})
 
             def each_second(*, last: bool = False) -> None:
-                for source in (self.recording, memory):
+                for source in (self.recording, memory, *clocks):
                     if source and (news := source.news()):
                         out.say(news)
                 out.each_second(last=last)
-                _learn_time(endpoint, options)
                 snapshot = figures() if feed or served else {}
                 if feed:
                     feed.count(snapshot)
@@ -304,12 +304,6 @@ def begin(
 def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.void]) -> Recorder:
     recorder.follow(feed.part(part, columns))
     return recorder
-
-
-def _learn_time(endpoint: Endpoint, options: ProcessOptions) -> None:
-    """Tell an endpoint the time of day, where it is asked for and known."""
-    if options.config.link.time_of_day == "host" and (told := host_time()):
-        endpoint.learn_time(told.utc_ns, told.error_ns, now_ns=told.now_ns)
 
 
 @contextmanager

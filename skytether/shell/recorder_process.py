@@ -1,7 +1,7 @@
 """Recording of a single process: another process reads its feed and writes an MCAP file.
 
-The process that flies waits for no disk and imports nothing for it. When it ends, or is killed, the
-recorder's standard input ends, and the recorder ends its file.
+The flying process does not wait for the disk, and imports no MCAP library. When it ends, or is
+killed, the recorder's standard input ends, and the recorder completes its file.
 """
 
 import subprocess
@@ -45,9 +45,7 @@ class RecorderError(Exception):
 
 @contextmanager
 def socket_of(feed: Path | None) -> Iterator[Path]:
-    """Socket of a feed: the path that was asked for, or one in a folder that nobody else can
-    see.
-    """
+    """Socket of a feed: the path that was asked for, else one in a private temporary folder."""
     if feed:
         yield feed
         return

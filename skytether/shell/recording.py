@@ -1,6 +1,4 @@
-"""File of a part of the record, written in a thread: no flight waits for a disk or fails with
-it.
-"""
+"""File of a part of the record, written in a thread: a slow or full disk disturbs no flight."""
 
 import os
 from typing import BinaryIO
@@ -28,9 +26,10 @@ class RecordFile:
     """Recorder and its file; rows that the file does not take are lost and counted.
 
     Args:
-        name: what the operator knows the file by.
-        columns: those of its rows.
-        file: the file, open for reading and writing without a buffer; or why there is none.
+        name: name of the file, for messages.
+        columns: columns of its rows.
+        file: the file, open for reading and writing without a buffer; or the error for which there
+            is none.
     """
 
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:

@@ -62,7 +62,7 @@ def begin() -> None:
 
 @contextlib.contextmanager
 def _mortal() -> Iterator[None]:
-    """Let Ctrl-C end the process at once: code that is being imported may swallow an exception."""
+    """Let Ctrl-C end the process at once: KeyboardInterrupt could be swallowed during an import."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -26,10 +26,10 @@ class ByteStream:
 
     Args:
         line: address of the stream.
-        hear: called with each piece that was read.
+        hear: called with each piece of bytes.
 
     Raises:
-        AddressError: no serial port runs at its rate.
+        AddressError: the system has no serial ports of this rate.
     """
 
     def __init__(self, line: Line, hear: Callable[[bytes], None]) -> None:

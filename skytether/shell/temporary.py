@@ -1,9 +1,8 @@
 """Temporary folders; those that a killed process has left are removed by the next process.
 
-A folder contains a mark, a file that its owner keeps locked while it lives, however it ends. Only a
-folder of this user with an unlocked mark is removed: no other user's, and none that merely has such
-a name. The mark is removed last, so that a removal that was interrupted is finished by the next
-process.
+A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
+folder of this user with an unlocked mark is removed. The mark is removed last, so that the next
+process finishes an interrupted removal.
 """
 
 import contextlib
@@ -34,8 +33,8 @@ def folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _marked(made: Path) -> Iterator[None]:
-    """Create and lock a folder's mark; it gets its name only once locked, so that nobody clears
-    it.
+    """Create and lock a folder's mark; it gets its name once it is locked, so that no other process
+    removes the folder.
     """
     held = made / f"{MARK}.new"
     with held.open("x") as mark:
@@ -59,7 +58,7 @@ def _clear_one(made: Path) -> None:
     """Remove a folder, if it is ours and its owner is dead.
 
     Raises:
-        OSError: the folder is none of these, or its owner lives.
+        OSError: the folder has no mark, or its owner lives.
     """
     if made.lstat().st_uid != os.getuid():
         return

@@ -1,8 +1,9 @@
 """Time of day of this host, to within the error that its kernel tells (`adjtimex`, Linux).
 
-What disciplines the clock sets that error: chrony and ntpd count half of the round trip to their
-source in it, so that no delay of theirs makes it false. systemd-timesyncd sets it to 0 and tells no
-estimate, which is no error at all; such a clock counts as unknown.
+The time daemon sets that error. chrony and ntpd include half of the round trip to their source, so
+no delay of the network makes it false. systemd-timesyncd sets it to 0 and gives no estimate: such a
+clock counts as unknown. So does the clock of a chrony without `rtcsync`, which leaves it marked as
+not synchronised.
 """
 
 import ctypes
@@ -11,13 +12,15 @@ from functools import cache
 from typing import NamedTuple
 
 from skytether.shared.base.units import MICROSECOND_NS
+from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.core.events import TimeUnknown
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
-"""Status bit, and answer of the kernel, of a clock that nothing disciplines."""
+"""Status bit, and answer of the kernel, of a clock that is not synchronised."""
 
 
 class _Timex(ctypes.Structure):
-    """Beginning of the kernel's `struct timex`, with room for the rest of it."""
+    """First fields of the kernel's `struct timex`; the rest of it is padding."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -38,7 +41,7 @@ class HostTime(NamedTuple):
     error_ns: int
     """Largest error of that [ns]."""
     now_ns: int
-    """Time on the clock that only runs, at the same moment [ns]."""
+    """CLOCK_MONOTONIC at the same moment [ns]."""
 
 
 @cache
@@ -48,14 +51,14 @@ def _adjtimex() -> "ctypes._FuncPointer | None":
 
 
 def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
-    """Largest error of the host's clock as the kernel answers [ns]; None where that is unknown."""
+    """Largest error of the host's clock by the kernel's answer [ns]; None if it is unknown."""
     if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
         return None
     return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None
 
 
 def host_time() -> HostTime | None:
-    """Time of day of this host; None where nothing says how wrong it may be."""
+    """Time of day of this host; None if its error is unknown."""
     call, told = _adjtimex(), _Timex()
     if call is None:
         return None
@@ -63,7 +66,25 @@ def host_time() -> HostTime | None:
     error_ns = stated(answer, told.status, told.maxerror, told.esterror)
     if error_ns is None:
         return None
-    # The process may lose its core between two clocks: the one that only runs is read on both
-    # sides, and what has passed is added to the error.
+    # The process may be preempted between two clocks: the monotonic one is read before and after,
+    # and the time between counts as an error.
     before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     return HostTime(utc_ns, error_ns + after_ns - before_ns, after_ns)
+
+
+class TimeTeller:
+    """Tells an endpoint the time of day of this host for as long as that is known."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = endpoint
+        self._is_known = True
+
+    def news(self) -> TimeUnknown | None:
+        """Tell the endpoint the time of day now; event for the operator once it is unknown."""
+        time_of_day, was_known = host_time(), self._is_known
+        self._is_known = time_of_day is not None
+        if time_of_day is None:
+            return TimeUnknown() if was_known else None
+        utc_ns, error_ns, now_ns = time_of_day
+        self._endpoint.learn_time(utc_ns, error_ns, now_ns=now_ns)
+        return None

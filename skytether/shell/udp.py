@@ -1,8 +1,8 @@
-"""Sockets and names, as the shell needs them; all blocking calls about addresses are in here.
+"""UDP sockets, and addresses of peers; all blocking calls about addresses are in this module.
 
-An address of this machine or of a peer is `(host, port)` everywhere else. In here it meets the
-kernel's own: for IPv6 a tuple of four, whose scope (the interface of a link-local address) becomes
-part of the host, as in `fe80::1%eth0`.
+An address is `(host, port)` everywhere else. The kernel's own form for IPv6 has four values; the
+scope among them (the interface of a link-local address) is written into the host, as in
+`fe80::1%eth0`.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ ADDRESSES_MAX = 4096
 again. A flood of HELLOs from ever new ports fills this memory."""
 
 SPARE_FILES = 48
-"""Number of open files that a process may need beside its sockets, with all who look on."""
+"""Number of open files that a process may need beside its sockets: readers of its feed, metrics."""
 
 FIND_S = 2.0
 """Longest time for which the start of a patient process waits for a name's address [s]."""
@@ -60,19 +60,19 @@ def within_reach_of(peers: Iterable[Address]) -> Address:
 
 
 def is_loopback(address: Address) -> bool:
-    """Whether only this machine can be, or reach, an address."""
+    """Whether an address can be reached from this machine alone."""
     return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
 def leads_back(address: Address, bound: Address) -> bool:
-    """Whether what is sent to an address of this machine comes to a socket that is bound; blocks.
+    """Whether datagrams to an address of this machine arrive at a certain socket; blocks.
 
     Args:
-        address: a name or a number, to which is sent.
-        bound: address of the socket, which may be one that stands for all of this machine.
+        address: name or number that datagrams are sent to.
+        bound: address of the socket; a wildcard address is allowed.
 
     Raises:
-        OSError: one of them cannot be found.
+        OSError: an address cannot be resolved.
     """
     (host, port), (bound_host, bound_port) = look_up(address), look_up(bound)
     if port != bound_port or (":" in host) != (":" in bound_host):
@@ -87,7 +87,7 @@ def _is_unspecified(host: str) -> bool:
 
 
 def _is_own(host: str) -> bool:
-    """Whether a numeric address is one of this machine's: a socket can be bound to those alone."""
+    """Whether a numeric address belongs to this machine, that is, a socket can be bound to it."""
     try:
         open_socket((host, 0)).close()
     except AddressError:
@@ -96,7 +96,7 @@ def _is_own(host: str) -> bool:
 
 
 def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
-    """A non-blocking UDP socket with large buffers; one of IPv6 hears IPv6 alone.
+    """Non-blocking UDP socket with large buffers; an IPv6 socket receives IPv6 only.
 
     Args:
         address: a name or a number, of either family.
@@ -176,15 +176,15 @@ def allow_sockets(count: int) -> None:
 
 
 def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
-    """Let the kernel drop datagrams of other forms; elsewhere than on Linux all come through.
+    """Let the kernel drop datagrams of other forms than these; on Linux only.
 
-    What is dropped takes no room in the receive buffer and no time of the process. For what comes
-    through there is more room than usual.
+    A dropped datagram takes no room in the receive buffer and no time of the process. The receive
+    buffer is made larger as well.
 
     Args:
         sock: a UDP socket.
-        forms: those that pass, the most frequent first; one that is shorter than a head before its
-            own is dropped.
+        forms: forms that pass, the most frequent first; a datagram that is shorter than the head of
+            a form before its own is dropped.
     """
     _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, FLOODED_BYTES)
     if sys.platform != "linux":
@@ -210,9 +210,9 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
 
 
 def kernel_drops(sock: socket.socket) -> int:
-    """Number of datagrams that the kernel dropped; 0 where nobody says.
+    """Number of datagrams that the kernel dropped; 0 if the system does not report it.
 
-    Its receive buffer was full, or they were of no form that is admitted.
+    The receive buffer was full, or the datagrams had none of the admitted forms.
     """
     try:
         info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
@@ -222,15 +222,15 @@ def kernel_drops(sock: socket.socket) -> int:
 
 
 class Names:
-    """Numeric addresses of peers, which an endpoint knows as the user has written them.
+    """Numeric addresses of peers, by the names that the user has written.
 
     Args:
         peers: names or numbers.
-        is_patient: whether a name that cannot be found now may be found by `look_up` later. Until
-            then nothing can be sent there.
+        is_patient: whether a name that cannot be resolved now may be resolved by `look_up` later.
+            Until then nothing can be sent there.
 
     Raises:
-        AddressError: one of them cannot be found, and the names are not patient.
+        AddressError: a name cannot be resolved, and `is_patient` is false.
     """
 
     def __init__(self, peers: Iterable[Address], *, is_patient: bool = False) -> None:
@@ -248,7 +248,7 @@ class Names:
                 self.add(peer)
 
     def _add_patiently(self, peer: Address) -> None:
-        """Know another peer by a name that may not be found for now; blocks for FIND_S at most."""
+        """Add a peer whose name need not be resolvable yet; blocks for at most FIND_S."""
         self._names.append(peer)
         self.missing[peer] = "no answer yet"
         found: dict[Address, Address] = {}
@@ -267,10 +267,10 @@ class Names:
         self.learn(dict(found))
 
     def add(self, peer: Address) -> None:
-        """Know another peer from now on; blocks.
+        """Add a peer; blocks.
 
         Raises:
-            AddressError: it cannot be found.
+            AddressError: its name cannot be resolved.
         """
         try:
             self.learn({peer: look_up(peer)})
@@ -281,7 +281,7 @@ class Names:
 
     @property
     def may_change(self) -> bool:
-        """Whether some peers are known by name, whose number may become another."""
+        """Whether some peers were given by name, whose numeric address may change."""
         return bool(self._names)
 
     def numbers(self) -> list[Address]:
@@ -357,7 +357,7 @@ class Names:
         return reached
 
     def look_up(self) -> dict[Address, Address]:
-        """All names looked up anew, without those that cannot be found just now; blocks."""
+        """Numeric addresses of all names that can be resolved now; blocks."""
         found = {}
         for name in self._names:
             with contextlib.suppress(OSError):
@@ -365,7 +365,7 @@ class Names:
         return found
 
     def learn(self, found: dict[Address, Address]) -> None:
-        """Let these numbers stand for these peers from now on."""
+        """Use these numeric addresses for these peers from now on."""
         for peer in found:
             self.missing.pop(peer, None)
         self._numbers |= found
@@ -375,10 +375,10 @@ class Names:
 
 
 def look_up(peer: Address) -> Address:
-    """Numeric address of a name or number, of IPv4 where a name has one of each family; blocks.
+    """Numeric address of a name or number, IPv4 where a name has both; blocks.
 
     Raises:
-        OSError: it cannot be found.
+        OSError: it cannot be resolved.
     """
     found = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
     four = [entry for entry in found if entry[0] == socket.AF_INET]

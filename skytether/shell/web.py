@@ -1,8 +1,8 @@
-"""Rules of what is served over HTTP, the page and the metrics.
+"""Rules for what is served over HTTP: the page and the metrics.
 
-Any website that a browser has open may make it connect to this machine, in an invisible frame or
-under a name of the website's own that it points here (DNS rebinding). So no answer may be shown in
-a frame, and the name under which a browser comes is looked at.
+Any website in a browser on this machine can make that browser connect here: in an invisible frame,
+or by pointing a domain of its own at this machine (DNS rebinding). So no answer may be shown in a
+frame, and the Host header is checked.
 """
 
 import ipaddress
@@ -24,7 +24,7 @@ def host_name(host: str) -> str:
 
 
 def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Address that a name is, if it is a number, in brackets or not, with a scope or not."""
+    """IP address in a host name, with or without brackets and scope; None if it is none."""
     try:
         return ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
@@ -32,5 +32,5 @@ def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_ours(name: str) -> bool:
-    """Whether no stranger can point a name at this machine: a number, or localhost."""
+    """Whether a host is a number or localhost, which no website's owner can point here."""
     return name == "localhost" or numeric(name) is not None

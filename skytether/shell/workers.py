@@ -19,7 +19,7 @@ from skytether.shared.core.endpoint import Address
 from skytether.shell.udp import from_kernel, open_socket
 
 FORK = multiprocessing.get_context("fork")
-"""Start method of workers: imported and compiled code is there at once, and in memory once."""
+"""Start method of workers: fork shares imported and compiled code, in memory and start-up time."""
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 """Signals passed on to every worker, SIGINT as SIGTERM, and each of both only once."""
 

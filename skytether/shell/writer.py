@@ -1,4 +1,4 @@
-"""Background writer: nobody waits for a full pipe, a slow disk or a reader that is gone."""
+"""Background writer: the process never waits for a full pipe, a slow disk or a dead reader."""
 
 import contextlib
 import os
@@ -9,15 +9,15 @@ from typing import IO, Any
 
 
 class Writer:
-    """Writer to a file in a thread of its own; pieces for which there is no room are dropped.
+    """Writer to a file in a thread of its own; pieces beyond its bound are dropped.
 
     The thread starts at once, so a process that forks must create writers in its children. A
-    blocked thread never keeps the process from ending. A killed process loses what gathered in the
-    pause.
+    blocked thread does not keep the process from ending. A killed process loses the pieces of the
+    last pause.
 
     Args:
-        file: unbuffered file to write to; or the error for which there is none.
-        room: most bytes that wait to be written.
+        file: unbuffered file to write to; or the error because of which there is none.
+        room: largest number of bytes that wait to be written.
         together: most bytes of several pieces in one write; a piece is never split.
         pause_s: time for which pieces gather before they are written [s].
     """

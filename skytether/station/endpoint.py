@@ -3,9 +3,9 @@
     heard → streams asked for, clock known → armed, climbed (`client.mavlink.launch`)
           → a set-point at every step of the flight → landed
 
-All messages cross a bad network, so every request is repeated until it is confirmed. While a pilot,
-or the autopilot itself, flies the vehicle, nothing is sent, and the station does not take the
-vehicle back.
+All messages cross a bad network, so every request is repeated until it is confirmed. While a pilot
+or the autopilot itself flies the vehicle, the station sends nothing, and it does not take control
+back afterwards.
 """
 
 from collections import Counter

@@ -14,6 +14,7 @@ import msgspec
 from skytether.shared.scenario import policies, registry
 from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.schemes import properties
 
 Values = Mapping[str, Any]
 """Values by key."""
@@ -206,7 +207,8 @@ def triggers(scheme: str, present: str) -> tuple[str, ...]:
 
     def has(trigger: str) -> bool:
         names = (each.name for each in policies.policies(policies.parse(trigger)))
-        return all(scheme in (registry.TRIGGERS[name].schemes or (scheme,)) for name in names)
+        needs = (registry.TRIGGERS[name].needs for name in names)
+        return all(not each or each in properties(scheme).computes for each in needs)
 
     offered = tuple(each for each in TRIGGERS if has(each))
     return offered if present in offered else (present, *offered)

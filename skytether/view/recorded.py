@@ -1,7 +1,7 @@
-"""Recordings that are read: a flight's frames, and the rows in them to the last bit.
+"""Reader of recordings: a flight's frames, and the rows in them, bit for bit.
 
-A file is not trusted: `view.container` bounds what reading it takes, and whatever no flight of its
-scenario can have is refused.
+A file is not trusted: `view.container` bounds time and memory, and frames that no flight of the
+scenario can have are refused.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -82,7 +82,7 @@ def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> 
 
 
 def read(path: Path) -> Recorded:
-    """Recording in a file; of one without an end, whose writer was killed, all that is whole.
+    """Recording in a file; if its writer was killed, everything up to the last whole record.
 
     Raises:
         OSError: the file cannot be read.
@@ -151,7 +151,7 @@ class _Frames:
         self._frames.append((process, frame))
 
     def together(self) -> tuple[list[Timed], dict[str, Table], dict[str, Indices]]:
-        """All frames in order of time; rows of each part, and their times.
+        """All frames in order of time; the rows of each part, and their times.
 
         Raises:
             ValueError: no flight takes so long, or has such rows.

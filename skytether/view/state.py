@@ -51,7 +51,7 @@ PLANS_MAX = 8
 SAID_MAX = 50
 """Most events that are kept."""
 LED = "reference.points_m"
-"""Key that a dragged target changes many times a second; such changes are not logged."""
+"""Key that changes many times a second while a target is dragged; these changes are not logged."""
 LOSS_S = 10.0
 """Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
@@ -431,7 +431,7 @@ class State:
             self.name = opened.name
             self.scenario = scenario
             control, axes = self.scenario.control, self.scenario.model.axes
-            follows = control.scheme == "trajectory"
+            follows = control.properties.splines
             self.network = Network(TRAJECTORY_BYTES if follows else 4 * axes * control.horizon)
         columns: dict[str, np.dtype[np.void]] = {}
         for part, described in opened.parts.items():
@@ -522,9 +522,8 @@ class State:
         return said if isinstance(said, str) else ""
 
     def clock(self, number: int) -> tuple[float, float]:
-        """Uncertainty of the clock of a vehicle of a mission: half of the time that it may
-        lie apart [ms], and the distance by which the vehicle may be elsewhere for that [m]; NaN
-        where the server does not say.
+        """Uncertainty of the clock of a vehicle on a mission [ms], and the resulting uncertainty of
+        its place [m]; NaN if the server reports neither.
         """
         figures = group(self.figures("server"), "by_vehicle", str(number))
         return told(figures, "clock_bound_ms"), told(figures, "clock_m")

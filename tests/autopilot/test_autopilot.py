@@ -70,13 +70,11 @@ def climbed(flavour: FlavourName) -> Companion:
 
 @pytest.fixture(scope="module")
 def ardupilot() -> Companion:
-    """ArduCopter in the air."""
     return climbed("ardupilot")
 
 
 @pytest.fixture(scope="module")
 def px4() -> Companion:
-    """PX4 in the air."""
     return climbed("px4")
 
 
@@ -282,7 +280,6 @@ def test_ardupilot_climbs_and_lands_as_measured() -> None:
 
 
 def test_a_setpoint_alone_lifts_px4_and_not_ardupilot() -> None:
-    """ArduCopter wants a command to take off."""
     for flavour, flies in (("ardupilot", False), ("px4", True)):
         companion = Companion(flavour)
         companion.velocity = (0.0, 0.0, 0.5)
@@ -304,7 +301,6 @@ def test_it_disarms_by_itself_where_it_is_not_flown(flavour: FlavourName) -> Non
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_it_is_not_disarmed_in_the_air_unless_it_must(flavour: FlavourName) -> None:
-    """With the number that forces it, it falls."""
     companion = Companion(flavour)
     companion.climb()
     assert companion.command(400, 0.0) == companion.flight.refusal
@@ -338,7 +334,6 @@ def test_a_pilot_takes_over(flavour: FlavourName) -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None:
-    """It tells no position meanwhile, and what it does not know."""
     companion = fly_with("estimate@15", flavour, 3.0)
     assert companion.flight.mode is FlightMode.LAND
     assert companion.mode(FlightMode.GUIDED) == companion.flight.refusal
@@ -412,7 +407,6 @@ def test_a_lost_ground_station_sends_it_home_where_it_is_to(
     ],
 )
 def test_its_own_fence_holds_it(flavour: FlavourName, keys: dict[str, float]) -> None:
-    """Once it is outside, as both do it."""
     companion = Companion(flavour)
     for name, value in keys.items():
         set_parameter(companion, name, value)
@@ -435,7 +429,6 @@ def test_a_fault_that_is_none_is_refused(text: str) -> None:
 
 
 def set_parameter(companion: Companion, name: str, value: float) -> None:
-    """Set a parameter as a ground station does, in its type."""
     before = companion.flight.parameters[name]
     given = int(value) if isinstance(before, int) else float(value)
     sent = parameters.to_wire(given, bytewise=companion.flavour.bytewise)
@@ -472,9 +465,6 @@ def test_parameters_are_read_listed_and_set(flavour: FlavourName) -> None:
 
 @pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 200.0])
 def test_a_stream_is_exact_by_its_own_stamp(rate: float) -> None:
-    """Streams keep the requested rate, up to 200 Hz; both real autopilots do, and send no
-    faster.
-    """
     companion = Companion()
     companion.run(1.0)
     companion.stream(rate)
@@ -554,7 +544,6 @@ def test_the_attitude_is_that_of_what_it_flies(ardupilot: Companion) -> None:
 
 
 def test_position_and_velocity_are_flown_together(ardupilot: Companion) -> None:
-    """A point that moves is followed closely; the autopilot regulates."""
     x, y, z = ardupilot.flight.position()
     for k in range(500):
         ardupilot.position = (x + 0.02 * k, y, z)
@@ -618,7 +607,6 @@ def test_it_heeds_its_own_number_alone() -> None:
 
 
 def test_other_peers_hear_it_and_a_crowd_moves_nobody_out() -> None:
-    """Each has its own streams; more than there is room for are turned away while it is full."""
     companion = Companion()
     companion.run(1.0)
     companion.stream(50.0)
@@ -660,7 +648,6 @@ def test_garbage_is_counted(garbage: list[bytes]) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_message_with_any_fields_is_survived(data: st.DataObject) -> None:
-    """Every message that it handles may have any float or integer; nothing arms by itself."""
     numbers = st.floats(width=32)
     companion = Companion(data.draw(st.sampled_from(BOTH)), ready_s=100.0)
     target = data.draw(st.sampled_from([0, 1, 2]))
@@ -690,7 +677,6 @@ def test_any_message_with_any_fields_is_survived(data: st.DataObject) -> None:
 
 
 def test_a_process_that_has_slept_goes_on_from_where_it_was() -> None:
-    """It flies a second of what it has missed, not an hour."""
     companion = Companion()
     companion.climb()
     before_ns = companion.flight.now_ns
@@ -700,7 +686,6 @@ def test_a_process_that_has_slept_goes_on_from_where_it_was() -> None:
 
 
 def test_the_same_seed_is_the_same_flight() -> None:
-    """In turbulence; another seed is another one, and yaw holds."""
     places = []
     for seed in (1, 1, 2):
         companion = Companion(seed=seed, turbulence_mps=6.0, steady_wind_mps=[6.0, 0.0])
@@ -713,7 +698,6 @@ def test_the_same_seed_is_the_same_flight() -> None:
 
 
 def test_another_wind_blows_when_it_is_told() -> None:
-    """In flight, as `skytether set` does it."""
     companion = Companion()
     companion.climb()
     before = companion.flight.quadrotor.attitude().roll

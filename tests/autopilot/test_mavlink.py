@@ -18,13 +18,11 @@ NOISE = st.binary(max_size=60)
 
 
 def frames(count: int) -> list[bytes]:
-    """Frames of heartbeats and positions in turn."""
     codec = Codec(1, 1)
     return [codec.encode((HEARTBEAT, POSITION)[n % 2]) for n in range(count)]
 
 
 def names(messages: list[object]) -> list[str]:
-    """Names of messages."""
     return [message.get_type() for message in messages]  # type: ignore[attr-defined]
 
 
@@ -77,7 +75,6 @@ def test_a_flipped_bit_is_no_message(which: int, at: int, flip: int) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=300), st.integers(0, 2**24 - 1))
 def test_a_frame_with_a_right_checksum_may_say_anything(payload: bytes, number: int) -> None:
-    """Text that is none, and more or fewer bytes than the message has."""
     kinds = sorted(dialect.mavlink_map)
     kind = dialect.mavlink_map[kinds[number % len(kinds)]]
     payload = payload[:255]
@@ -108,7 +105,6 @@ def test_an_integer_goes_as_a_number(value: int) -> None:
 
 @pytest.mark.parametrize("bytewise", [False, True])
 def test_what_is_no_number_is_no_value(bytewise: bool) -> None:
-    """Neither NaN nor infinity, nor a type that needs more than a float."""
     assert parameters.from_wire(math.nan, parameters.FLOAT, bytewise=bytewise) is None
     assert parameters.from_wire(math.inf, parameters.FLOAT, bytewise=bytewise) is None
     assert parameters.from_wire(1.0, dialect.MAV_PARAM_TYPE_REAL64, bytewise=bytewise) is None
@@ -131,7 +127,6 @@ def test_a_long_text_is_put_together(text: str) -> None:
 
 
 def test_texts_that_never_end_are_bounded() -> None:
-    """The oldest gives way; one text has so many chunks and no more."""
     codec, texts = Codec(1, 1), Texts()
     for number in range(1, 100):
         frame = codec.encode(chunks(4, "x" * 60, number)[0])

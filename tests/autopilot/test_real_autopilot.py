@@ -97,7 +97,6 @@ class Heard(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:
-        """Keep the line, to ask for what is not told of itself."""
         self._transport = transport
 
     def datagram_received(self, data: bytes, address: object) -> None:
@@ -122,7 +121,6 @@ class Heard(asyncio.DatagramProtocol):
 
 
 async def command(*argv: str) -> asyncio.subprocess.Process:
-    """A `skytether` command that says nothing."""
     skytether = (sys.executable, "-P", "-m", "skytether")
     return await asyncio.create_subprocess_exec(
         *skytether, *argv, stdout=asyncio.subprocess.DEVNULL
@@ -130,11 +128,6 @@ async def command(*argv: str) -> asyncio.subprocess.Process:
 
 
 async def until(so: Callable[[], bool], seconds: float) -> None:
-    """Wait until something is so.
-
-    Raises:
-        TimeoutError: it is not, for so long.
-    """
     async with asyncio.timeout(seconds):
         while not so():
             await asyncio.sleep(0.1)
@@ -154,12 +147,10 @@ class Flight:
         """Events of the client."""
 
     def events(self, kind: type) -> list[object]:
-        """Events of the client of a kind."""
         return [line.event for line in self.said if isinstance(line.event, kind)]
 
     @contextlib.asynccontextmanager
     async def begun(self) -> AsyncIterator[tuple[Child, Child]]:
-        """Client and netem, once they run."""
         file, keys = self.folder / "scenario.toml", str(self.folder / "keys")
         file.write_bytes(to_toml(self.flown))
         made = await command("keygen", keys)
@@ -187,11 +178,9 @@ class Flight:
             yield client, netem
 
     def rows(self) -> Rows:
-        """Rows of the client's record."""
         return parse((self.folder / "client").read_bytes())
 
     def rmse_m(self) -> float:
-        """Error in the plane, rms [m]."""
         rows = self.rows()
         times = rows["step"] * self.flown.control.dt
         wanted = self.flown.make_reference()(times)[:, :2, 0]
@@ -232,7 +221,6 @@ async def test_arducopter_stands_where_its_client_is_killed(tmp_path: Path) -> N
 
 @needs_arducopter
 async def test_arducopter_brakes_and_hovers_while_the_link_is_cut(tmp_path: Path) -> None:
-    """For five seconds; then it flies on."""
     flight = Flight(tmp_path, scenario("udp:127.0.0.1:14650", **OF_ARDUCOPTER))
     async with arducopter(tmp_path), flight.begun() as (client, _):
         await until(lambda: bool(flight.events(Flying)), 120.0)

@@ -38,7 +38,6 @@ PX4 = {"tau_s": [0.5], "gain": [0.85], "dead_time_s": [0.1]}
 
 
 def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
-    """The scenario of one of the three clients."""
     table = reading.to_table(reading.load("swap-autopilot")) | {"duration": 55.0}
     table["vehicle"]["address"] = f"udpout:autopilot{number}:0"
     table["network"]["uplink"]["loss"] = table["network"]["downlink"]["loss"] = loss

@@ -71,7 +71,6 @@ class Process:
         raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
 
     def address(self) -> str:
-        """Address that the process listens on."""
         return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
 
     def counted(self, name: str) -> int:
@@ -84,13 +83,10 @@ class Process:
         return next((int(match[1]) for match in found if match), 0)
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """End the process by a signal; returns its exit code."""
         self.popen.send_signal(number)
-        self.said += self._stdout.read().splitlines()
-        return self.popen.wait(PATIENCE_S)
+        return self.ended()
 
     def ended(self) -> int:
-        """Wait until the process has ended by itself; returns its exit code."""
         self.said += self._stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
@@ -148,20 +144,13 @@ def test_an_address_is_read_as_it_is_written(address: Address) -> None:
     assert command.address("--bind", address_text(*address)) == address
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["--triger", "x"],
-        ["--page"],
-        ["more"],
-    ],
-)
-def test_a_wrong_flag_is_explained(argv: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("wrong", ["--triger x", "--page", "more"])
+def test_a_wrong_flag_is_explained(wrong: str, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
-        main(["fly", "demo", *argv])
+        main(["fly", "demo", *wrong.split()])
     assert exit_.value.code == 2
     said = capfd.readouterr().err
-    assert argv[0] in said
+    assert wrong.split(maxsplit=1)[0] in said
     assert "skytether fly --help" in said
 
 
@@ -231,7 +220,6 @@ def test_help_shows_the_scenario_that_was_named(
 
 
 def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
-    """One seed gives one file, byte by byte; measured times stay out of it."""
     files = [tmp_path / "one.json", tmp_path / "two.json"]
     argv = ["fly", "paper", "--virtual", "--duration", "12", "--seed", "3"]
     argv += ["--figure", str(tmp_path / "flight.png")]
@@ -346,10 +334,10 @@ def test_a_flag_may_be_a_number_or_a_word(given: str, bound: float | str, tmp_pa
 
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     file = tmp_path / "real.json"
-    run = skytether("fly", "demo-committed", *QUICK, "--duration", "3", "--json", str(file))
+    run = skytether("fly", "demo-committed", *QUICK, "--duration", "2", "--json", str(file))
     assert run.returncode == 0, run.stderr
     summary = json.loads(file.read_text())
-    assert summary["steps"] + summary["deadline_misses"] >= 60
+    assert summary["steps"] + summary["deadline_misses"] >= 40
     absent = {key for key, value in summary.items() if value is None}
     assert absent == {"rmse_z", "estimate_error_m"}
     assert summary["solve_ms_p50"] > 0.0
@@ -385,7 +373,7 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     address = server.address()
     netem = start("netem", "demo", "--bind", f"{host}:0", "--server", address, *QUICK)
     address = netem.address()
-    argv = ["client", "demo", "--server", address, "--duration", "3", "--json", str(file)]
+    argv = ["client", "demo", "--server", address, "--duration", "2", "--json", str(file)]
     client = start(*argv, *QUICK)
     client.wait_for(rf"waiting for the server at {re.escape(host)}:\d+")
     client.wait_for("session open, flying")
@@ -404,7 +392,7 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     assert loud == [True, False, True]
     assert any("error_ms_p99" in line for line in netem.said[-20:])
     summary = json.loads(file.read_text())
-    assert summary["steps"] + summary["deadline_misses"] == 60
+    assert summary["steps"] + summary["deadline_misses"] == 40
     assert summary["event_ratio"] is None
 
 
@@ -447,9 +435,8 @@ def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
 
 
 def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
-    """Lines of JSON alone, each with process and CLOCK_MONOTONIC, in the order of time."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
-    argv = ["--server", server.address(), "--duration", "3", "--log", "json", *QUICK]
+    argv = ["--server", server.address(), "--duration", "1", "--log", "json", *QUICK]
     began_ns = time.monotonic_ns()
     run = skytether("client", "demo", *argv)
     assert run.returncode == 0, run.stderr
@@ -490,29 +477,28 @@ def unread(request: pytest.FixtureRequest) -> Iterator[int]:
         os.close(reading)
 
 
-def test_a_server_whose_output_nobody_reads_flies_vehicles_and_ends_in_order(
-    unread: int, tmp_path: Path
+def test_a_server_whose_output_nobody_reads_flies_a_vehicle_and_ends_in_order(
+    unread: int, start: Callable[..., Process], tmp_path: Path
 ) -> None:
-    """However many strangers it has to tell of."""
+    """However many strangers it has to tell of meanwhile."""
     figures = tmp_path / "server.json"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     argv = ["server", "demo", "--bind", f"127.0.0.1:{port}", *QUICK, "--json", str(figures)]
-    client = ["client", "demo", "--server", f"127.0.0.1:{port}", "--duration", "3", *QUICK]
     with Command(*argv, stdout=unread, stderr=sys.stderr.fileno()) as server:
         try:
-            first = skytether(*client, "--link.connect-s", "30")
-            assert first.returncode == 0, first.stderr
+            there = ["--server", f"127.0.0.1:{port}", "--link.connect-s", "30"]
+            client = start("client", "demo", *there, "--duration", "3", *QUICK)
+            client.wait_for("session open, flying")
             call_as_strangers(port, 2000)
-            second = skytether(*client, "--id", "2")
-            assert second.returncode == 0, second.stderr
+            assert client.ended() == 0
             server.send_signal(signal.SIGTERM)
             assert server.wait(PATIENCE_S) == 0
         finally:
             server.kill()
     counted = json.loads(figures.read_text())
-    assert counted["vehicles"] == 0  # both have said that they end
+    assert counted["vehicles"] == 0  # the client has said that it ends
     assert counted["counts"]["steps"] > 40
 
 
@@ -619,10 +605,7 @@ def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
     assert re.fullmatch(r"fly: .*: File too large: recorded up to [\d.]+ of 4 s", last)
 
 
-@pytest.mark.parametrize("victim", ["server", "netem", "client"])
-def test_the_other_two_survive_a_kill_and_restart(
-    victim: str, start: Callable[..., Process]
-) -> None:
+def test_the_other_two_survive_a_kill_and_restart_of_each(start: Callable[..., Process]) -> None:
     flags = [*QUICK, "--control.trigger", "always", "--duration", "60"]
     argv = {"server": ["server", "demo", "--bind", "127.0.0.1:0", *flags]}
     running = {"server": start(*argv["server"])}
@@ -635,21 +618,16 @@ def test_the_other_two_survive_a_kill_and_restart(
     argv["client"] = ["client", "demo", "--server", address, *flags]
     running["client"] = start(*argv["client"])
     running["client"].wait_for("flies a plan")
-
-    assert running[victim].end(signal.SIGKILL) == -signal.SIGKILL
-    if victim != "client":
-        running["client"].wait_for("brakes: the server is silent")
-    running[victim] = start(*argv[victim])
-    if victim == "client":
-        running["client"].wait_for("session open, flying")
-    else:
-        running["client"].wait_for("flies a plan")
-
-    before = running["client"].counted("horizons")
-    deadline = time.monotonic() + PATIENCE_S
-    while running["client"].counted("horizons") < before + 10:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    for name in ("client", "netem", "server"):
-        assert running[name].end() == 0
-        assert not any("Traceback" in line for line in running[name].said)
+    for victim in ("server", "netem", "client"):
+        assert running[victim].end(signal.SIGKILL) == -signal.SIGKILL
+        if victim != "client":
+            running["client"].wait_for("brakes: the server is silent")
+        running[victim] = start(*argv[victim])
+        client = running["client"]
+        client.wait_for("session open, flying" if victim == "client" else "flies a plan")
+        enough = client.counted("horizons") + 10
+        while client.counted("horizons") < enough:
+            time.sleep(0.1)
+    for process in reversed(running.values()):
+        assert process.end() == 0
+        assert not any("Traceback" in line for line in process.said)

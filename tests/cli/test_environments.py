@@ -49,7 +49,6 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
 
 
 def run(argv: list[str], environment: str = "") -> subprocess.CompletedProcess[str]:
-    """One command to its end, in one of the environments."""
     variables, line = ENVIRONMENTS.get(environment, ({}, "{}"))
     merged = {**os.environ, **variables}
     return subprocess.run(
@@ -241,7 +240,6 @@ def ignores_usr1(pid: int) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started."""
     return [int(pid) for pid in about(pid, f"task/{pid}/children").split()]
 
 

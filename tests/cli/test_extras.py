@@ -98,7 +98,6 @@ def run(argv: list[str], installed: tuple[str, ...]) -> subprocess.CompletedProc
 
 
 def refusal(prog: str, module: str, extra: str) -> str:
-    """The line that names an extra."""
     return f"{prog}: {module} is not installed, expected it: pip install 'skytether[{extra}]'\n"
 
 
@@ -120,7 +119,6 @@ def test_every_package_that_is_imported_is_asked_for() -> None:
 
 
 def _imports(tree: ast.AST) -> Iterator[str]:
-    """Top-level packages that a module imports, wherever in it."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition(".")[0] for alias in node.names)
@@ -166,7 +164,6 @@ def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str
 def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
     argv: list[str], installed: tuple[str, ...], extra: str
 ) -> None:
-    """For what most flights do without, a module is imported once it is asked for."""
     refused = run(argv, installed)
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr in {refusal(argv[0], module, extra) for module in packages(extra)}

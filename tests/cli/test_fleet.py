@@ -40,7 +40,6 @@ GUSTY = reading.check(
 
 
 def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Client], io.BytesIO]:
-    """Vehicles 1, 2, … and what they record."""
     sink = io.BytesIO()
     recorder = Recorder(client_columns(scenario.model.axes), sink)
     made = [
@@ -83,7 +82,6 @@ def flown(count: int, *, together: bool) -> Rows:
 
 
 def test_a_fleet_flies_as_its_vehicles_would_alone() -> None:
-    """Each vehicle of a fleet, with its own flow, flies bit for bit as it would alone."""
     together, alone = flown(5, together=True), flown(5, together=False)
     assert len(together) == 5 * 200
     np.testing.assert_array_equal(together, alone)
@@ -112,7 +110,6 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
 
 
 def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -> None:
-    """Counted there, and shown under its number."""
     vehicles, _ = clients(GUSTY, 2, ("server", 1))
     fleet = Fleet(vehicles)
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
@@ -138,7 +135,6 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
 
 
 def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
-    """The summary of `skytether fleet`."""
     file = tmp_path / "fleet.json"
     done = skytether("fleet", *argv, "--json", str(file), timeout_s=100.0)
     assert done.returncode == 0, done.stderr
@@ -161,9 +157,6 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
 
 
 def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:
-    """A mission has its own number of vehicles; the smallest and the required distance are
-    shown.
-    """
     flown = ("--virtual", "--reference.shape", "swap(4)", "--figure", str(tmp_path / "swap.png"))
     swap = fleet_command(tmp_path, "--mission", "swap", *flown)
     assert (tmp_path / "swap.png").stat().st_size > 10_000
@@ -202,7 +195,6 @@ def test_a_mission_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path) ->
 @pytest.mark.long
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
-    """Six vehicles in one process; one server, and two workers at one address."""
     argv = ("--vehicles", "6", "--duration", "6", "--workers", str(count))
     summary = fleet_command(tmp_path, *argv)
     assert (summary["vehicles"], summary["workers"]) == (6, count)

@@ -28,11 +28,12 @@ from warm import Command
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=5.0, settle=3.0)
 OFFSETS_NS = {"client": 10**18, "server": 10**18 + 7 * 10**9, "netem": 10**18 - 3 * 10**9}
 """Time of day minus the clock, of each process's computer [ns]."""
+AT_ONCE = ("--settle", "0", "--network.uplink", "loss(0.1)", "--network.downlink", "loss(0.1)")
+"""A network without delay, over which the first plan comes in a moment."""
 
 
 @pytest.fixture(scope="module")
 def flown() -> Record:
-    """A flight."""
     return flight.fly(SCENARIO)
 
 
@@ -51,7 +52,6 @@ def recorded_by(process: str, folder: Path, flown: Record, scenario: Scenario = 
 
 
 def moved(frame: Frame, late_ns: int) -> Frame:
-    """A frame on another clock."""
     frame = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
     if isinstance(frame, Rows) and frame.part == "netem":
         rows = np.frombuffer(frame.rows, PACKET_COLUMNS).copy()
@@ -61,7 +61,6 @@ def moved(frame: Frame, late_ns: int) -> Frame:
 
 
 def together(paths: Sequence[Path], out: Path) -> int:
-    """Join recordings."""
     return command.main(join, [*map(str, paths), "--out", str(out)], "join")
 
 
@@ -111,7 +110,6 @@ def test_what_is_not_of_one_flight_is_refused(
 
 
 def port(process: Command) -> str:
-    """Port on which a process says that it listens."""
     line = next(line for line in process.stdout if "listening on" in line)
     return line.split("127.0.0.1:")[1].split(",")[0].split()[0]
 
@@ -123,7 +121,7 @@ def test_a_flight_by_hand_is_recorded_and_joined(
     with ExitStack() as stack:
 
         def start(name: str, *argv: str) -> Command:
-            flags = ["--duration", "6", "--settle", "0", "--record", str(files[name])]
+            flags = ["--duration", "2", *AT_ONCE, "--record", str(files[name])]
             command = stack.enter_context(Command(name, "demo", *argv, *flags))
             stack.callback(command.kill)
             return command

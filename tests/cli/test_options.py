@@ -45,7 +45,6 @@ NOT_PLAIN: list[tuple[Any, list[str]]] = [
 
 
 def by_tyro(default: Any, argv: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Options that tyro reads from a line."""
     monkeypatch.setattr(options, "plain", lambda *_: None)
     return options.read(default, argv, "x", "Help.")
 

@@ -111,7 +111,6 @@ def _tables() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of a flight."""
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
     assert main(["fly", "demo", *SHORT, "--record", str(path)]) == 0
     return path
@@ -185,7 +184,6 @@ def test_no_output_is_an_input(
 def test_nor_by_its_own_name(
     option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The simplest way to lose a recording."""
     argv, source, _ = line_of(option, inputs, tmp_path)
     argv[-1] = str(source)
     before = source.read_bytes()
@@ -222,7 +220,6 @@ def test_two_options_do_not_name_one_file(
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """A file or folder that another command is writing."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

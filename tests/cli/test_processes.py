@@ -146,7 +146,6 @@ async def test_a_line_that_is_nested_deeply_hides_nothing_that_follows() -> None
 def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """On stderr, where the progress bar is."""
     shown = [
         ModeChanged(vehicle=1, before="track", after="brake", reason="the server is silent"),
         RecordIncomplete(file="netem", reason="No space left on device"),

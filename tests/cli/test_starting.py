@@ -48,7 +48,6 @@ def imported(*argv: str) -> set[str]:
 
 @pytest.mark.parametrize("command", ["--help", "scenarios", "client demo", "client paper"])
 def test_what_is_light_imports_nothing_heavy(command: str) -> None:
-    """Neither help nor a vehicle has to wait for what plans, draws or encrypts."""
     modules = imported(*command.split())
     assert "skytether.shell.command" in modules
     assert modules & HEAVY == set()
@@ -64,7 +63,6 @@ def test_a_server_imports_its_own_solver_and_no_ciphers_without_keys(scenario: s
 
 
 def test_a_server_with_osqp_imports_it() -> None:
-    """The solver that a scenario names is there before a vehicle waits for it."""
     modules = imported("server", "paper", "--bind", "127.0.0.1:0", "--control.solver", "osqp")
     assert "osqp" in modules
 

@@ -15,13 +15,18 @@ from skytether.shared.core.aboard import (
     AutopilotRefused,
     AutopilotText,
     AutopilotWaits,
+    ClockSilent,
     NotTakenOff,
     ParametersRead,
     PositionsDropped,
     TextsOmitted,
 )
 from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import ServerHeard, ServerSilent, Welcomed
+from skytether.shared.core.events import (
+    ServerHeard,
+    ServerSilent,
+    Welcomed,
+)
 from skytether.shared.telemetry.record import Reason
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
@@ -165,6 +170,18 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
     air.run(120.0)
     assert len(air.of(Welcomed)) == 1
     assert not air.of(ServerSilent)
+
+
+def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
+    """It goes on flying: the clock is followed as it ran."""
+    air = Air("px4", duration=60.0)
+    air.fly()
+    air.run(3.0)
+    air.tap.alter = lambda message: b"" if message.get_type() == "TIMESYNC" else None
+    air.run(25.0)
+    (silent,) = air.of(ClockSilent)
+    assert 10.0 < silent.silent_s < 12.0
+    assert modes(air)[-1][0] == "track"
 
 
 def test_an_autopilot_that_does_not_answer_timesync_is_told_and_given_up() -> None:

@@ -60,7 +60,6 @@ class Constant(skytether.Endpoint):
         self.terms = scenario.terms()
 
     def receive(self, datagram: skytether.Datagram, *, now_ns: int) -> None:
-        """Answer HELLO and OBSERVATION."""
         message = decode(datagram.payload, self.terms)
         vehicle = message.vehicle
         if isinstance(message, Hello):
@@ -87,12 +86,10 @@ class Silent(Constant):
 
 @pytest.fixture(scope="module")
 def flown() -> skytether.Flight:
-    """A short flight of `demo`."""
     return skytether.fly("demo", **SHORT)
 
 
 def test_it_exports_this_and_nothing_else() -> None:
-    """Each name is there, and `dir` has it."""
     assert skytether.__all__ == EXPORTS
     homes = [name for names in skytether._HOMES.values() for name in names]
     assert sorted(homes) == EXPORTS
@@ -177,7 +174,6 @@ def test_a_reference_that_nothing_can_follow_is_told() -> None:
 
 
 def test_a_flight_is_that_of_the_simulation(flown: skytether.Flight) -> None:
-    """To the last bit, with its events and its summary."""
     scenario = skytether.load("demo", **SHORT)
     record = virtual.fly(scenario)
     assert flown.record.trace_hash() == record.trace_hash()
@@ -218,7 +214,6 @@ def test_arrays_have_names_shapes_and_units(flown: skytether.Flight) -> None:
 
 
 def test_a_flight_comes_back_from_its_file(tmp_path: Path) -> None:
-    """To the last bit, sealed and in space; its name, events, figures and summary as well."""
     flown = skytether.fly("demo", secure=True, duration=3, settle=0, **{"model.axes": 3})
     flown.save(tmp_path / "flight.mcap")
     back = skytether.Flight.load(str(tmp_path / "flight.mcap"))
@@ -235,7 +230,6 @@ def test_a_flight_comes_back_from_its_file(tmp_path: Path) -> None:
 
 
 def test_a_flight_that_failed_says_why_and_comes_back(tmp_path: Path) -> None:
-    """Nobody has answered: there is no row, and nothing to draw."""
     scenario = skytether.load("demo", **{"link.connect_s": 2.0})
     flown = skytether.fly(scenario, server=Silent(scenario))
     assert isinstance(flown.failure, NoAnswer)
@@ -249,7 +243,6 @@ def test_a_flight_that_failed_says_why_and_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
-    """Each with its own seed; only plans are missing."""
     one, other = skytether.fly_batch("demo", np.array([1, 5]), **SHORT)
     assert one.record.trace_hash() == flown.record.trace_hash()
     assert other.summary == skytether.fly("demo", seed=5, **SHORT).summary
@@ -264,7 +257,6 @@ def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
 
 
 def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
-    """A column a number, words for modes."""
     pytest.importorskip("pandas")
     table = flown.to_pandas()
     assert list(table.columns[:5]) == [
@@ -289,7 +281,6 @@ def test_without_pandas_it_says_what_to_install(
 
 
 def test_a_server_of_ones_own_is_flown() -> None:
-    """Over the scenario's network: the vehicle flies what it says once its link is good."""
     always = {"vehicle.report": "always"}
     scenario = skytether.load("demo-committed", duration=8, settle=0, **always)
     flown = skytether.fly(scenario, server=Constant(scenario))
@@ -305,7 +296,6 @@ def test_a_server_of_ones_own_is_flown() -> None:
 
 @pytest.mark.long
 def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
-    """Sealed, with events from 0 on; it comes back from its file."""
     at_once = {"network.uplink.delay": "none", "network.downlink.delay": "none"}
     flown = skytether.fly("demo", udp=True, secure=True, duration=5, settle=0, **at_once)
     assert (flown.summary.duration_s, flown.summary.secure) == (5.0, True)
@@ -359,7 +349,6 @@ GRID = {"control.trigger": ["always", "cost_gap"], "network.uplink.loss": np.arr
 
 
 def test_a_sweep_flies_every_combination() -> None:
-    """The last key changes fastest; each flight is that of `fly` with its seed."""
     swept = skytether.sweep("demo", GRID, runs=2, seed=3, **SHORT)
     assert [tuple(each.keys.values()) for each in swept] == [
         ("always", 0.0),
@@ -381,7 +370,6 @@ def test_a_sweep_flies_every_combination() -> None:
 
 @pytest.mark.long
 def test_a_sweep_is_the_same_with_more_workers() -> None:
-    """The result does not depend on which process flies a run."""
     alone = skytether.sweep("demo", GRID, runs=2, **SHORT)
     assert skytether.sweep("demo", GRID, runs=2, workers=2, **SHORT) == alone
 
@@ -390,7 +378,6 @@ def test_a_sweep_is_the_same_with_more_workers() -> None:
 
 
 def mine() -> Constant:
-    """A server of one's own."""
     return Constant(skytether.load("demo-committed"))
 
 

@@ -31,7 +31,6 @@ from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
-from skytether.shell.time_of_day import stated
 from skytether.sim import flight
 
 DT_S, DT_NS = 0.05, 50 * MS
@@ -466,18 +465,6 @@ def test_with_the_time_of_day_at_both_ends_clocks_are_known(
     told = flown.figures["server"]["by_vehicle"]
     assert max(each["clock_bound_ms"] for each in told.values()) < 25.0
     assert not [each for each in flown.events if isinstance(each.event, ClockContradicted)]
-
-
-def test_a_host_s_clock_counts_where_its_kernel_tells_how_wrong_it_is() -> None:
-    """By chrony it tells both errors; a clock that nothing disciplines, or 0 wrong, is unknown."""
-    assert stated(0, 0x2001, 1500, 40) == 1_500_000
-    for answer, status, most_us, estimate_us in (
-        (5, 0x40, 16_000_000, 16_000_000),
-        (0, 0x40, 1500, 40),
-        (0, 0x2001, 500, 0),
-        (-1, 0, 1500, 40),
-    ):
-        assert stated(answer, status, most_us, estimate_us) is None
 
 
 @pytest.mark.long

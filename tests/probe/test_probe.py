@@ -121,12 +121,10 @@ def test_a_changed_packet_is_refused_or_another_one(kind: int, data: Any) -> Non
 
 
 def listener() -> Listener:
-    """A listener without keys."""
     return Listener(PlainGate(), b"secret")
 
 
 def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
-    """Session that a listener gives."""
     far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), peer), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
@@ -149,7 +147,6 @@ def test_a_listener_answers_with_no_more_than_it_got(payloads: list[bytes]) -> N
 
 
 def test_only_who_can_be_answered_at_an_address_is_kept() -> None:
-    """A session belongs to an address; without its cookie nothing is kept or answered."""
     far = listener()
     session = session_of(far, ("prober", 1), 0)
     probe = encode(Probe(session, 0, 0, 0), 96)
@@ -274,7 +271,6 @@ def in_order(packets: Rows, direction: int) -> Rows:
 
 
 def test_every_packet_is_measured_as_it_was() -> None:
-    """Delays, losses and times of both directions are netem's, whatever the clocks."""
     uplink, downlink = (
         "lognormal(0.05, 0.08, 0.02) & loss(0.1)",
         "gamma(0.05, 0.09, 0.03) & loss(0.3)",
@@ -330,7 +326,6 @@ def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None
 
 
 def test_the_models_are_those_of_the_network_and_fly() -> None:
-    """The models form one text, which is a valid network."""
     text = "gamma(0.02, 0.06, 0.03) & gilbert_elliott(0.2, 0.5)"
     measured, _ = measure(text, text, seconds=300.0)
     told = outcome(measured, "x", secure=False).told
@@ -370,7 +365,6 @@ POINTS = st.tuples(st.integers(0, 1000), st.floats(0, 1))
 
 @given(st.lists(POINTS, min_size=2, max_size=40, unique_by=lambda point: point[0]))
 def test_a_lower_hull_lies_below_all_points(points: list[tuple[int, float]]) -> None:
-    """It begins with the first and ends with the last, and is convex."""
     x, y = (np.array(each) for each in zip(*points, strict=True))
     corner_x, corner_y = analysis.lower_hull(x, y)
     assert np.all(np.interp(x, corner_x, corner_y) <= y + 1e-9)
@@ -407,7 +401,6 @@ def test_what_was_measured_is_replayed_as_a_trace(tmp_path: Path) -> None:
 
 
 def test_a_measurement_that_ends_early_leaves_out_what_is_under_way() -> None:
-    """Packets of unknown fate are not counted as lost."""
     far = listener()
     near = Prober(
         PlainLink(), LISTENER, bytes(NONCE_BYTES), probes=100, period_ns=SECOND_NS // 20, size=200
@@ -431,7 +424,6 @@ def test_a_measurement_that_ends_early_leaves_out_what_is_under_way() -> None:
 
 
 def test_who_is_not_answered_gives_up() -> None:
-    """After ten seconds."""
     near = Prober(
         PlainLink(), LISTENER, bytes(NONCE_BYTES), probes=10, period_ns=SECOND_NS, size=200
     )
@@ -503,7 +495,6 @@ def test_bad_options_are_one_line(
 
 @contextmanager
 def listening(*flags: str) -> Iterator[str]:
-    """Run a listener; yields its address."""
     command = [sys.executable, "-P", "-m", "skytether", "probe", "--listen", "127.0.0.1:0", *flags]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
@@ -520,7 +511,6 @@ def listening(*flags: str) -> Iterator[str]:
 def test_a_path_over_loopback_is_measured_sealed_or_not(
     sealed: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Everything is written, and the text that is printed flies."""
     keys: list[str] = []
     if sealed:
         file = tmp_path / "keys"

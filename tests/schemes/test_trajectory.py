@@ -19,7 +19,7 @@ from skytether.client.navigation import Navigation
 from skytether.lab.sweep import summaries
 from skytether.server.common.clock import ClockMap
 from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import Foresight, foresight
+from skytether.server.common.scheme import Fleet, Foresight, foresight
 from skytether.server.mpc.nominal import make_nominal, plan_nominal
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.knots import fewest_knots
@@ -27,6 +27,7 @@ from skytether.server.schemes.sent import LOSS
 from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain
+from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, advance
 from skytether.shared.law.spline import AxisSpline, along, follow, guided_to, regulated, spline_at
 from skytether.shared.scenario import reading
@@ -249,15 +250,18 @@ class Server:
         self.terms = flown.terms()
         self.desired = Moved(flown, self.terms, capacity, capacity)
         self.clock = ClockMap(capacity, self.terms.dt_ns)
-        self.scheme = Guidance(
+        fleet = Fleet(
+            flown,
             self.terms,
-            flown.control,
-            regulator(flown),
-            self.desired,
+            capacity,
+            capacity,
             self.clock,
-            capacity,
-            capacity,
+            self.desired,
+            None,
+            Stopwatch(),
+            print,
         )
+        self.scheme = Guidance(fleet)
         self.found: Foresight = foresight(capacity, 2, 1, 1, splines=True)
 
     def observe(

@@ -35,20 +35,17 @@ FAMILIES = {"127.0.0.1": socket.AF_INET, "::1": socket.AF_INET6}
 
 @pytest.fixture(params=FAMILIES)
 def host(request: pytest.FixtureRequest) -> str:
-    """Loopback address of either family."""
     return str(request.param)
 
 
 @pytest.fixture
 def ends(host: str) -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Two sockets of one family."""
     with ExitStack() as stack:
         here, there = (stack.enter_context(open_socket((host, 0))) for _ in range(2))
         yield here, there
 
 
 def received(sock: socket.socket) -> list[bytes]:
-    """Payloads that wait at a socket."""
     found = []
     while True:
         try:
@@ -65,7 +62,6 @@ def raw_of(sock: socket.socket) -> bytes:
 def test_datagrams_arrive_whole_in_order_and_with_their_senders(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """Any size arrives, from none to the longest that UDP carries."""
     here, there = ends
     batch, payloads = Batch(FAMILIES[host]), [b"", b"a", bytes(range(256)) * 255, b"z" * 1200]
     for payload in payloads:
@@ -114,7 +110,6 @@ def test_the_kernel_tells_when_each_came(
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """No more than BATCH_MAX at once, so that timers and other sockets have their turn."""
     here, there = ends
     batch, numbered = Batch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
@@ -179,7 +174,6 @@ def test_a_name_has_no_kernels_form(address: Address) -> None:
 
 
 def test_known_addresses_are_forgotten_with_a_name_that_moves() -> None:
-    """A restarted host has a new number; so does what was worked out from the old one."""
     names, peer = Names(()), ("ground", 5000)
     names.learn({peer: ("192.0.2.1", 5000)})
     old, new = pack_address(("192.0.2.1", 5000)), pack_address(("192.0.2.2", 5000))
@@ -193,7 +187,6 @@ def test_known_addresses_are_forgotten_with_a_name_that_moves() -> None:
 
 
 def test_strangers_take_no_more_memory_than_allowed() -> None:
-    """A flood from made-up addresses fills neither table."""
     names = Names(())
     for i in range(ADDRESSES_MAX + 10):
         address = (f"10.{i >> 16}.{i >> 8 & 255}.{i & 255}", 1)
@@ -205,7 +198,6 @@ def test_strangers_take_no_more_memory_than_allowed() -> None:
 def test_segments_arrive_as_the_datagrams_that_they_were(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
-    """In order, with their own lengths, and more of them than one call takes."""
     here, there = ends
     segments, payloads = Segments(), [b"%4d" % i * 25 for i in range(SEGMENTS_MAX + 7)]
     payloads += [b"%4d" % i for i in range(20)]
@@ -253,11 +245,9 @@ class Answering(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether it has heard enough."""
         return len(self.heard) >= self._enough
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Keep a datagram; fail at the one that asks for it."""
         self.heard.append(datagram)
         self.stamps_ns.append(now_ns)
         if self.finished:
@@ -270,7 +260,6 @@ class Answering(Endpoint):
         """Do nothing."""
 
     def next_wake_ns(self) -> int | None:
-        """Never."""
         return None
 
 
@@ -348,7 +337,6 @@ def test_a_datagram_that_cannot_be_sent_is_counted_and_the_others_go() -> None:
 @pytest.mark.usefixtures("batches")
 @pytest.mark.parametrize("size", [4, 1200, 30_000])
 def test_answers_of_one_size_arrive_one_by_one(size: int) -> None:
-    """However long, and however many there are."""
     with open_socket(("127.0.0.1", 0)) as sock:
         payloads = [b"%4d" % i * (size // 4) for i in range(70)]
         endpoint = Answering(1, lambda datagram: [datagram._replace(payload=p) for p in payloads])
@@ -359,7 +347,6 @@ def test_answers_of_one_size_arrive_one_by_one(size: int) -> None:
 
 @pytest.mark.usefixtures("batches")
 def test_a_peer_that_has_gone_disturbs_nobody_else() -> None:
-    """The kernel is told that its port is closed, in the middle of answers to others."""
     with open_socket(("127.0.0.1", 0)) as sock:
         with open_socket(("127.0.0.1", 0)) as gone:
             closed = gone.getsockname()
@@ -375,7 +362,6 @@ def test_a_peer_that_has_gone_disturbs_nobody_else() -> None:
 
 @pytest.mark.usefixtures("batches")
 def test_a_fault_in_the_middle_of_a_batch_costs_no_other_datagram() -> None:
-    """It is told as often as it happens, and what came behind it is heard."""
     with open_socket(("127.0.0.1", 0)) as sock:
         burst = [b"%d" % i for i in range(20)]
         endpoint = Answering(42, lambda _: [])
@@ -424,7 +410,6 @@ class Crowd:
 def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its datagrams are received in batches, each with its own time of arrival."""
     crowd = Crowd(Answering(31, lambda _: []), monkeypatch)
     crowd.endpoint.patience_ns = 20_000_000
     crowd.send((1, 10, 10, 10))
@@ -441,7 +426,6 @@ class TwoSockets(Answering):
     patience_ns = 20_000_000
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Keep a datagram."""
         super().receive(datagram, now_ns=now_ns)
         if len(self.heard) == 1:
             self._out.append(Datagram(b"here", datagram.peer, 1))
@@ -481,7 +465,6 @@ def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
 
 
 def test_two_crowded_sockets_are_heard_in_the_order_of_arrival() -> None:
-    """Not one after the other, and each datagram with its own time."""
     endpoint = send_to_both([[0, 1] * 10] * 4)
     stamps_ns = endpoint.stamps_ns
     assert sorted(stamps_ns) == stamps_ns
@@ -580,7 +563,6 @@ def test_an_endpoint_without_patience_hears_each_as_it_comes(
 
 
 def test_a_crowd_that_has_gone_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a slice in which few came each is read as it comes again."""
     crowd = Crowd(Answering(24, lambda _: []), monkeypatch)
     crowd.endpoint.patience_ns = 1_000_000
     real, listened = Shell._listen, list[int]()

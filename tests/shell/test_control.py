@@ -34,13 +34,11 @@ class Closing(Proxy):
     finished = False
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Change, and perhaps end."""
         super().change(scenario, keys, now_ns=now_ns)
         self.finished = scenario.network.uplink.path.loss == 1.0
 
 
 def running() -> Running:
-    """A scenario that a netem flies."""
     return Running(Proxy(DEMO, server=("server", 0)), DEMO)
 
 
@@ -52,15 +50,12 @@ class Loop:
         self.rests: list[tuple[float, Callable[[], None]]] = []
 
     def add_reader(self, _: object, read: Callable[[], None]) -> None:
-        """Let it read."""
         self.reads = read
 
     def remove_reader(self, _: object) -> None:
-        """Let it read no more."""
         self.reads = None
 
     def call_later(self, delay_s: float, then: Callable[[], None]) -> None:
-        """Note what is to be done."""
         self.rests.append((delay_s, then))
 
     def turn(self) -> bool:
@@ -82,7 +77,6 @@ def heeding(control: Control) -> tuple[Loop, list[None]]:
 
 
 def test_a_process_is_changed_through_its_socket_while_it_is_driven(tmp_path: Path) -> None:
-    """The file is its owner's alone, and is gone at the end; events tell what was done."""
     path, events, answers = tmp_path / "netem", list[Event](), list[Any]()
 
     def operate() -> None:
@@ -106,7 +100,6 @@ def test_a_process_is_changed_through_its_socket_while_it_is_driven(tmp_path: Pa
 
 
 def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_path: Path) -> None:
-    """However many wait: whoever sends them is told that there is no room."""
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, heeded = heeding(control)
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as flood:
@@ -130,7 +123,6 @@ def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_pa
 def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So that requests cost a share of the time, whatever they ask for."""
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
@@ -140,7 +132,6 @@ def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
 
 
 def test_a_socket_that_is_closed_while_it_rests_reads_no_more(tmp_path: Path) -> None:
-    """The loop that it rests in goes on for a while."""
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
         loop.turn()
@@ -172,7 +163,6 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
 
 
 def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> None:
-    """A change may not be cut off where it still makes sense."""
     path = tmp_path / "netem"
     flown = running()
     with closing(Control(path, flown)) as control, closing(Caller(path)) as caller:
@@ -185,7 +175,6 @@ def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("said", [b"", b"[]", b"\xff", b'{"values":{"a":' + b"[" * 30_000])
 def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: Path) -> None:
-    """Whoever listens there need be no process of ours."""
     path = tmp_path / "netem"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
         other.bind(str(path))
@@ -210,7 +199,6 @@ def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) ->
 
 
 def occupied(path: Path, kind: str) -> None:
-    """Put something at a path."""
     match kind:
         case "a file":
             path.write_text("precious")
@@ -297,7 +285,6 @@ def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
     ],
 )
 def test_a_value_is_toml_or_else_a_text(text: str, expected: object) -> None:
-    """A value is read as TOML, and as plain text if it is none."""
     assert toml_value(text) == expected
 
 
@@ -362,7 +349,6 @@ def test_where_no_address_for_answers_can_be_made_that_is_said(
 def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A process that is stopped, for instance."""
     path = tmp_path / "netem"
     monkeypatch.setattr(skytether.shell.control, "PATIENCE_S", 0.05)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
@@ -374,7 +360,6 @@ def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
 def test_set_prints_what_may_change_what_has_and_what_was_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Values as in a scenario's file, and in an order."""
     path = tmp_path / "netem"
     codes: list[int] = []
 
@@ -405,7 +390,6 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
 
 
 def test_no_loop_is_needed_to_close_what_was_never_driven(tmp_path: Path) -> None:
-    """A process that fails before it flies leaves none behind; without a path there is none."""
     path = tmp_path / "netem"
     with controlled(path, running()) as control:
         assert control is not None

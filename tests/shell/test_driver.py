@@ -14,26 +14,22 @@ class Faulty(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether it was woken twice."""
         return self.wakes == 2
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take nothing."""
 
     def wake(self, *, now_ns: int) -> None:  # noqa: ARG002
-        """Say something, then fail, once."""
         self.wakes += 1
         self._events.append(Flying(vehicle=self.wakes))
         if self.wakes == 1:
             raise ZeroDivisionError("by zero")
 
     def next_wake_ns(self) -> int | None:
-        """Time of the next wake: at once."""
         return 0
 
 
 def test_a_mistake_in_the_code_is_an_event_and_does_not_end_the_flight() -> None:
-    """With its traceback, in the log like any other: a flood of them is as bounded."""
     events: list[Event] = []
     run([Shell(Faulty(), ("127.0.0.1", 0))], on_event=events.append)
     kinds = [type(event) for event in events]

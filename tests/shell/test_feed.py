@@ -83,7 +83,6 @@ FRAMES: list[Frame] = [
 
 @given(st.lists(st.sampled_from(FRAMES), max_size=12), st.data())
 def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.DataObject) -> None:
-    """Bytes come from a socket in pieces of any size."""
     stream, reader, read = b"".join(map(encode, frames)), Reader(), []
     while stream:
         size = data.draw(st.integers(1, len(stream)))
@@ -95,7 +94,6 @@ def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.Data
 @given(st.binary(max_size=200), st.booleans())
 @settings(max_examples=300)
 def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool) -> None:
-    """A reader meets nothing else, even if the other end of the socket sends random bytes."""
     head = len(garbage).to_bytes(4, "big") if framed else b""
     try:
         Reader().read(head + garbage)
@@ -142,7 +140,6 @@ def test_a_frame_longer_than_any_is_refused_before_it_has_come() -> None:
     ids=["key", "depth", "text"],
 )
 def test_figures_that_are_none_are_a_feed_error(value: bytes) -> None:
-    """Values of msgpack that Python cannot represent are a FeedError, too."""
     whole = encode(Figures(time_ns=4, figures={"x": 7}))[4:]
     body = whole[:-1] + value
     with pytest.raises(FeedError, match="got no frame"):
@@ -150,7 +147,6 @@ def test_figures_that_are_none_are_a_feed_error(value: bytes) -> None:
 
 
 def test_columns_survive_the_round_trip() -> None:
-    """Those of every part, with their shapes; and rows are read by them."""
     columns = {"netem": PACKET_COLUMNS, "plan": plan_columns(3, 40)}
     assert {part: columns_of(text) for part, text in described(columns).items()} == columns
     row = np.zeros(2, PACKET_COLUMNS)
@@ -184,23 +180,18 @@ class Loop:
         self.later: list[Callable[[], None]] = []
 
     def add_reader(self, _: socket.socket, read: Callable[[], None]) -> None:
-        """See asyncio."""
         self.reads = read
 
     def remove_reader(self, _: socket.socket) -> None:
-        """See asyncio."""
         self.reads = None
 
     def add_writer(self, sock: socket.socket, write: Callable[[Any], None], reader: Any) -> None:
-        """See asyncio."""
         self.writes[sock] = lambda: write(reader)
 
     def remove_writer(self, sock: socket.socket) -> None:
-        """See asyncio."""
         del self.writes[sock]
 
     def call_later(self, _: float, then: Callable[[], None]) -> "Loop":
-        """See asyncio; time passes in `turn`."""
         self.later.append(then)
         return self
 
@@ -275,7 +266,6 @@ def numbers(frames: list[Frame]) -> list[int]:
 
 @pytest.fixture
 def driven(tmp_path: Path) -> Iterator[Driven]:
-    """A feed and its loop."""
     one = Driven(tmp_path / "netem.feed")
     yield one
     one.feed.close()
@@ -329,7 +319,6 @@ def test_rows_of_one_call_are_one_frame_of_each_part(driven: Driven) -> None:
 
 
 def test_what_is_kept_for_readers_to_come_is_bounded(driven: Driven) -> None:
-    """The oldest gives way, in whole frames."""
     size = 10_000
     driven.tell(*range(250), size=size)
     looker, frames = driven.look(), list[Frame]()
@@ -383,7 +372,6 @@ def test_without_the_bound_memory_grows_for_who_does_not_read(
 
 
 def test_readers_beyond_the_last_place_are_turned_away(driven: Driven) -> None:
-    """Those who read are not disturbed, and a place that becomes free is given away again."""
     lookers = [driven.look() for _ in range(READERS_MAX + 2)]
     driven.tell(1)
     assert [numbers(looker.read()) for looker in lookers] == [[1]] * READERS_MAX + [[], []]
@@ -395,7 +383,6 @@ def test_readers_beyond_the_last_place_are_turned_away(driven: Driven) -> None:
 
 
 def test_a_reader_that_is_killed_is_forgotten(driven: Driven) -> None:
-    """In the middle of a frame, with much that waits; what the kernel says of it hurts nobody."""
     driven.tell(*range(100), size=10_000)
     gone, stays = driven.look(), driven.look()
     gone.socket.recv(1000)
@@ -409,7 +396,6 @@ def test_a_reader_that_is_killed_is_forgotten(driven: Driven) -> None:
 
 
 def test_what_a_reader_sends_is_never_read(driven: Driven) -> None:
-    """His own buffer is full then, and no more."""
     hostile, other = driven.look(), driven.look()
     with suppress(BlockingIOError):
         while True:
@@ -433,7 +419,6 @@ def test_one_reader_is_let_in_at_a_time_with_a_rest_after_each(driven: Driven) -
 
 
 def test_with_nobody_reading_nothing_is_sent_or_timed(driven: Driven) -> None:
-    """Frames are kept for those to come, and that is all."""
     driven.loop.turn()
     driven.loop.later.clear()
     driven.part.write(b"x" * 36)
@@ -444,7 +429,6 @@ def test_with_nobody_reading_nothing_is_sent_or_timed(driven: Driven) -> None:
 
 
 def test_at_the_end_readers_get_the_rest(driven: Driven) -> None:
-    """Also what was said after the loop had ended; then the feed hangs up and is gone."""
     looker = driven.look()
     driven.part.write(b"\x07" * 36)
     driven.feed.take()
@@ -469,7 +453,6 @@ def test_the_end_does_not_wait_long_for_who_does_not_read(
 
 
 def test_nobody_but_the_owner_can_look(driven: Driven) -> None:
-    """The socket's mode says so from its first moment on."""
     assert stat.S_IMODE(driven.path.lstat().st_mode) == 0o600
 
 
@@ -527,7 +510,6 @@ class Passing(Proxy):
         self.recorder = recorder
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Change, and perhaps end."""
         super().change(scenario, keys, now_ns=now_ns)
         self.recorder.append(1, number=round(100 * scenario.network.uplink.loss))
         self.finished = scenario.network.uplink.loss == 1.0
@@ -542,19 +524,16 @@ class Seen:
         self.came = threading.Condition()
 
     def take(self, name: str, frame: Frame) -> None:
-        """Take a frame."""
         with self.came:
             self.frames[name].append(frame)
             self.came.notify_all()
 
     def lose(self, name: str) -> None:
-        """Note that a feed has ended."""
         with self.came:
             self.lost[name] += 1
             self.came.notify_all()
 
     def wait(self, done: Callable[[], bool]) -> None:
-        """Wait until something has come."""
         with self.came:
             assert self.came.wait_for(done, PATIENCE_S)
 
@@ -628,7 +607,6 @@ def test_a_process_tells_its_readers_while_it_is_driven(
 def test_a_subscriber_begins_anew_where_a_process_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also after one that told garbage; once closed it calls nobody any more."""
     monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.02)
     path, seen = tmp_path / "feed", Seen()
     with closing(Subscriber({"netem": path}, seen.take, seen.lose)):
@@ -702,14 +680,12 @@ def test_the_plans_told_are_those_that_are_sent(
 
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
-    """Thousands of them would fill the memory."""
     flown = msgspec.structs.replace(DEMO, duration=6.0)
     (one,) = flight.fly_batch(flown, [1])
     assert len(one.plan) == 0
 
 
 def test_events_are_of_the_log_and_limited() -> None:
-    """A reader is sent the events that the log has, and no others."""
     from skytether.shell.log import Log
 
     told: list[Event] = []

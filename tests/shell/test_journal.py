@@ -31,7 +31,6 @@ def begun(folder: Path, scenario: Scenario = DEMO, *, new_flight: bool = False) 
 
 
 def kept(folder: Path) -> Path:
-    """Place of the journal."""
     return folder / "netem.set"
 
 
@@ -106,7 +105,6 @@ def test_without_a_control_socket_there_is_none() -> None:
 def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
     tmp_path: Path,
 ) -> None:
-    """It was checked when it was set, and is read as it was written then."""
     first = begun(tmp_path, SWAP)
     assert first.journal
     first.journal.write({"mission.zones": BOX})
@@ -157,8 +155,6 @@ def test_one_of_another_flight_is_refused_in_words(
 def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is in force all the same, as the answer says."""
-
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -27,7 +27,6 @@ from skytether.shell.udp import AddressError
     ],
 )
 def test_a_line_is_what_is_written(text: str, line: Line, peer: Address | None) -> None:
-    """Whoever is at its other end is known before it speaks, but where we listen."""
     assert parse_line("vehicle.address", text) == line
     assert line.peer == peer
 
@@ -49,7 +48,6 @@ class Echo(Endpoint):
         self.heard = b""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Say it back."""
         assert datagram.socket == 1
         self.heard += datagram.payload
         self.send(datagram.payload, datagram.peer, 1)
@@ -62,7 +60,6 @@ class Echo(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether it has heard enough."""
         return self.heard.endswith(self._enough)
 
 
@@ -135,7 +132,6 @@ def test_a_rate_that_no_port_has_is_refused() -> None:
 
 @pytest.mark.parametrize("kind", ["udp", "udpout"])
 def test_udp_listens_or_speaks_first(kind: str) -> None:
-    """Both are answered where what was heard came from."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.bind(("127.0.0.1", 0))
         autopilot.settimeout(5)

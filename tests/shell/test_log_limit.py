@@ -20,7 +20,6 @@ def test_the_first_few_of_a_kind_are_told_and_the_others_counted() -> None:
 
 
 def test_what_was_left_out_is_told_before_the_next_of_its_kind() -> None:
-    """In their order, and each second anew, though nobody asks in between."""
     limit, event = Limit(), Flying(vehicle=1)
     assert told(limit, [event] * 8, 0) == [event] * 5
     assert told(limit, [event] * 7, SECOND_NS) == [
@@ -31,7 +30,6 @@ def test_what_was_left_out_is_told_before_the_next_of_its_kind() -> None:
 
 
 def test_a_flood_of_one_kind_hides_no_other() -> None:
-    """Strangers who are refused leave room for the vehicle that is gone."""
     limit, gone = Limit(), SessionEnded(vehicle=1)
     told(limit, [Flying(vehicle=n) for n in range(100)], 0)
     assert told(limit, [gone], 0) == [gone]
@@ -44,7 +42,6 @@ def test_the_end_tells_what_was_left_out_though_its_second_is_not_over() -> None
 
 
 def test_what_an_endpoint_has_left_out_itself_is_added() -> None:
-    """Also where none of its kind was told."""
     limit = Limit()
     events = [Omitted(kind="Flying", count=4), *(Flying(vehicle=n) for n in range(7))]
     assert told(limit, events, 0) == events[1 : 1 + KIND_MAX]

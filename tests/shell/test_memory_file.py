@@ -30,7 +30,6 @@ def put(path: Path, held: bytes) -> None:
 
 
 def a_file(path: Path) -> bytes:
-    """A file that was kept."""
     kept = MemoryFile(path, IDENTITY, SECRET)
     held = kept.sealed(CONTENT, WRITTEN_NS)
     kept.close()
@@ -57,22 +56,18 @@ class Keeps(Endpoint):
         """See `Endpoint`."""
 
     def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002
-        """See `Endpoint`."""
         return self.wanted.pop(0) if self.wanted else None
 
     def kept(self) -> None:
-        """See `Endpoint`."""
         self.written += 1
 
 
 async def until(so: Callable[[], bool]) -> None:
-    """Wait until something is so."""
     while not so():
         await asyncio.sleep(0.01)
 
 
 def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
-    """In the same run of the host, whose clock goes on."""
     put(path, a_file(path))
     kept = MemoryFile(path, IDENTITY, SECRET)
     assert kept.read() == (CONTENT, WRITTEN_NS)
@@ -80,7 +75,6 @@ def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
 
 
 def test_without_a_file_there_is_nothing(path: Path) -> None:
-    """The folder is made for the owner alone."""
     kept = MemoryFile(path, IDENTITY)
     assert kept.read() is None
     assert path.parent.stat().st_mode & 0o777 == 0o700
@@ -90,7 +84,6 @@ def test_without_a_file_there_is_nothing(path: Path) -> None:
 def test_after_a_restart_of_the_host_its_clock_says_nothing(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was kept is there, and its time is not known."""
     put(path, a_file(path))
     monkeypatch.setattr(memory, "_host", lambda: "another run")
     kept = MemoryFile(path, IDENTITY, SECRET)
@@ -99,7 +92,6 @@ def test_after_a_restart_of_the_host_its_clock_says_nothing(
 
 
 def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
-    """Each byte of it, and each length."""
     held = a_file(path)
     kept = MemoryFile(path, IDENTITY, SECRET)
     cut = [held[:size] for size in range(len(held))]
@@ -115,7 +107,6 @@ def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
 
 @pytest.mark.parametrize("name", IDENTITY)
 def test_what_another_flight_has_kept_is_refused_with_what_differs(name: str, path: Path) -> None:
-    """Another vehicle, key, autopilot or rule of flight."""
     put(path, a_file(path))
     kept = MemoryFile(path, IDENTITY | {name: "other"}, SECRET)
     with pytest.raises(MemoryRefused, match=rf"{name}: got {IDENTITY[name]}, expected other"):
@@ -124,7 +115,6 @@ def test_what_another_flight_has_kept_is_refused_with_what_differs(name: str, pa
 
 
 def test_a_file_made_with_another_secret_is_refused(path: Path) -> None:
-    """Nobody without the vehicle's key can make one."""
     put(path, a_file(path))
     kept = MemoryFile(path, IDENTITY, SECRET[::-1])
     with pytest.raises(MemoryRefused, match=r"another key"):
@@ -142,7 +132,6 @@ def test_a_file_that_others_may_write_is_refused(path: Path) -> None:
 
 
 def test_two_processes_do_not_share_a_memory(path: Path) -> None:
-    """The second is refused until the first has ended."""
     first = MemoryFile(path, IDENTITY)
     with pytest.raises(OSError, match=r"another process keeps its memory there"):
         MemoryFile(path, IDENTITY)
@@ -169,7 +158,6 @@ async def test_a_thread_writes_the_newest_and_says_so(path: Path) -> None:
 async def test_a_disk_that_fails_is_told_once_and_tried_again(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The endpoint hears nothing of it until the file is there."""
     monkeypatch.setattr(memory, "AGAIN_S", 0.01)
     kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
     elsewhere = path.parent.rename(path.parent.with_name("gone"))

@@ -47,7 +47,6 @@ EXPRESSIONS = [
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, set[str]], str]:
-    """See `_flown`."""
     return asyncio.run(_flown(tmp_path_factory.mktemp("feeds")))
 
 
@@ -106,23 +105,19 @@ async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
 
 
 def at(address: Address) -> str:
-    """An address as a flag has it."""
     return f"{address[0]}:{address[1]}"
 
 
 def fetched(address: Address, path: str) -> str:
-    """Body of an answer of 200."""
     with urllib.request.urlopen(f"http://{at(address)}{path}", timeout=10.0) as answer:
         return str(answer.read().decode())
 
 
 def metrics_of(expression: str) -> set[str]:
-    """Names of the metrics in an expression."""
     return set(re.findall(r"skytether_[a-z_]+", expression))
 
 
 def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]]) -> None:
-    """By processes that fly; and those of them are known by name."""
     asked = set[str]().union(*map(metrics_of, EXPRESSIONS))
     assert asked - set(exported) <= NEVER_YET
     assert set(exported) <= names()
@@ -131,7 +126,6 @@ def test_every_metric_that_is_asked_for_is_served(exported: dict[str, set[str]])
 
 
 def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str]], str]) -> None:
-    """The program in docs/operating.md prints positions while three processes fly."""
     lines = flown[1].splitlines()
     assert len(lines) > 20
     assert all(re.fullmatch(r"vehicle 1 is at \[[^]]*\] m", line) for line in lines)
@@ -154,7 +148,6 @@ def test_every_label_that_is_asked_for_is_served(exported: dict[str, set[str]]) 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 def test_expressions_fit_what_they_are_about(expression: str) -> None:
-    """Rates are of what only grows, quantiles of buckets, and brackets are closed."""
     for opening, closing in ("()", "[]", "{}"):
         assert expression.count(opening) == expression.count(closing)
     kinds = {metric.name: metric.kind for table in TABLES.values() for metric in table}
@@ -168,7 +161,6 @@ def test_expressions_fit_what_they_are_about(expression: str) -> None:
 
 
 def test_panels_lie_side_by_side() -> None:
-    """None over another, and each asks the one source there is."""
     (source,) = yaml.safe_load(
         (OBSERVE / "grafana/provisioning/datasources/prometheus.yml").read_text()
     )["datasources"]
@@ -199,12 +191,10 @@ def test_what_is_scraped_is_what_the_services_serve() -> None:
 
 
 def observing() -> Iterator[tuple[str, dict[str, Any]]]:
-    """Services of the profile."""
     return ((name, each) for name, each in COMPOSE.items() if each.get("profiles") == ["observe"])
 
 
 def test_the_observers_are_pinned_and_locked_in() -> None:
-    """Read-only, without privileges, for this machine alone; and what they mount is there."""
     assert {name for name, _ in observing()} == {"prometheus", "grafana"}
     for _, service in observing():
         assert re.fullmatch(r"[a-z]+/[a-z]+:v?\d+\.\d+\.\d+", service["image"])

@@ -24,7 +24,6 @@ def test_a_bar_shows_title_amount_unit_and_text(
 
 
 def test_without_a_terminal_nothing_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    """A log file is no place for a bar."""
     with progress("flying", 60.0) as bar:
         bar(30.0, "half-way")
     assert capsys.readouterr() == ("", "")

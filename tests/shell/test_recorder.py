@@ -18,13 +18,11 @@ from skytether.shell.recording import RecordFile
 
 
 def append(to: RecordFile, count: int) -> None:
-    """Record rows, numbered from 0."""
     for number in range(count):
         to.recorder.append(1, number=number)
 
 
 def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
-    """All of them, and nothing is said."""
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 1000)
@@ -35,7 +33,6 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
 
 
 def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
-    """Nobody has to end anything for it: a process that is killed keeps them."""
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 10)
@@ -54,13 +51,11 @@ class OnAFullDisk(files.Growing):
 
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file on a disk that is full."""
     monkeypatch.setattr(files, "Growing", OnAFullDisk)
     return Path("record")
 
 
 def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done(full: Path) -> None:
-    """With what there is of the record; the flight, which is the block, goes on to its end."""
     flown = []
 
     def fly() -> None:
@@ -80,8 +75,6 @@ def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done(full: Pa
 def test_without_a_temporary_file_a_flight_is_flown_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nothing is recorded, and this is said."""
-
     def nowhere(*_: object, **__: object) -> BinaryIO:
         raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
 

@@ -51,7 +51,6 @@ def test_a_folder_is_gone_at_the_end(tmp_path: Path) -> None:
 def test_the_next_start_clears_what_a_dead_process_has_left(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    """Nothing is removed while its owner lives."""
     with holding() as owner:
         assert owner.stdout is not None
         left = Path(owner.stdout.readline().strip())
@@ -88,7 +87,6 @@ def test_what_is_not_ours_stays(tmp_path: Path) -> None:
 def test_what_is_written_while_it_is_removed_is_cleared_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Files that another process adds during the removal are cleared by the next run."""
     with monkeypatch.context() as patch, folder() as made:
         (made / "below").mkdir()
 

@@ -36,7 +36,6 @@ def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
 
 
 def test_pieces_share_a_write_but_none_is_torn(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
-    """No write is longer than it may be, and each ends where a piece ends."""
     reading, writing = pipe
     writer = Writer(writing, room=10**6, together=100, pause_s=0.1)
     for _ in range(9):
@@ -46,7 +45,6 @@ def test_pieces_share_a_write_but_none_is_torn(pipe: tuple[IO[bytes], IO[bytes]]
 
 
 def test_nobody_waits_for_a_reader_who_does_not_read(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
-    """Lines without room are dropped whole and counted; the queued ones still arrive."""
     reading, writing = pipe
     pages = 0
     os.set_blocking(writing.fileno(), False)
@@ -87,7 +85,6 @@ def test_a_full_disk_ends_the_writing_and_nothing_else() -> None:
 
 
 def test_a_reader_who_is_gone_ends_the_writing_and_nothing_else() -> None:
-    """A closed pipe ends the writing as a full disk does: the failure is kept, not raised."""
     reading, number = os.pipe()
     os.close(reading)
     with os.fdopen(number, "wb", buffering=0) as writing:
@@ -99,7 +96,6 @@ def test_a_reader_who_is_gone_ends_the_writing_and_nothing_else() -> None:
 
 
 def test_without_a_file_all_is_left_out() -> None:
-    """A thousand rows are accepted and dropped, and the failure to open is kept."""
     closed = OSError(errno.EBADF, "closed")
     writer = Writer(closed, room=100, together=100)
     for _ in range(1000):

@@ -48,7 +48,6 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator["sync_api.Browser"]:
-    """Chromium, drawing in software."""
     PICTURES.mkdir(exist_ok=True)
     with chromium() as launched:
         yield launched
@@ -106,7 +105,6 @@ def test_the_loss_slider_changes_the_measured_loss(
 def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
     browser: "sync_api.Browser", flight: str
 ) -> None:
-    """In words, in this order; and the vehicle flies its plans again."""
     with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")
         page.get_by_role("button", name="Cut the link").click()
@@ -128,7 +126,6 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
 
 
 def test_what_may_end_a_flight_is_asked_once_more(browser: "sync_api.Browser", flight: str) -> None:
-    """Disarming, and losing all packets by the slider; leaving it changes nothing."""
     with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")
         armed = page.get_by_label("Armed")
@@ -155,10 +152,7 @@ def test_a_website_cannot_show_the_page_in_a_frame_and_catch_a_click(
     )
 
     class Website(BaseHTTPRequestHandler):
-        """A website of a stranger."""
-
         def do_GET(self) -> None:
-            """Send the page with the frame."""
             self.send_response(200)
             self.send_header("Content-Type", "text/html")
             self.end_headers()
@@ -286,7 +280,6 @@ def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
 
 
 def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", flight: str) -> None:
-    """Pictures are taken; and the page is as light as it is asked to be."""
     pictures(browser, flight, PICTURES)
     with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")

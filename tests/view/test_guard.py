@@ -46,7 +46,6 @@ CAMERA = {
 
 
 def messages(payload: bytes) -> list[dict[str, Any]]:
-    """Messages that viser sends a browser at once."""
     size = int.from_bytes(payload[8:16], "little")
     inner = msgspec.msgpack.decode(zstandard.decompress(payload[16 : 16 + size]))
     return [each[1] if isinstance(each, list) else each for each in inner["messages"]]
@@ -118,7 +117,6 @@ def uploaded(uuid: str, number: int) -> tuple[bytes, bytes]:
 
 @pytest.fixture(scope="module")
 def flown() -> PageFlight:
-    """A flight that is over."""
     scenario = msgspec.structs.replace(reading.load("demo"), duration=10.0)
     flight = PageFlight()
     for _, process, frame_of_it in of_flight(scenario, "demo", virtual.fly(scenario)):
@@ -128,7 +126,6 @@ def flown() -> PageFlight:
 
 @pytest.fixture
 def page(flown: PageFlight) -> Iterator[Page]:
-    """A page of it."""
     with closing(Page("127.0.0.1", 0, [flown], now_ns=lambda: flown.state.newest_ns)) as served:
         yield served
 
@@ -148,7 +145,6 @@ def joined(
 
 
 def send(browser: ClientConnection, **message: Any) -> None:
-    """Send a message of viser's."""
     browser.send(msgspec.msgpack.encode(message))
 
 
@@ -163,7 +159,6 @@ def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
 
 
 def counts(page: Page) -> dict[TurnedAway, int]:
-    """Number of refusals, by reason."""
     return dict(page._guard.counts)
 
 
@@ -180,7 +175,6 @@ def counts(page: Page) -> dict[TurnedAway, int]:
 def test_a_website_of_a_stranger_reads_nothing(
     page: Page, origin: str | None, host: str, why: TurnedAway
 ) -> None:
-    """Under its own name, under none, or under one that it lets mean this machine."""
     with pytest.raises(InvalidStatus) as refused:
         joined(page, origin and origin.format(port=page.port), host)
     assert refused.value.response.status_code == 403
@@ -208,7 +202,6 @@ def test_who_has_the_token_in_the_address_is_asked_nothing_else(flown: PageFligh
 
 
 def test_a_page_by_a_name_says_why_it_stays_empty(page: Page) -> None:
-    """Instead of waiting for its websocket for ever."""
     for host, status in ((b"drone.example", b"403"), (b"127.0.0.1", b"200")):
         with socket.create_connection(("127.0.0.1", page.port)) as sock:
             sock.sendall(b"GET / HTTP/1.1\r\nHost: " + host + b"\r\n\r\n")
@@ -228,7 +221,6 @@ def test_a_page_by_a_name_says_why_it_stays_empty(page: Page) -> None:
 def test_no_answer_may_be_shown_in_a_frame(
     page: Page, request_: bytes, status: bytes | None
 ) -> None:
-    """Neither the page nor a refusal: a website would catch clicks in it."""
     with socket.create_connection(("127.0.0.1", page.port)) as sock:
         sock.sendall(request_)
         head = sock.recv(4096).partition(b"\r\n\r\n")[0].split(b"\r\n")
@@ -238,7 +230,6 @@ def test_no_answer_may_be_shown_in_a_frame(
 
 
 def test_a_refused_websocket_may_not_be_shown_in_a_frame(page: Page) -> None:
-    """Nor what a browser shows in its place."""
     with pytest.raises(InvalidStatus) as refused:
         joined(page, "http://evil.example")
     headers = refused.value.response.headers
@@ -253,7 +244,6 @@ class Asked:
         self.asked: list[tuple[str, dict[str, Any]]] = []
 
     def ask(self, process: str, values: dict[str, Any]) -> None:
-        """Note a change."""
         self.asked.append((process, values))
 
     def close(self) -> None:
@@ -305,7 +295,6 @@ def _keys(table: object) -> list[tuple[str, object]]:
 
 
 def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> None:
-    """With the name of an element of the browser's own; nothing of it is kept."""
     with joined(page) as browser:
         send(browser, **CAMERA)
         uuid = element(browser)
@@ -327,7 +316,6 @@ def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> No
 
 
 def test_a_huge_frame_ends_the_connection(page: Page) -> None:
-    """Before it has come: by its length; one of 64 KiB is read."""
     with joined(page) as browser:
         browser.send(bytes(guard.MESSAGE_BYTES_MAX))
         until(lambda: counts(page).get(TurnedAway.MESSAGE))
@@ -366,7 +354,6 @@ def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
 
 
 def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
-    """The newest value of each element waits for him, and no more."""
     with closing(opened(page.port)) as sock:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         until(lambda: page._panels)
@@ -411,7 +398,6 @@ def test_nothing_is_drawn_for_who_does_not_read(
 def test_a_value_that_makes_no_sense_costs_nobody_else_the_page(
     page: Page, message: dict[str, Any]
 ) -> None:
-    """At most, the browser that sent it is refused."""
     with joined(page) as other, joined(page) as browser:
         send(other, **CAMERA)
         assert element(other)
@@ -427,7 +413,6 @@ def test_a_value_that_makes_no_sense_costs_nobody_else_the_page(
 def test_browsers_beyond_the_most_are_turned_away(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Connections are counted as well, whatever they want; those that are there stay."""
     monkeypatch.setattr(guard, "BROWSERS_MAX", 1)
     with joined(page) as first:
         assert first.recv(timeout=PATIENCE_S)
@@ -457,7 +442,6 @@ def test_a_page_of_another_version_is_told_so(page: Page) -> None:
 
 
 async def test_messages_wait_for_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few hundred at once are read at once, and then so many a second."""
     now_s = 1000.0
 
     async def sleep(pause_s: float) -> None:

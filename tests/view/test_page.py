@@ -78,12 +78,10 @@ HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
 def test_only_this_machine_and_who_knows_the_token_may_play(
     host: str, path: str, headers: dict[str, str], token: str, *, may: bool
 ) -> None:
-    """Neither strangers, nor their pages in a browser of this machine."""
     assert may_play(Visitor(host, path, headers), token) is may
 
 
 def test_a_name_that_only_looks_like_this_machine_is_none() -> None:
-    """Names are compared whole, and looked up by nobody."""
     for host in ("localhost.evil.example", "127.0.0.1.evil.example", "0.0.0.0", "::", ""):
         assert not is_loopback(host), host
 
@@ -110,7 +108,6 @@ def running(process: str, scenario: schema.Scenario) -> tuple[Running, dict[str,
 
 @pytest.mark.parametrize("axes", [2, 3])
 def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
-    """Its lowest, highest and some number in between are accepted, and read back as they are."""
     scenario = reading.load("demo")
     model = msgspec.structs.replace(scenario.model, axes=axes)
     control = msgspec.structs.replace(scenario.control, horizon=50)  # fits, whatever the delay
@@ -127,7 +124,6 @@ def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
 
 
 def test_every_trigger_that_is_offered_can_be_flown() -> None:
-    """With the scheme for which it is offered."""
     demo = reading.load("demo")
     for scheme in ("committed", "predictive", "none", "trajectory"):
         offered = triggers(scheme, "always")
@@ -153,7 +149,6 @@ NETWORK = {
 
 
 def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
-    """Those that it compares with, unless they stand in it."""
     assert compared("cost_gap | silence(1)") == {"control.cost_gap"}
     assert compared("cost_gap(2) & budget(5, 2) | periodic") == {"control.period"}
     assert compared("state_gap") == {"control.epsilon", "control.decay_rate"}
@@ -217,7 +212,6 @@ def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
 
 
 def test_a_player_shows_any_time_of_a_flight() -> None:
-    """Forwards as it comes, and the same when it is sought, backwards too."""
     scenario = msgspec.structs.replace(reading.load("demo"), duration=10.0)
     frames = list(of_flight(scenario, "demo", virtual.fly(scenario)))
     flight = PageFlight()
@@ -237,7 +231,6 @@ def test_a_player_shows_any_time_of_a_flight() -> None:
 
 
 def test_a_duel_is_on_the_same_network_and_seed() -> None:
-    """Those of the first, whatever the second one says."""
     one, other = both(DuelOptions("demo", "paper-no-compensation", duration=12.0, seed=7))
     assert one.network == other.network
     assert (one.seed, other.seed, one.duration, other.duration) == (7, 7, 12.0, 12.0)
@@ -262,7 +255,6 @@ def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
 
 
 def test_a_plot_with_gaps_reaches_a_browser() -> None:
-    """The library takes them, and puts them on the wire as they are."""
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
         plot = plots.Plot("", (plots.PlotLine("age", lambda look: look.curves.age_s),))
@@ -295,7 +287,6 @@ def test_the_figures_of_a_report_have_a_gap_where_rows_are_missing() -> None:
 
 
 def test_a_scene_has_room_for_all_that_is_flown() -> None:
-    """Lines on the ground reach further than what is shown, in steps that are round."""
     middle, reach_m = extent([reading.load("demo")])
     assert middle == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
     assert 2.0 < reach_m < 3.0
@@ -308,7 +299,6 @@ def test_a_scene_has_room_for_all_that_is_flown() -> None:
 
 
 def fenced(**keys: Any) -> Scenario:
-    """The scenario demo, with a fence."""
     scenario = reading.load("demo")
     return msgspec.structs.replace(
         scenario, fence=msgspec.convert(keys, type(scenario.fence), strict=False)
@@ -316,7 +306,6 @@ def fenced(**keys: Any) -> Scenario:
 
 
 def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
-    """In the plane a rectangle has four sides; one that is open reaches far on that side."""
     box = fence(fenced(low_m=(-3, -2), high_m=(3, 2)), 2.0)
     assert box.shape == (4, 2, 3)
     assert (np.abs(box).max(axis=(0, 1)) == [3.0, 2.0, 0.0]).all()
@@ -363,7 +352,6 @@ def neighbours() -> Iterator[int]:
 def test_a_page_is_served_on_the_next_free_port_where_its_own_is_taken(
     tmp_path: Path, neighbours: int
 ) -> None:
-    """The address that is printed works, and the page loads nothing from outside."""
     at = f"127.0.0.1:{neighbours}"
     address, page = heard(at, tmp_path)
     assert f"http://127.0.0.1:{neighbours + 2} " in address
@@ -384,6 +372,5 @@ def test_where_no_port_is_free_that_is_said(
 
 
 def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:
-    """A page that cannot be served is reported in a line, and nothing is raised."""
     (line,) = heard("192.0.2.1:8080", tmp_path)
     assert "192.0.2.1:8080" in line

@@ -58,7 +58,6 @@ def demo(cut_s: float = 0.0, vehicles: int = 1, name: str = "demo-committed") ->
 
 
 def state_of(frames: tuple[tuple[int, str, Frame], ...]) -> State:
-    """State after all of these frames."""
     state = State()
     for _, process, frame in frames:
         state.take(process, frame)
@@ -66,7 +65,6 @@ def state_of(frames: tuple[tuple[int, str, Frame], ...]) -> State:
 
 
 def test_the_curves_of_a_vehicle_are_its_record() -> None:
-    """Step by step, on a grid of the steps themselves."""
     shown = demo()
     track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
     dt = shown.scenario.control.dt
@@ -118,7 +116,6 @@ def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
 
 
 def test_the_error_is_that_of_the_record() -> None:
-    """The root mean square over the last seconds."""
     shown = demo()
     away = (
         shown.flown.client["state"][-100:, :, 0]
@@ -132,7 +129,6 @@ def test_the_error_is_that_of_the_record() -> None:
 
 
 def test_the_plan_leads_on_from_where_the_vehicle_is() -> None:
-    """No step of it is longer than the fastest that can be flown."""
     shown = demo()
     track = shown.state.vehicles[1]
     ahead = track.ahead()
@@ -172,7 +168,6 @@ def test_loss_and_rates_are_those_of_the_packets(name: str, least: int) -> None:
 
 
 def test_a_cut_link_is_said_in_words_and_colour() -> None:
-    """Brakes, then hovers; and no plan is drawn."""
     shown = demo(cut_s=5.0)
     state, number = shown.state, 1
     assert state.link(number, shown.now_ns).word == "CUT"
@@ -195,7 +190,6 @@ def test_a_cut_link_is_said_in_words_and_colour() -> None:
 
 
 def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() -> None:
-    """Nothing without an autopilot, and dashes for what makes no sense."""
     shown = demo()
     state, number = shown.state, 1
     assert "autopilot" not in words.status(state, number, shown.now_ns)
@@ -212,7 +206,6 @@ def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() ->
 
 
 def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
-    """Zones as they were changed last, drawn around their corners; the nearest of the others."""
     scenario = reading.load("swap")
     shape = msgspec.structs.replace(scenario.reference, shape="swap(4)")
     scenario = msgspec.structs.replace(scenario, duration=25.0, reference=shape)
@@ -275,7 +268,6 @@ def test_what_comes_again_counts_once() -> None:
 
 
 def test_another_flight_of_the_same_processes_begins_anew() -> None:
-    """Nothing of the flight before is left."""
     shown = demo()
     state = state_of(shown.frames)
     opened = next(frame for _, process, frame in shown.frames if process == "client")
@@ -301,7 +293,6 @@ def test_several_vehicles_are_shown_and_no_more_than_a_bound() -> None:
 def opened(
     process: str, parts: dict[str, np.dtype[np.void]], scenario: Scenario | None = None
 ) -> Opened:
-    """First frame of a process with these parts."""
     return Opened(
         process=process,
         name="demo",
@@ -313,7 +304,6 @@ def opened(
 
 
 def test_a_day_takes_no_more_memory_than_a_minute() -> None:
-    """Rings, events and histograms keep their sizes."""
     scenario = reading.load("demo")
     fast = msgspec.structs.replace(
         scenario, control=msgspec.structs.replace(scenario.control, dt=0.001)
@@ -358,7 +348,6 @@ def test_what_makes_no_sense_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_part_with_columns_of_no_flight_is_left_out() -> None:
-    """Those of another number of axes: it is not drawn."""
     state, columns = State(), client_columns(3)
     rows = np.zeros(1, columns)
     rows["vehicle"] = 1
@@ -380,7 +369,6 @@ def test_rows_of_an_hour_ago_change_nothing() -> None:
 
 
 def test_what_is_said_cannot_become_part_of_the_page() -> None:
-    """Texts of events and titles are escaped."""
     shown = demo()
     state = state_of(shown.frames)
     evil = ModeChanged(vehicle=1, before="track", after="brake", reason="<script>alert(1)</script>")
@@ -403,7 +391,6 @@ def test_it_says_how_old_what_the_server_knows_is() -> None:
 
 
 def test_netem_alone_is_a_network_and_no_flight() -> None:
-    """Its packets, losses and queues are shown, and no vehicle is waited for."""
     frames = [frame for frame in demo().frames if frame[1] == "netem"]
     state = state_of(tuple(frames))
     assert not state.flies
@@ -432,5 +419,4 @@ def test_netem_alone_is_a_network_and_no_flight() -> None:
 
 
 def test_every_mode_has_a_colour() -> None:
-    """A pilot who takes over, and a return, are shown as any other mode."""
     assert set(MODE_COLOURS) == set(Mode)

@@ -65,12 +65,10 @@ SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=6.0, settle=3.
 
 @cache
 def flown() -> Record:
-    """A short flight."""
     return flight.fly(SCENARIO)
 
 
 def record(path: Path, scenario: Scenario = SCENARIO, of: Record | None = None) -> Path:
-    """A recording of a flight in virtual time."""
     of = of or flown()
     summary = summarise(scenario, "demo", of.client, of.server, of.netem)
     assert recorder.write(path, scenario, "demo", of, summary) is None
@@ -100,12 +98,10 @@ def write_frames(
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recording of the short flight; not to be changed."""
     return record(tmp_path_factory.mktemp("recording") / "flight.mcap")
 
 
 def summary_of(of: Record) -> Summary:
-    """Summary of a flight of the scenario."""
     return summarise(SCENARIO, "demo", of.client, of.server, of.netem)
 
 
@@ -115,7 +111,6 @@ def is_named(record: Any, name: str) -> bool:
 
 
 def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    """Exit code and the one line of a command."""
     code = command.main(of, argv, "it")
     (line,) = capsys.readouterr().err.splitlines()
     return code, line
@@ -125,7 +120,6 @@ def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tup
 
 
 def test_a_flight_comes_back_to_the_last_bit(recording: Path) -> None:
-    """Every part, the frames with their times, the scenario and the summary."""
     back = read(recording)
     assert (back.about.scenario, back.scenario, back.lost_bytes) == ("demo", SCENARIO, None)
     assert back.summary == summary_of(flown())
@@ -152,7 +146,6 @@ def test_frames_of_a_flight_are_in_the_order_of_their_times() -> None:
 
 
 def test_a_fleet_in_space_comes_back() -> None:
-    """Each of two vehicles, whose rows alternate, has topics of its own."""
     scenario = reading.check(
         reading.to_table(SCENARIO) | {"model": {"axes": 3}, "duration": 2.0, "settle": 0.0}
     )
@@ -165,7 +158,6 @@ def test_a_fleet_in_space_comes_back() -> None:
 
 
 def topics_of(file: Any) -> dict[str, int]:
-    """Number of messages on each topic of a file."""
     file.seek(0)
     summary = make_reader(file).get_summary()
     assert summary is not None
@@ -239,7 +231,6 @@ def undrawable(schema: Mapping[str, Any]) -> str:
 
 
 def test_every_message_is_as_its_schema_says(recording: Path) -> None:
-    """Every schema is one that Foxglove and Lichtblick can read."""
     with recording.open("rb") as file:
         seen = set()
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
@@ -267,7 +258,6 @@ def test_every_message_is_as_its_schema_says(recording: Path) -> None:
 
 
 def messages_on(path: Path, topic: str) -> list[dict[str, Any]]:
-    """Messages on a topic."""
     with path.open("rb") as file:
         return [
             json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topic)
@@ -275,7 +265,6 @@ def messages_on(path: Path, topic: str) -> list[dict[str, Any]]:
 
 
 def test_the_scene_is_where_the_flight_was(recording: Path) -> None:
-    """The vehicle at its position, its plan from there on, each a line through positions."""
     rows = flown().client
     poses = messages_on(recording, "/vehicle/1/pose")
     x = [pose["pose"]["position"]["x"] for pose in poses]
@@ -317,7 +306,6 @@ def test_rows_are_read_in_the_order_in_which_they_were_made(tmp_path: Path) -> N
 
 
 def test_of_many_vehicles_only_the_first_are_drawn() -> None:
-    """The rows of the others are recorded all the same."""
     file, columns = io.BytesIO(), client_columns(2)
     rows = np.zeros(VEHICLES_MAX + 1, columns)
     rows["vehicle"] = np.arange(1, VEHICLES_MAX + 2)
@@ -330,7 +318,6 @@ def test_of_many_vehicles_only_the_first_are_drawn() -> None:
 
 
 def opened(columns: np.dtype[np.void], part: str = "client") -> Opened:
-    """First frame of a feed with one part."""
     toml = reading.to_toml(SCENARIO).decode()
     known = described({part: columns})
     return Opened(process=part, name="demo", scenario=toml, parts=known, wall_ns=0, time_ns=0)
@@ -340,7 +327,6 @@ def opened(columns: np.dtype[np.void], part: str = "client") -> Opened:
 
 
 def write_in_chunks(path: Path, frames: int, *, end: bool) -> Path:
-    """A recording of the short flight, a chunk for so many frames, with its end or without."""
     with path.open("wb") as file:
         write_frames(file, of_flight(SCENARIO, "demo", flown()), chunk=frames, end=end)
     return path
@@ -348,7 +334,6 @@ def write_in_chunks(path: Path, frames: int, *, end: bool) -> Path:
 
 @pytest.fixture(scope="module")
 def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with many chunks and no end."""
     return write_in_chunks(tmp_path_factory.mktemp("torn") / "torn.mcap", 12, end=False)
 
 
@@ -370,7 +355,6 @@ def ends(path: Path) -> list[tuple[int, int]]:
 def test_a_torn_recording_is_read_and_commands_say_so(
     torn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Here it is whole but for its end; the summary is that of the flight."""
     back = read(torn)
     assert back.lost_bytes == 0
     assert back.parts["client"].tobytes() == flown().client.tobytes()
@@ -418,7 +402,6 @@ def test_cut_anywhere_no_whole_chunk_is_lost(
 
 @pytest.fixture(scope="module")
 def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole recording of many chunks."""
     return write_in_chunks(tmp_path_factory.mktemp("chunked") / "chunked.mcap", 200, end=True)
 
 
@@ -446,7 +429,6 @@ def test_a_damaged_byte_is_never_believed(
 def test_without_its_checksum_a_changed_number_would_be_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only the checksum knows."""
     monkeypatch.setattr(
         "skytether.view.recording.Writer", partial(Writer, compression=CompressionType.NONE)
     )
@@ -489,7 +471,6 @@ while True:
 
 
 def test_a_killed_recorder_loses_less_than_a_second(tmp_path: Path) -> None:
-    """It was told something for two seconds; what is left is a recording that any reader opens."""
     path = tmp_path / "killed.mcap"
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
@@ -545,7 +526,6 @@ class Feeds:
 def live(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Live, Feeds, list[str]]]:
-    """A recorder of one feed, what it reads, and what it has told."""
     monkeypatch.setattr(recorder, "Subscriber", Feeds)
     told: list[str] = []
     made = Live(
@@ -562,14 +542,12 @@ def live(
 
 
 def row_at(step: int) -> Rows:
-    """Frame with a row of a step."""
     row = np.zeros(1, client_columns(2))
     row["vehicle"], row["step"] = 1, step
     return Rows(part="client", time_ns=step, rows=row.tobytes())
 
 
 def recorded_steps(path: Path) -> list[int]:
-    """Steps of which a recording has rows."""
     parts = read(path).parts
     return [int(step) for step in parts["client"]["step"]] if "client" in parts else []
 
@@ -618,7 +596,6 @@ def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_p
 
 
 def test_rows_that_never_came_are_missed_at_the_end(live: tuple[Live, Feeds, list[str]]) -> None:
-    """The processes' own record knows how many there are."""
     made, feeds, _ = live
     for frame in (opened(client_columns(2)), row_at(0)):
         feeds.take("client", frame)
@@ -631,7 +608,6 @@ def test_rows_that_never_came_are_missed_at_the_end(live: tuple[Live, Feeds, lis
 def test_a_disk_that_fills_up_costs_the_recording_alone(
     live: tuple[Live, Feeds, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is told once, and nothing is raised."""
     made, feeds, told = live
 
     def full(*_: object) -> None:
@@ -651,7 +627,6 @@ def test_a_disk_that_fills_up_costs_the_recording_alone(
 
 @pytest.mark.long
 def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
-    """All rows of all parts; the recording ends with the summary that is shown."""
     path, summary = tmp_path / "flight.mcap", tmp_path / "summary.json"
     flags = ["--duration", "3", "--settle", "0", "--json", str(summary), "--record", str(path)]
     flags += ["--network.uplink.delay", "none", "--network.downlink.delay", "none"]
@@ -692,7 +667,6 @@ def test_tables_have_plain_columns_with_units(recording: Path, tmp_path: Path) -
 
 
 def exported(recording: Path, folder: Path, part: str) -> list[dict[str, str]]:
-    """Rows of a part as CSV has them."""
     assert command.main(export, [str(recording), "--csv", str(folder)], "export") == 0
     with (folder / f"{part}.csv").open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -718,7 +692,6 @@ def test_what_is_not_known_is_empty_and_times_are_in_ms(recording: Path, tmp_pat
 
 
 def test_a_table_says_how_far_off_the_vehicle_was(recording: Path, tmp_path: Path) -> None:
-    """The errors of the table give the RMSE and maximum of the summary."""
     rows = exported(recording, tmp_path, "client")
     summary = read(recording).summary
     assert summary is not None
@@ -778,7 +751,6 @@ def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path:
 
 
 def other_mcap(path: Path) -> None:
-    """A file of MCAP that is none of ours."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -832,18 +804,15 @@ def changed(path: Path, out: Path, change: Callable[[list[Any]], object]) -> Pat
 
 
 def nest(found: list[Any]) -> None:
-    """A frame of lists in each other."""
     at, _ = flown_rows(found)[3]
     found[at] = replace(found[at], data=b"\x91" * 100_000)
 
 
 def flown_rows(found: list[Any]) -> list[tuple[int, dict[str, Any]]]:
-    """Frames of the client's rows, with their places."""
     return [(i, each) for i, each in frames_of(found, "Rows").items() if each["part"] == "client"]
 
 
 def widen(found: list[Any]) -> None:
-    """Rows that are very wide."""
     for at, begun in frames_of(found, "Opened").items():
         if "client" in begun["parts"]:
             columns = [*json.loads(begun["parts"]["client"]), ["more_mps", "<f8", [2, 50_000]]]
@@ -851,7 +820,6 @@ def widen(found: list[Any]) -> None:
 
 
 def write_in(found: list[Any], column: str, value: float) -> None:
-    """Another number in a row."""
     at, frame = flown_rows(found)[3]
     rows = np.frombuffer(frame["rows"], client_columns(2)).copy()
     rows[column] = value
@@ -859,20 +827,17 @@ def write_in(found: list[Any], column: str, value: float) -> None:
 
 
 def cut_row(found: list[Any]) -> None:
-    """Half a row."""
     at, frame = flown_rows(found)[3]
     put(found, at, frame | {"rows": frame["rows"][:9]})
 
 
 def forget(found: list[Any]) -> None:
-    """Rows of a process that never began."""
     del found[
         next(i for i, each in frames_of(found, "Opened").items() if each["process"] == "client")
     ]
 
 
 def date(found: list[Any], time_ns: int) -> None:
-    """A frame of another time."""
     at, frame = flown_rows(found)[3]
     put(found, at, frame | {"time_ns": time_ns})
 
@@ -910,7 +875,6 @@ def test_what_no_flight_says_is_refused_in_a_line(
 
 
 def chunk_starts(path: Path) -> list[int]:
-    """Positions of the chunks of a file with an index [B]."""
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -920,7 +884,6 @@ def chunk_starts(path: Path) -> list[int]:
 def test_a_chunk_that_is_far_larger_inside_is_not_opened(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whether it says so itself or its compressed frame does."""
     content, at = recording.read_bytes(), chunk_starts(recording)[1]
     frame = zstandard.compress(bytes(2**28))
     lying = b"\x28\xb5\x2f\xfd\xe0" + (2**40).to_bytes(8, "little") + frame[9:]

@@ -52,18 +52,15 @@ class Probe(Endpoint):
         """None: it is never woken."""
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Note it."""
         self.changes.append((scenario, keys, now_ns))
 
 
 def probe(scenario: Scenario = DEMO) -> tuple[Probe, Running]:
-    """An endpoint, and what it flies."""
     endpoint = Probe()
     return endpoint, Running(endpoint, scenario)
 
 
 def answer(running: Running, request: bytes) -> Answer:
-    """Answer to a request."""
     return msgspec.json.decode(running.answer(request, now_ns=7), type=Answer)
 
 
@@ -87,7 +84,6 @@ def test_a_change_is_laid_over_all_changes_before_it() -> None:
 
 
 def test_a_value_that_a_key_has_already_is_passed_on_and_no_news() -> None:
-    """A point that is led may stand still."""
     endpoint, running = probe()
     assert running.change({"control.epsilon": 3.6}, now_ns=5) == ()
     assert endpoint.changes == [(DEMO, frozenset({"control.epsilon"}), 5)]
@@ -120,7 +116,6 @@ def test_a_value_that_a_key_has_already_is_passed_on_and_no_news() -> None:
 def test_what_cannot_be_is_refused_with_one_line_and_nothing_changes(
     values: dict[str, Any], reason: str
 ) -> None:
-    """Also the keys beside it that could change."""
     endpoint, running = probe()
     with pytest.raises(ConfigError) as refused:
         running.change(values, now_ns=5)
@@ -178,7 +173,6 @@ def test_what_is_no_request_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_request_may_be_so_long_and_no_longer() -> None:
-    """The rest of a datagram that is too long was never read."""
     _, running = probe()
     request = b'{"control.epsilon":1}'
     assert answer(running, request + b" " * (REQUEST_BYTES_MAX - len(request))).changed
@@ -188,7 +182,6 @@ def test_a_request_may_be_so_long_and_no_longer() -> None:
 
 @pytest.mark.parametrize("kind", [Server, Proxy, Client, Fleet])
 def test_what_may_change_is_a_key_of_the_scenario(kind: type[Endpoint]) -> None:
-    """Each endpoint has some, and may be asked to leave all as it is."""
     endpoint = make(kind)
     values = answer(Running(endpoint, DEMO), b"{}").values
     assert values.keys() == endpoint.changeable
@@ -197,7 +190,6 @@ def test_what_may_change_is_a_key_of_the_scenario(kind: type[Endpoint]) -> None:
 
 
 def make(kind: type[Endpoint]) -> Endpoint:
-    """An endpoint of this kind."""
     if kind is Server:
         return Server(DEMO, boot_id=1, entropy=stream(1, "entropy").bytes)
     if kind is Proxy:
@@ -210,7 +202,6 @@ def make(kind: type[Endpoint]) -> Endpoint:
 
 
 def scenario(**changes: Any) -> Scenario:
-    """Ten seconds of the demonstration."""
     return packaged("demo-committed", {"duration": 10.0, "settle": 0.0}, changes)
 
 
@@ -234,7 +225,6 @@ def test_netem_loses_what_it_is_told_to_from_then_on() -> None:
 
 
 def test_another_delay_is_that_of_the_packets_to_come() -> None:
-    """Also in a flow that is there; each direction by itself."""
     values = {"network.downlink.delay": "constant", "network.downlink.minimum_s": 0.1}
     packets = fly(scenario(), changes=[(4.0, values)]).netem
     down = packets[packets["direction"] != UPLINK]
@@ -245,7 +235,6 @@ def test_another_delay_is_that_of_the_packets_to_come() -> None:
 
 
 def test_every_trigger_may_follow_every_other_in_flight() -> None:
-    """The vehicles fly on, and are sent as many horizons as the new trigger asks for."""
     triggers = ["always", "periodic", "state_gap(9, 1) & budget(5, 2) | silence(1)", "deviation"]
     triggers += ["periodic(20)", "cost_gap & budget(2, 1)", "periodic(4)"]
     changes = [(4.0 + i, {"control.trigger": text}) for i, text in enumerate(triggers)]
@@ -288,7 +277,6 @@ def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
 
 
 def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
-    """It blows the way it did, as if it had always had it."""
     air = VehicleConfig(gust_mps2=1.0, gust_every_s=1e-9, gust_s=1e9)
     flown = msgspec.structs.replace(DEMO, vehicle=air)
     plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))
@@ -339,7 +327,6 @@ def arming(*changes: tuple[float, bool], armed: bool = True) -> Record:
 
 
 def test_a_vehicle_that_waits_is_armed_in_flight() -> None:
-    """It stays where it is until then, and flies the first horizon that is made for it."""
     flight = arming((5.0, True), armed=False)
     modes = [(event.after, event.reason) for _, _, event in told(flight, ModeChanged)]
     assert modes == [

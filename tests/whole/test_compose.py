@@ -42,7 +42,6 @@ def test_a_profile_adds_services_and_changes_none() -> None:
 
 
 def test_compose_understands_its_file() -> None:
-    """With each profile and without one, where Compose is."""
     docker = shutil.which("docker")
     if docker is None or subprocess.run([docker, "compose", "version"], check=False).returncode:
         pytest.skip("no Compose")
@@ -55,7 +54,6 @@ def test_compose_understands_its_file() -> None:
 
 
 def test_each_image_of_ours_is_a_stage_with_a_lock_file() -> None:
-    """The Dockerfile builds what is named, of what is pinned."""
     targets = {each["build"]["target"] for each in SERVICES.values() if "build" in each}
     assert targets == set(re.findall(r"^FROM bare AS (\w+)$", DOCKERFILE, re.MULTILINE))
     for lock in re.findall(r"^COPY (locks/\w+\.lock)", DOCKERFILE, re.MULTILINE):
@@ -63,7 +61,6 @@ def test_each_image_of_ours_is_a_stage_with_a_lock_file() -> None:
 
 
 def test_the_autopilot_is_pinned_and_speaks_to_the_computer_aboard_alone() -> None:
-    """No port is published, and its network is one that nobody leaves."""
     autopilot, aboard = SERVICES["px4"], SERVICES["aboard"]
     assert re.fullmatch(r"px4io/px4-sitl:v\d+\.\d+\.\d+", autopilot["image"])
     assert aboard["network_mode"] == "service:px4"

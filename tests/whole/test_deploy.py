@@ -46,7 +46,6 @@ def test_the_client_starts_unarmed_and_as_a_flight_that_goes_on() -> None:
 
 
 def test_the_server_keeps_what_was_set_where_it_outlives_the_computer() -> None:
-    """Its control socket, and the journal beside that, lie in its state folder."""
     options = command.parse(ServerOptions(), started(SERVER, "server"), "server", "")
     assert not options.new_flight
     assert options.control
@@ -57,7 +56,6 @@ def test_the_server_keeps_what_was_set_where_it_outlives_the_computer() -> None:
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="this machine has no systemd")
 @pytest.mark.parametrize("unit", [CLIENT, SERVER], ids=lambda unit: unit.name)
 def test_systemd_finds_no_fault_with_a_unit(unit: Path, tmp_path: Path) -> None:
-    """Each setting is one that it knows."""
     copy = tmp_path / unit.name
     copy.write_text(unit.read_text().replace(BINARY, sys.executable))
     verify = ["systemd-analyze", "verify", "--man=no", str(copy)]

@@ -67,7 +67,6 @@ def test_each_image_carries_what_it_runs_and_no_more() -> None:
 
 
 def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
-    """From `up` to the summary, with the doors that ought to be locked tried on the way."""
     with containers(compose, FLIGHT_S) as three, three.capture() as captured:
         three.flies()
         for service in SERVICES:
@@ -121,7 +120,6 @@ def test_one_command_flies_for_a_gate(
 
 
 def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) -> None:
-    """One flight, in which everything that can break breaks, and horizons flow again."""
     with containers(compose, FAULTY_FLIGHT_S) as three:
         three.flies()
 
@@ -169,8 +167,6 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
 
 @dataclass
 class Containers:
-    """The project of one test."""
-
     command: list[str]
     """Compose."""
     seconds: int
@@ -184,11 +180,9 @@ class Containers:
         return run(*self.argv(*arguments), more_env=self.flight)
 
     def attempt(self, *arguments: str) -> tuple[int, str]:
-        """Exit code of Compose, and what it printed."""
         return attempt(*self.argv(*arguments), within_s=150.0, more_env=self.flight)
 
     def argv(self, *arguments: str) -> list[str]:
-        """Command line of Compose."""
         return [
             *self.command,
             "-f",
@@ -200,11 +194,9 @@ class Containers:
 
     @property
     def flight(self) -> dict[str, str]:
-        """Figures of the flight in the environment."""
         return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
 
     def docker(self, *arguments: str) -> str:
-        """Output of Docker."""
         return run("docker", *arguments)
 
     def id(self, service: str) -> str:
@@ -214,32 +206,25 @@ class Containers:
         return self.ids[service]
 
     def network(self, name: str) -> str:
-        """Name of a network with Docker."""
         return f"{self.project}_{name}"
 
     def inspect(self, service: str) -> dict[str, Any]:
-        """Description of a container by Docker."""
         return json.loads(self.docker("inspect", self.id(service)))[0]
 
     def state(self, service: str) -> dict[str, Any]:
-        """Status, ExitCode, Health."""
         return self.inspect(service)["State"]
 
     def addresses(self, service: str) -> dict[str, str]:
-        """By network."""
         networks = self.inspect(service)["NetworkSettings"]["Networks"]
         return {name: network["IPAddress"] for name, network in networks.items()}
 
     def said(self, service: str) -> str:
-        """Log of a container."""
         return attempt("docker", "logs", self.id(service))[1]
 
     def inside(self, service: str, *command: str) -> tuple[int, str]:
-        """Exit code and output of a command in a container."""
         return attempt("docker", "exec", self.id(service), *command)
 
     def has_said(self, service: str, what: str, *, since: int = 0) -> bool:
-        """Whether its log has the words, from a place on."""
         return what in self.said(service)[since:]
 
     # -- the flight --------------------------------------------------------------------------
@@ -300,7 +285,6 @@ class Containers:
             self.docker("rm", "--force", stranger)
 
     def land(self, folder: Path) -> Summary:
-        """The summary of the flight, once the client has ended with 0."""
         until(
             "the end of the flight",
             lambda: self.state("client")["Status"] == "exited",
@@ -344,7 +328,6 @@ class Containers:
         assert all(secret not in self.said(each) for each in ("server", "client", "netem"))
 
     def check_privileges(self, service: str) -> None:
-        """Limits are set in Docker's configuration and in effect inside the container."""
         host = self.inspect(service)["HostConfig"]
         assert host["ReadonlyRootfs"]
         assert host["CapDrop"] == ["ALL"]
@@ -452,7 +435,6 @@ def check_capture(capture: Path, part: Path) -> None:
 
 
 def works(*command: str) -> bool:
-    """Whether a command exists and succeeds."""
     try:
         return attempt(*command)[0] == 0
     except (OSError, subprocess.TimeoutExpired):
@@ -462,7 +444,6 @@ def works(*command: str) -> bool:
 def attempt(
     *command: str, within_s: float = 60.0, more_env: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[int, str]:
-    """Exit code and output of a command."""
     done = subprocess.run(
         command,
         stdout=subprocess.PIPE,
@@ -476,7 +457,6 @@ def attempt(
 
 
 def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> str:
-    """The standard output of a command that ought to succeed."""
     done = subprocess.run(
         command,
         capture_output=True,
@@ -491,7 +471,6 @@ def run(*command: str, more_env: Mapping[str, str] = MappingProxyType({})) -> st
 
 
 def number(name: str, figures: str) -> int:
-    """Number of a figure by its name; 0 if it is missing."""
     found = re.search(rf"(?m): +{name} +(\d+)$", figures)
     return int(found[1]) if found else 0
 
@@ -500,7 +479,6 @@ T = TypeVar("T")
 
 
 def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) -> T:
-    """Result of a condition once it holds."""
     deadline_s = time.monotonic() + within_s
     while not (value := condition()):
         assert time.monotonic() < deadline_s, f"in {within_s:g} s not come: {what}"
@@ -509,5 +487,4 @@ def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) 
 
 
 def say(text: str) -> None:
-    """A line for whoever watches."""
     print(f"{time.strftime('%H:%M:%S')}  {text}", flush=True)

@@ -44,7 +44,6 @@ ELSEWHERE = {
 
 
 def skytether(line: str) -> list[str]:
-    """A documented command as this environment runs it."""
     name, *argv = shlex.split(line)
     assert name == "skytether"
     return [sys.executable, "-P", "-m", "skytether", *argv]
@@ -118,7 +117,6 @@ def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
 
 
 def terminals() -> list[list[str]]:
-    """Blocks of docs/running.md with a client of their own."""
     return [
         block
         for block in blocks(ROOT / "docs" / "running.md")

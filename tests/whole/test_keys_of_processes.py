@@ -28,8 +28,6 @@ SECRET = "6f" * 32
 
 
 class Server:
-    """A server process, and its events."""
-
     def __init__(self, *argv: str) -> None:
         self.popen = Command("server", "demo", "--bind", "127.0.0.1:0", "--log", "json", *argv)
         self.events: list[object] = []
@@ -56,7 +54,6 @@ class Server:
         return self.events
 
     def address(self) -> str:
-        """Address of the server, as a client takes it."""
         return f"127.0.0.1:{self.port}"
 
 
@@ -73,7 +70,6 @@ def serving(*argv: str) -> Iterator[Server]:
 
 
 def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str = "keys") -> Path:
-    """A file with the key of vehicle 1."""
     path = folder / name
     path.write_text(f"1 1 {secret}\n")
     path.chmod(mode)
@@ -92,7 +88,6 @@ def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
 
 
 def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
-    """The server says that it hears a stranger; the vehicle, that nobody knows its key."""
     ours = key_file(tmp_path)
     other = key_file(tmp_path, "70" * 32, name="other")
     with serving("--keys", str(ours)) as server:
@@ -107,7 +102,6 @@ def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
 
 
 def test_a_server_with_keys_answers_nothing_in_plaintext(tmp_path: Path) -> None:
-    """Neither a HELLO nor a byte of noise."""
     with serving("--keys", str(key_file(tmp_path))) as server:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.settimeout(0.5)
@@ -136,7 +130,6 @@ def test_plaintext_is_said_loudly() -> None:
     ids=["server", "client"],
 )
 def test_without_keys_no_other_machine_is_spoken_to(argv: tuple[str, ...]) -> None:
-    """Unless it is asked for by name."""
     ended = skytether(*argv)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()

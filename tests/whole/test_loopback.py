@@ -54,11 +54,9 @@ class Echo(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """After so many datagrams or wakes."""
         return len(self.heard) + len(self.woken_ns) >= self.last
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Answer."""
         assert now_ns > 0
         self.heard.append(datagram.payload)
         host, port = datagram.peer
@@ -66,11 +64,9 @@ class Echo(Endpoint):
         self._out.append(Datagram(datagram.payload, datagram.peer, len(self.heard) % self.sockets))
 
     def wake(self, *, now_ns: int) -> None:
-        """Note the time."""
         self.woken_ns.append(now_ns - self.wakes_ns.pop(0))
 
     def next_wake_ns(self) -> int | None:
-        """The next of the list."""
         return self.wakes_ns[0] if self.wakes_ns else None
 
 
@@ -125,8 +121,6 @@ async def test_wakes_come_in_time_and_never_early(
 
 
 async def test_a_fault_of_ours_is_told_and_does_not_end_the_flight() -> None:
-    """An exception in a wake or in a datagram: the loop's handler hears it, the timer goes on."""
-
     class Faulty(Echo):
         def wake(self, *, now_ns: int) -> None:
             super().wake(now_ns=now_ns)
@@ -153,7 +147,6 @@ async def test_a_fault_of_ours_is_told_and_does_not_end_the_flight() -> None:
 
 
 async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
-    """Nothing that a peer's absence does to a socket reaches the endpoint."""
     echo = Echo()
     driver = Shell(echo, LOOPBACK)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
@@ -182,7 +175,6 @@ class Asker(Echo):
         self._out.append(Datagram(b"who?", peer))
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Note the address."""
         self.seen.append(datagram.peer)
         super().receive(datagram, now_ns=now_ns)
 
@@ -232,7 +224,6 @@ async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it() -
 
 
 def test_the_scope_of_a_link_local_address_is_part_of_its_host() -> None:
-    """The kernel keeps it apart, as a number, beside a flow that nobody needs."""
     name = socket.if_indextoname(1)
     assert udp.from_kernel(("fe80::1", 5, 7, 1)) == (f"fe80::1%{name}", 5)
     assert udp.to_kernel((f"fe80::1%{name}", 5)) == ("fe80::1", 5, 0, 1)
@@ -255,7 +246,6 @@ def test_the_scope_of_a_link_local_address_is_part_of_its_host() -> None:
     ],
 )
 def test_a_socket_is_bound_as_near_as_its_peers_allow(peers: list[Address], host: str) -> None:
-    """On loopback where all of them are, and in their family."""
     assert udp.within_reach_of(peers) == (host, 0)
 
 
@@ -281,7 +271,6 @@ def test_a_name_means_its_ipv4_address_if_it_has_one(
 
 @pytest.mark.ipv6
 def test_an_ipv6_socket_hears_ipv6_alone() -> None:
-    """One port may therefore be bound in both families."""
     with open_socket(("::", 0)) as six:
         port = six.getsockname()[1]
         with open_socket(("0.0.0.0", port)) as four:
@@ -297,20 +286,16 @@ class Asking(Echo):
 
     @property
     def finished(self) -> bool:
-        """Once something has been heard."""
         return bool(self.senders)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Note who has said it."""
         self.senders.append(datagram.peer)
 
     def wake(self, *, now_ns: int) -> None:
-        """Ask again."""
         self.due_ns = now_ns + 20_000_000
         self._out.append(Datagram(b"hello", self.peer))
 
     def next_wake_ns(self) -> int | None:
-        """The time of the next HELLO."""
         return self.due_ns
 
 
@@ -325,7 +310,6 @@ class Asking(Echo):
 async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
     loopback: Address, family: socket.AddressFamily, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the network there is no answer to the name, and then there is one."""
     monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.05)
     with socket.socket(family, socket.SOCK_DGRAM) as server:
         server.setblocking(False)
@@ -435,7 +419,6 @@ FAST = {
 
 
 async def test_a_flight_over_real_sockets() -> None:
-    """Delays of 20 ms, an observation and a horizon a step, and the circle is flown."""
     flown = packaged("paper-every-step", settle=0.0, duration=4.0, network=FAST)
     flight = await fly(flown)
     assert flight.client["step"][-1] == 79
@@ -534,7 +517,6 @@ async def test_datagrams_dropped_by_the_kernel_are_counted(
 
 
 def test_uvloop_is_used_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without uvloop, the loop is asyncio's own."""
     for module in ("uvloop", "asyncio"):
         loop = new_event_loop()
         loop.close()

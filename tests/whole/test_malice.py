@@ -69,7 +69,6 @@ def hostile(rng: random.Random) -> Iterator[bytes]:
 
 
 def endpoints() -> list[Endpoint]:
-    """A server and a client, as they are before any session."""
     flies = simulated(SCENARIO, 1)
     return [
         Server(SCENARIO, boot_id=2**40, entropy=stream(1, "entropy").bytes),
@@ -81,7 +80,6 @@ def endpoints() -> list[Endpoint]:
 def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
     endpoint: Server | Client,
 ) -> None:
-    """No exception, no answer, no session, no wake; a bounded set of reasons."""
     asleep_until = endpoint.next_wake_ns()
     datagrams = hostile(random.Random(1))
     sender = SERVER if isinstance(endpoint, Client) else STRANGER  # others are not even heard

@@ -50,7 +50,6 @@ class Observer(Endpoint):
         """Number of copies so far."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Pass it on, and attack."""
         payload, peer, socket = datagram
         own = OWN + self.copied % ADDRESSES
         if socket == 0:
@@ -71,14 +70,11 @@ class Observer(Endpoint):
         """Never."""
 
     def next_wake_ns(self) -> None:
-        """Never."""
         return
 
 
 @dataclass
 class Outcome:
-    """Figures of a flight."""
-
     rmse_m: float
     changes: list[tuple[str, str]] = field(default_factory=list)
     """Modes that it changed to, and why."""

@@ -22,7 +22,6 @@ SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
 
 def hatchling(source: Path, target: str, folder: Path) -> Path:
-    """Files that hatchling builds of a source: "sdist" or "wheel"."""
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
     subprocess.run(command, cwd=source, check=True, capture_output=True)
     (built,) = folder.iterdir()
@@ -31,7 +30,6 @@ def hatchling(source: Path, target: str, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A source distribution of this checkout, unpacked."""
     folder = tmp_path_factory.mktemp("sdist")
     with tarfile.open(hatchling(ROOT, "sdist", folder / "packed")) as packed:
         packed.extractall(folder, filter="data")
@@ -40,7 +38,6 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of the source distribution."""
     return hatchling(sdist, "wheel", tmp_path_factory.mktemp("wheel") / "built")
 
 
@@ -57,7 +54,6 @@ def files(folder: Path) -> set[str]:
 
 
 def test_the_wheel_is_our_package_and_nothing_else(wheel: Path) -> None:
-    """Every file of it: code, scenarios, templates and the mark that it is typed."""
     held = {name for name in contents(wheel) if not name.startswith("skytether-0.1.0.dist-info/")}
     assert held == files(ROOT / "skytether")
     scenarios = [*reading.names(), reading.COMPARED]
@@ -74,7 +70,6 @@ def test_a_checkout_and_its_source_distribution_make_the_same_wheel(
 
 
 def test_the_source_distribution_holds_the_package_and_no_links(sdist: Path) -> None:
-    """Neither tests nor documents, and no room twice."""
     about = {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "PKG-INFO", ".gitignore"}
     assert {path.name for path in sdist.iterdir()} == {"skytether", *about}
     assert not [path for path in sdist.rglob("*") if path.is_symlink()]
@@ -82,7 +77,6 @@ def test_the_source_distribution_holds_the_package_and_no_links(sdist: Path) -> 
 
 @pytest.mark.parametrize("lock", LOCKS, ids=lambda path: path.stem)
 def test_lock_files_carry_hashes_and_no_addresses(lock: Path) -> None:
-    """Pinned, each with hashes, and from whatever index the installer is configured for."""
     text = lock.read_text()
     pins = re.split(r"\n(?=\w)", text.strip())
     assert all(re.match(r"[a-z0-9-]+==\S+ .*\\\n    --hash=sha256:", f"{pin} ") for pin in pins)
@@ -91,7 +85,6 @@ def test_lock_files_carry_hashes_and_no_addresses(lock: Path) -> None:
 
 
 def test_what_is_in_two_lock_files_has_one_version() -> None:
-    """Whichever of them an environment was made from."""
     pins = {pin for lock in LOCKS for pin in re.findall(r"(?m)^(\S+)==(\S+)", lock.read_text())}
     assert len(pins) == len(dict(pins))
 
@@ -152,7 +145,6 @@ def environment(folder: Path) -> tuple[Path, Path]:
 
 
 def names(folder: Path) -> set[str]:
-    """Names of the files in a folder."""
     return {path.name for path in folder.iterdir()}
 
 

@@ -23,7 +23,7 @@ def test_the_page_of_commands_has_every_command() -> None:
 def test_the_page_of_the_library_has_every_name() -> None:
     text = (DOCS / "python.md").read_text()
     named = re.findall(r"^::: skytether\.(\w+)$", text, re.MULTILINE)
-    assert sorted(named) == sorted([*skytether.__all__, "plugin"])
+    assert sorted(named) == sorted([*skytether.__all__, "plugin", "plugin_scheme"])
 
 
 @pytest.mark.long

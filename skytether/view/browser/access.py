@@ -1,9 +1,9 @@
 """Access rules of a page: which visitors may look, and which may change the flight.
 
 Any website that the user's browser loads can make it connect to this machine. So a connection from
-this machine is not enough: the website must be ours (`Origin`), loaded under a name that no
-stranger can point at this machine (`Host`). Otherwise a stranger's website could read the flight,
-or fly it. A visitor with the token is not checked for either.
+this machine is not enough: the page must be ours (`Origin`), loaded under a name that nobody else
+can point at this machine (`Host`). Otherwise any website could read the flight, or fly it. A
+visitor with the token is checked for neither.
 """
 
 import hmac

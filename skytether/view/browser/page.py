@@ -1,7 +1,6 @@
 """Page that shows flights in a browser, live, by viser.
 
-One thread draws for all browsers, at a rate sufficient for the eye, and only while a browser is
-open.
+One thread draws for all browsers, 25 times a second, and only while a browser is open.
 """
 
 import contextlib

@@ -43,7 +43,7 @@ ALL_IS_LOST = "Every packet is lost then, both ways."
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
 LEAD_S = 5.0
-"""Age up to which a target that is led about is shown as known [s]."""
+"""Age up to which a target that is moved in flight is shown as known [s]."""
 AFTER_LEAP = (
     "Once its position has leapt: fly on in the old frame (the leap is subtracted), in the new one "
     "(figure and fence move with it), or stay, see docs/failsafe.md"
@@ -119,7 +119,7 @@ class Panel:
         titles = [each.title for each in flights]
         scenarios = [each.state.scenario for each in flights]
         axes = max(each.model.axes for each in scenarios)
-        solves = any(each.control.scheme != "trajectory" for each in scenarios)
+        solves = any(not each.control.properties.splines for each in scenarios)
         panel = gui.add_panel()
         self._plots = []
         flies = any(each.state.flies for each in flights)
@@ -244,7 +244,7 @@ class _Slider:
 
 
 class _Question:
-    """Question whether a change is meant that may end the flight; one at a time.
+    """Question that confirms a change which may end the flight; one at a time.
 
     Args:
         gui: elements of the browser that is asked.
@@ -507,7 +507,7 @@ class _Mission:
         return track.goal(GOAL_S) if track else None
 
     def _drag(self, place: NDArray[Any], held: bool) -> None:
-        """Send the chosen vehicle to where its goal is let go."""
+        """Send the chosen vehicle to the place where its goal was dropped."""
         if not held:
             self._guide(place)
 

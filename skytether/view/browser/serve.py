@@ -25,7 +25,7 @@ POLL_S = 0.1
 PORTS, PORTS_TRIED = 65536, 100
 """Number of ports that exist, and of those that are tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
-"""Addresses that mean every interface, and cannot be connected to."""
+"""Wildcard addresses: they mean every interface, and nobody can connect to them."""
 
 
 @contextmanager

@@ -23,7 +23,7 @@ UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
 
 
-class Telling:
+class Telemetry:
     """Maker of telemetry messages.
 
     Args:
@@ -173,16 +173,16 @@ class Telling:
         )
 
 
-STREAMS: dict[int, Callable[[Telling], Message | None]] = {
-    HEARTBEAT: Telling.heartbeat,
-    int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED): Telling.local_position,
-    int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telling.attitude,
-    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Telling.system_status,
-    int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): Telling.battery_status,
-    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): Telling.extended_state,
-    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Telling.home,
-    int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION): Telling.version,
-    int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Telling.estimate,
-    int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telling.estimate,
+STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
+    HEARTBEAT: Telemetry.heartbeat,
+    int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED): Telemetry.local_position,
+    int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telemetry.attitude,
+    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Telemetry.system_status,
+    int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): Telemetry.battery_status,
+    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): Telemetry.extended_state,
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Telemetry.home,
+    int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION): Telemetry.version,
+    int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Telemetry.estimate,
+    int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telemetry.estimate,
 }
 """Telemetry messages by id, which can be streamed or requested once."""

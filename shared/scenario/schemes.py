@@ -1,0 +1,117 @@
+"""Schemes of delay compensation: what each says of itself, for whoever needs to know.
+
+One of ours has its code in the module of its name in `server.schemes`. One of a plug-in is a class
+of `skytether.plugin_scheme` with `properties`.
+"""
+
+from typing import NamedTuple
+
+from skytether.shared.law.terms import ALONG_SPLINES, COMMITTING, FLOWN_AS, INDEXED
+from skytether.shared.scenario import policies
+from skytether.shared.scenario.registry import SCHEMES, Entry
+
+scheme = SCHEMES
+"""Decorator of a scheme."""
+
+HELD = "held"
+"""What a trigger needs that looks at the inputs which are flown if nothing is sent."""
+FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
+"""Figures of a plan that a scheme may compute, and the columns of the record that have them."""
+
+
+class SchemeProperties(NamedTuple):
+    """Properties of a scheme, as it says them itself."""
+
+    flown_as: str = "predictive"
+    """How a vehicle flies what is sent, one of `shared.law.terms.FLOWN_AS`."""
+    figures: tuple[str, ...] = ()
+    """Those of FIGURES that it computes."""
+    feedback: bool | None = None
+    """The one value of `control.feedback` that it can be flown with; None: either."""
+    observes: bool = False
+    """Whether it learns a disturbance, and so heeds `control.observer_s`."""
+    missions: bool = False
+    """Whether it can be named on a mission, whose motions are flown as it sends them."""
+
+    @property
+    def indexed(self) -> bool:
+        """See `Terms.indexed`."""
+        return self.flown_as in INDEXED
+
+    @property
+    def commits(self) -> bool:
+        """See `Terms.commits`."""
+        return self.flown_as in COMMITTING
+
+    @property
+    def splines(self) -> bool:
+        """See `Terms.splines`."""
+        return self.flown_as in ALONG_SPLINES
+
+    @property
+    def computes(self) -> tuple[str, ...]:
+        """What triggers may need."""
+        return (*self.figures, HELD) if self.commits else self.figures
+
+
+@scheme
+def committed() -> SchemeProperties:
+    """Plans of inputs, which begin with the committed ones: the vehicle flies them already."""
+    return SchemeProperties("committed", FIGURES, observes=True)
+
+
+@scheme
+def predictive() -> SchemeProperties:
+    """Plans of inputs from where the vehicle is by the inputs of all plans: the paper's."""
+    return SchemeProperties("predictive", ("state_gap",), observes=True)
+
+
+@scheme
+def trajectory() -> SchemeProperties:
+    """Desired trajectory as a spline, along which the vehicle regulates itself."""
+    return SchemeProperties("trajectory", FIGURES[1:], feedback=True, missions=True)
+
+
+@scheme
+def none() -> SchemeProperties:
+    """Plans of inputs from the newest observation, without compensation of any delay."""
+    return SchemeProperties("none", ("state_gap",), feedback=False)
+
+
+def entry(text: str) -> tuple[Entry, tuple[float, ...]]:
+    """Entry of the scheme that `control.scheme` names, and its numbers as they are written.
+
+    Raises:
+        PolicyError: there is none such, or what a plug-in's says of itself cannot be.
+    """
+    found = SCHEMES.get(text.partition("(")[0].strip())
+    if found is None:
+        raise policies.PolicyError(text, " or ".join(map(repr, SCHEMES)))
+    _said(found)
+    return found, policies.shape(text, SCHEMES).values
+
+
+def properties(text: str) -> SchemeProperties:
+    """Properties of the scheme that `control.scheme` names.
+
+    Raises:
+        PolicyError: see `entry`.
+    """
+    return _said(entry(text)[0])
+
+
+def that_compute(need: str) -> list[str]:
+    """Names of the schemes that compute what a trigger needs."""
+    return [name for name, each in SCHEMES.items() if need in _said(each).computes]
+
+
+def _said(entry: Entry) -> SchemeProperties:
+    if entry.is_ours:
+        return entry.make()
+    name, said = entry.make.__name__, getattr(entry.make, "properties", None)
+    if not isinstance(said, SchemeProperties):
+        raise policies.PolicyError(name, "a class of skytether.plugin_scheme")
+    if said.flown_as not in FLOWN_AS or not set(said.figures) <= set(FIGURES):
+        known = f"flown_as of {', '.join(FLOWN_AS)}, and figures of {', '.join(FIGURES)}"
+        raise policies.PolicyError(f"{name}: {said}", known)
+    return said

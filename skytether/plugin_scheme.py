@@ -1,0 +1,27 @@
+"""Names that a plug-in with a scheme imports, beside those of `skytether.plugin`.
+
+They bring the server's packages, which no other plug-in needs. docs/schemes.md has such a plug-in.
+"""
+
+from skytether.server.common.scheme import Batch, Fleet, Foresight, Head, Scheme, SentPlans
+from skytether.server.common.splines import SplineScheme
+from skytether.server.schemes.horizons import InputScheme
+from skytether.shared.law.model import Flags, Indices
+from skytether.shared.scenario.schemes import SchemeProperties, scheme
+from skytether.shared.wire.protocol import Observation
+
+__all__ = [
+    "Batch",
+    "Flags",
+    "Fleet",
+    "Foresight",
+    "Head",
+    "Indices",
+    "InputScheme",
+    "Observation",
+    "Scheme",
+    "SchemeProperties",
+    "SentPlans",
+    "SplineScheme",
+    "scheme",
+]

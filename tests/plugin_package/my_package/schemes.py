@@ -1,0 +1,48 @@
+"""A scheme of a package of its own, which only a server has to import."""
+
+import numpy as np
+
+from skytether.plugin_scheme import (
+    Fleet,
+    Foresight,
+    Indices,
+    Observation,
+    SchemeProperties,
+    SplineScheme,
+    scheme,
+)
+
+
+@scheme(name="beacon")
+class Beacon(SplineScheme):
+    """Sends where the vehicle should be now and how fast, and compares by how far it is away."""
+
+    properties = SchemeProperties(flown_as="trajectory", figures=("deviation_m",), feedback=True)
+
+    def __init__(self, fleet: Fleet) -> None:
+        super().__init__(fleet)
+        self._desired = fleet.desired
+        self._state = np.zeros((fleet.capacity, fleet.terms.axes, 2))
+
+    def forget(self, row: int) -> None:
+        """See `Scheme`."""
+        self.observed_step[row] = -1
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """See `Scheme`."""
+        newer = observation.step > self.observed_step[row]
+        if newer:
+            self.observed_step[row] = observation.step
+            self._state[row] = observation.state
+        return newer
+
+    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+        """See `Scheme`: what was observed, as it is."""
+        found.estimate[:] = found.start[:] = self._state[rows]
+
+    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+        """See `Scheme`: a spline of one knot."""
+        now = self._desired.states(rows, step, found.ahead)[:, :, 0]
+        found.told.knots[:, :, :2] = now
+        away = np.linalg.norm(now[:, :, 0] - self._state[rows, :, 0], axis=1)
+        self.figures["deviation_m"][: len(rows)] = away
