@@ -714,7 +714,7 @@ def test_who_is_silent_for_long_keeps_its_place_when_another_joins(
     if not keeps:
         monkeypatch.setattr("skytether.server.endpoint.Sessions", forgetful)
     swaps = scenario(4, duration=50.0)
-    server = HardOfHearing(swaps, boot_id=1, entropy=stream(1, "entropy").bytes, room=4)
+    server = HardOfHearing(swaps, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=4)
     flown = flight.fly(swaps, vehicles=4, server=server)
     ended = [event for *_, event in flown.events if isinstance(event, SessionEnded)]
     assert ended[0] == SessionEnded(vehicle=1)
@@ -1055,7 +1055,7 @@ def test_nobody_is_below_a_vehicle_that_lands(
     passing = reading.check(in_space(tmp_path, goals) | {"duration": 65.0}, "passing")
 
     def fly() -> tuple[float, Rows, Rows]:
-        server = CutOff(passing, boot_id=1, entropy=stream(1, "entropy").bytes, room=2)
+        server = CutOff(passing, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=2)
         flown = flight.fly(passing, vehicles=2, server=server)
         one, other = each_of(flown)
         assert (one["mode"] == Mode.LAND).any()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
-from skytether.server.common.desired import EMPTY, PAGE, PAGES, Desired, _led
+from skytether.server.common.desired import EMPTY, PAGE, PAGES, Desired, _extrapolated
 from skytether.server.common.moving_setpoint import MEMORY_S, REST_S, LivePoint
 from skytether.server.controller import BLOCK
 from skytether.shared.base.chance import stream
@@ -289,7 +289,7 @@ def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
         error = p + ahead_s * v - then[..., 0]
         errors["goes on"].append(error)
         errors["accelerates"].append(error + 0.5 * ahead_s**2 * (v - old))
-        lead = np.vectorize(lambda p, v: plain(_led)(p, v, ahead_s, 10.0)[0])
+        lead = np.vectorize(lambda p, v: plain(_extrapolated)(p, v, ahead_s, 10.0)[0])
         errors["turns"].append(lead(p, v) - then[..., 0])
     rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
     assert rms["goes on"] == pytest.approx(0.55, abs=0.02)
@@ -312,8 +312,8 @@ def test_a_prediction_goes_to_and_fro_between_walls(
     p: float, v: float, after_s: float, expected: tuple[float, float]
 ) -> None:
     """Walls at 2 m, however often they are met; without walls it goes straight on."""
-    assert plain(_led)(p, v, after_s, 2.0) == expected
-    assert plain(_led)(p, v, after_s, np.inf) == (p + v * after_s, v)
+    assert plain(_extrapolated)(p, v, after_s, 2.0) == expected
+    assert plain(_extrapolated)(p, v, after_s, np.inf) == (p + v * after_s, v)
 
 
 # -- a trajectory for each vehicle -------------------------------------------------------------
