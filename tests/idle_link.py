@@ -90,8 +90,8 @@ def _session(network: DirectionConfig, link: LinkConfig, seed: int) -> tuple[int
         else:
             assert server.is_heartbeat_due(now_ns)
             asks = server.hearing.silence
-            _send(under_way, up, now_ns, server.said, asks, to_vehicle=True)
-            server.said, server.sent_ns = server.said + 1, now_ns
+            _send(under_way, up, now_ns, server.sent, asks, to_vehicle=True)
+            server.sent, server.sent_ns = server.sent + 1, now_ns
     last_ns = max([heard_ns, *(at for at, to_vehicle, _, _ in under_way if to_vehicle)])
     noticed_ns = max(0, _grid(last_ns + timeout_ns + 1, 0) - end_ns)
     return false, noticed_ns / SECOND_NS, said
