@@ -90,7 +90,7 @@ class Order:
         if not of_host:
             del self._hosts[flow.host]
 
-    def touch(self, flow: Flow) -> None:
+    def renew(self, flow: Flow) -> None:
         """Make a flow the newest."""
         self.flows.move_to_end(flow.client)
         self._hosts[flow.host].move_to_end(flow.client)
@@ -148,7 +148,7 @@ class Places:
             flow.exchanges, flow.earned_ns = 0, now_ns
             self._put(flow, self._earned)
         elif flow.order is self.others:
-            flow.order.touch(flow)
+            flow.order.renew(flow)
 
     def replace(self, host: str, now_ns: int) -> Flow | None:
         """Remove and return the flow that a new client of a host replaces; None if there is

@@ -196,7 +196,7 @@ def test_figures_of_a_client_in_flight_have_ages() -> None:
 
     def spied(self: Client, now_ns: int) -> None:
         fly(self, now_ns)
-        seen.append(self.told())
+        seen.append(self.vehicle_figures())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Client, "_fly", spied)

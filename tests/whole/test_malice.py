@@ -108,7 +108,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
             server.receive(Datagram(hello, STRANGER), now_ns=SECOND_NS)
             answers += len(server.outbox())
     assert answers == 6000
-    assert len(server.sessions.coming) == VEHICLES_MAX
+    assert len(server.sessions.welcomed_vehicles) == VEHICLES_MAX
     assert sum(not isinstance(event, Omitted) for event in server.events()) <= EVENTS_MAX
 
 
