@@ -124,12 +124,6 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
     }
 
 
-def test_figures_of_many_vehicles_stay_readable() -> None:
-    vehicles, _ = clients(GUSTY, 20, ("server", 1))
-    figures = Fleet(vehicles).figures()
-    assert (len(figures["by_vehicle"]), figures["vehicles"]) == (16, 20)
-
-
 # -- the command ---------------------------------------------------------------------------------
 
 

@@ -69,6 +69,7 @@ KEYS: list[tuple[list[str], dict[str, Any]]] = [
     (["--control.decay-rate", "1.5e-3"], {"control.decay_rate": 1.5e-3}),
     (["--control.trigger", "cost_gap | silence(1)"], {"control.trigger": "cost_gap | silence(1)"}),
     (["--control.delay-bound", "auto"], {"control.delay_bound": "auto"}),
+    (["--control.delay-bound", "0.55"], {"control.delay_bound": 0.55}),
     (["--control.feedback"], {"control.feedback": True}),
     (["--control.no-feedback", "--no-armed"], {"control.feedback": False, "armed": False}),
     (["--model.axes", "3", "--vehicle.kind", "ideal"], {"model.axes": 3, "vehicle.kind": "ideal"}),

@@ -110,6 +110,7 @@ def test_the_kernel_tells_when_each_came(
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
+    """Timers and other sockets have their turn in between."""
     here, there = ends
     batch, numbered = Batch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX

@@ -99,6 +99,7 @@ def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_pa
 def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Requests cost a share of the time, whatever they ask for."""
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
@@ -139,6 +140,7 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
 
 
 def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> None:
+    """A change may not be cut off where it still makes sense."""
     path = tmp_path / "netem"
     flown = running()
     with closing(Control(path, flown)) as control, closing(Caller(path)) as caller:

@@ -646,6 +646,7 @@ def test_the_plans_told_are_those_that_are_sent(
 
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
+    """Thousands of them would fill the memory."""
     flown = msgspec.structs.replace(DEMO, duration=6.0)
     (one,) = flight.fly_batch(flown, [1])
     assert len(one.plan) == 0

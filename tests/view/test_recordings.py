@@ -739,15 +739,6 @@ def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
     assert b"\x1b" not in written.out
 
 
-def test_parquet_without_pyarrow_is_one_line(
-    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    code, line = refusal([str(recording), "--parquet", "tables"], export, capsys)
-    assert code == 2
-    assert "pyarrow is not installed" in line
-
-
 def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     assert command.main(report, [str(recording), "--out", str(out)], "report") == 0
@@ -788,14 +779,6 @@ def test_what_is_no_recording_is_refused_in_a_line(
     for line in refused(path, tmp_path, capsys):
         assert line.startswith(f"it: {path}: {said}")
     assert set(tmp_path.iterdir()) == before
-
-
-def test_a_file_of_another_name_is_refused_before_anything_flies(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, line = refusal(["demo", "--record", str(tmp_path / "flight.mp4")], fly, capsys)
-    assert code == 2
-    assert line.endswith("flight.mp4, expected a file that ends in .mcap")
 
 
 # --- What somebody has changed with care.

@@ -164,6 +164,7 @@ def test_what_is_no_request_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_request_may_be_so_long_and_no_longer() -> None:
+    """The rest of a datagram that is too long was never read."""
     _, running = probe()
     request = b'{"control.epsilon":1}'
     assert answer(running, request + b" " * (REQUEST_BYTES_MAX - len(request))).changed
