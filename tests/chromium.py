@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,23 +124,15 @@ def picture(page: "Page", file: Path) -> None:
     remark = page.locator(".mantine-Notification-closeButton")
     for _ in range(remark.count()):
         remark.first.click()
-    page.wait_for_timeout(1500)
+    page.wait_for_timeout(500)
     page.screenshot(path=file)
-
-
-def _tracks(page: "Page") -> bool:
-    return "TRACK" in status(page)
-
-
-def _flown_long_enough(page: "Page") -> bool:
-    return flown_s(page) > SHOWN_S
 
 
 def pictures(browser: "Browser", address: str, folder: Path) -> None:
     for size in SIZES:
         with opened(browser, address, size) as page:
-            until(partial(_tracks, page), "it flies a plan")
-            until(partial(_flown_long_enough, page), "it has flown for a while")
+            until(lambda page=page: "TRACK" in status(page), "it flies a plan")
+            until(lambda page=page: flown_s(page) > SHOWN_S, "it has flown for a while")
             picture(page, folder / f"flight-dark-{size}.png")
             page.get_by_label("Light page").click()
             page.wait_for_timeout(1000)

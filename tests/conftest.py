@@ -9,8 +9,8 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import nullcontext
-from functools import cache
+from contextlib import ExitStack, nullcontext
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _STATES = tempfile.mkdtemp(prefix="skytether-states-")
 atexit.register(shutil.rmtree, _STATES, ignore_errors=True)
 os.environ["XDG_STATE_HOME"] = _STATES
+
+
+FIRST = (
+    *("test_observer.py", "test_docs.py", "test_together_autopilots.py", "test_aboard_udp.py"),
+    *("test_plugins.py", "test_reproduce.py", "test_packaging.py", "test_environments.py"),
+    *("test_command.py", "test_straight.py", "test_margins.py", "test_compare.py", "test_fleet.py"),
+    *("test_trajectory.py", "test_kernel.py", "test_slow.py", "test_loopback.py"),
+)
+"""Files that take longest: they begin first, so that no other worker waits for them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files that take longest first."""
+    place = {name: number for number, name in enumerate(FIRST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(FIRST)))
 
 
 @cache
@@ -82,6 +97,15 @@ def here() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pool, "_executor", lambda _: nullcontext(Here()))
         yield
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Any]]:
+    """Starts processes; what is still running at the end of the test is killed."""
+    from warm import Process
+
+    with ExitStack() as stack:
+        yield partial(Process, stack)
 
 
 @pytest.fixture

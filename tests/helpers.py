@@ -1,8 +1,11 @@
 """Scenarios and shells that tests of several rooms need."""
 
 import asyncio
+import socket
+import subprocess
+import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,13 +15,15 @@ import pytest
 from skytether.__main__ import main
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.endpoint import Address
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell.driver import Shell
 
 LOOPBACK: Address = ("127.0.0.1", 0)
+SKYTETHER = (sys.executable, "-P", "-m", "skytether")
+"""Command line of a command that is started as a user starts it."""
 
 
 def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
@@ -54,6 +59,13 @@ def refusal(run: Callable[[], object]) -> str:
     return str(caught.value)
 
 
+def refused(argv: Sequence[str], capfd: pytest.CaptureFixture[str]) -> str:
+    """The one line in which a command is refused."""
+    assert main([*argv]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    return line
+
+
 def refused_before_writing(
     argv: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> str:
@@ -64,6 +76,15 @@ def refused_before_writing(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     return said.rstrip("\n")
+
+
+def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
+    """Run a program to its end, with keys of `subprocess.run`."""
+    line = [str(each) for each in argv]
+    done: subprocess.CompletedProcess[str] = subprocess.run(
+        line, capture_output=True, text=True, check=False, **keys
+    )
+    return done
 
 
 def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
@@ -82,6 +103,61 @@ def interpreted() -> Iterator[None]:
         yield
     finally:
         kernel.compile_all()
+
+
+class Idle(Endpoint):
+    """An endpoint that hears nothing and is never woken, unless a subclass says so."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+
+    def wake(self, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+
+    def next_wake_ns(self) -> int | None:
+        """See `Endpoint`."""
+        return None
+
+
+class HandLoop:
+    """Stands in for an event loop: time passes, and sockets are looked at, when a test says so."""
+
+    def __init__(self) -> None:
+        self.reads: Callable[[], None] | None = None
+        self.writes: dict[socket.socket, Callable[[], None]] = {}
+        self.later: list[tuple[float, Callable[[], None]]] = []
+
+    def add_reader(self, _: socket.socket, read: Callable[[], None]) -> None:
+        self.reads = read
+
+    def remove_reader(self, _: socket.socket) -> None:
+        self.reads = None
+
+    def add_writer(self, sock: socket.socket, write: Callable[[Any], None], reader: Any) -> None:
+        self.writes[sock] = lambda: write(reader)
+
+    def remove_writer(self, sock: socket.socket) -> None:
+        del self.writes[sock]
+
+    def call_later(self, delay_s: float, then: Callable[[], None]) -> "HandLoop":
+        self.later.append((delay_s, then))
+        return self
+
+    def cancel(self) -> None:
+        """See asyncio's `TimerHandle`."""
+
+    def pass_time(self) -> None:
+        """Do what is due later."""
+        later, self.later = self.later, []
+        for _, then in later:
+            then()
+
+    def look(self) -> bool:
+        """Read if somebody wants to; returns whether anybody does."""
+        if self.reads is None:
+            return False
+        self.reads()
+        return True
 
 
 @asynccontextmanager

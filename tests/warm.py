@@ -7,17 +7,26 @@ tested with `subprocess`.
 
 import multiprocessing
 import os
+import re
 import resource
 import signal
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import NoReturn
 
+import msgspec
+
 from skytether.__main__ import main
+from skytether.shared.core.events import Event, address_text
+from skytether.shell.log import LogLine
+
+PATIENCE_S = 60.0
+"""Longest wait for the end of a process [s]."""
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
@@ -97,6 +106,61 @@ class Command:
         if self._process.exitcode is None:
             raise subprocess.TimeoutExpired("skytether", timeout)
         return self._process.exitcode
+
+
+class Process:
+    """A command that goes on, and what it has said.
+
+    Args:
+        stack: at whose end it is killed.
+        argv: see `Command`.
+        file_bytes: see `Command`.
+    """
+
+    def __init__(self, stack: ExitStack, *argv: str, file_bytes: int | None = None) -> None:
+        self.popen = stack.enter_context(Command(*argv, file_bytes=file_bytes))
+        stack.callback(self.popen.kill)
+        self.said: list[str] = []
+
+    def wait_for(self, pattern: str) -> re.Match[str]:
+        """The first line from here on that has the pattern; the test's time limit bounds it."""
+        for line in self.popen.stdout:
+            self.said.append(line.rstrip())
+            found = re.search(pattern, line)
+            if found:
+                return found
+        raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
+
+    def address(self) -> str:
+        """Address that it listens on, once it says so in words or in JSON."""
+        found = self.wait_for(r'listening on (\S+:\d+)|"Listening"')
+        if found[1]:
+            return found[1]
+        event = msgspec.json.decode(found.string)["event"]
+        return address_text(event["host"], event["port"])
+
+    def events(self) -> list[Event]:
+        """All that it has said so far with `--log json`."""
+        return [msgspec.json.decode(line, type=LogLine).event for line in self.said]
+
+    def counted(self, name: str) -> int:
+        """A number that it has counted, asked for by SIGUSR1; 0 where there is none of it."""
+        self.popen.send_signal(signal.SIGUSR1)
+        self.wait_for("counted so far:")
+        first = len(self.said)
+        self.wait_for("send_errors")  # the last line
+        found = [re.search(rf": +{name} +(\d+)$", line) for line in self.said[first:]]
+        return next((int(match[1]) for match in found if match), 0)
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """End it by a signal; returns its exit code."""
+        self.popen.send_signal(number)
+        return self.ended()
+
+    def ended(self) -> int:
+        """Wait until it has ended by itself; returns its exit code."""
+        self.said += self.popen.stdout.read().splitlines()
+        return self.popen.wait(PATIENCE_S)
 
 
 def skytether(*argv: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:

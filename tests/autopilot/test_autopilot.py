@@ -60,22 +60,21 @@ def fitted(times: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
     return float(gain), float(tau_s), float(dead_s)
 
 
-def climbed(flavour: FlavourName) -> Companion:
-    """An autopilot in the air, guided, with its position at 50 Hz."""
+def climbed(flavour: FlavourName = "ardupilot", **parameters: float) -> Companion:
+    """An autopilot in the air, guided, with some parameters set before."""
     companion = Companion(flavour)
+    for name, value in parameters.items():
+        set_parameter(companion, name, value)
     companion.climb()
-    companion.stream(50.0)
     return companion
 
 
 @pytest.fixture(scope="module")
 def ardupilot() -> Companion:
-    return climbed("ardupilot")
-
-
-@pytest.fixture(scope="module")
-def px4() -> Companion:
-    return climbed("px4")
+    """ArduCopter in the air, with its position at 50 Hz."""
+    companion = climbed()
+    companion.stream(50.0)
+    return companion
 
 
 # Velocities
@@ -112,9 +111,11 @@ def test_a_vertical_step_is_as_measured(ardupilot: Companion) -> None:
     assert dead_s == pytest.approx(0.24, abs=0.09)
 
 
-def test_px4_stays_below_what_it_is_told(px4: Companion) -> None:
+def test_px4_stays_below_what_it_is_told() -> None:
     """Gain 0.79 to 0.89 within 3 s, time constant 0.25 to 0.78 s, dead time 0.03 to 0.20 s."""
-    times, values = step(px4, 1.0)
+    companion = climbed("px4")
+    companion.stream(50.0)
+    times, values = step(companion, 1.0)
     assert 0.77 < values[-1] < 0.91
     gain, tau_s, dead_s = fitted(times, values)
     assert 0.76 < gain < 0.91
@@ -148,9 +149,7 @@ def test_px4_errs_as_measured() -> None:
 
 
 def test_10_setpoints_a_second_answer_as_50_do() -> None:
-    often, seldom = Companion(), Companion()
-    for companion in (often, seldom):
-        companion.climb()
+    often, seldom = climbed(), climbed()
     often.velocity = (1.0, 0.0, 0.0)
     often.run(2.0)
     for _ in range(20):
@@ -186,8 +185,7 @@ def test_ardupilot_stands_after_its_time_out_and_goes_on_when_setpoints_do(
 
 def test_px4_flies_home_and_lands_after_its_time_out() -> None:
     """It leaves OFFBOARD 1.2 s after the last setpoint, whether anybody is aboard or not."""
-    companion = Companion("px4")
-    companion.climb()
+    companion = climbed("px4")
     companion.velocity = (2.0, 0.0, 0.0)
     companion.run(4.0)
     companion.velocity = None
@@ -203,8 +201,7 @@ def test_px4_flies_home_and_lands_after_its_time_out() -> None:
 
 @pytest.mark.parametrize(("value", "name"), [(4, "AUTO.LAND"), (5, "AUTO.LOITER")])
 def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
-    companion = Companion("px4")
-    companion.climb()
+    companion = climbed("px4")
     for parameter, number in (("COM_OBL_RC_ACT", value), ("COM_OF_LOSS_T", 0.5)):
         set_parameter(companion, parameter, number)
     companion.velocity = None
@@ -214,8 +211,7 @@ def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
 
 
 def test_a_shorter_time_out_stops_ardupilot_sooner() -> None:
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     set_parameter(companion, "GUID_TIMEOUT", 0.5)
     companion.velocity = (1.0, 0.0, 0.0)
     companion.run(3.0)
@@ -235,8 +231,7 @@ def test_px4_is_not_guided_without_a_stream() -> None:
 
 
 def test_ardupilot_forgets_setpoints_of_before() -> None:
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     companion.velocity = (1.0, 0.0, 0.0)
     companion.run(3.0)
     companion.mode(FlightMode.PILOT)
@@ -301,8 +296,7 @@ def test_it_disarms_by_itself_where_it_is_not_flown(flavour: FlavourName) -> Non
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_it_is_not_disarmed_in_the_air_unless_it_must(flavour: FlavourName) -> None:
-    companion = Companion(flavour)
-    companion.climb()
+    companion = climbed(flavour)
     assert companion.command(400, 0.0) == companion.flight.refusal
     assert companion.flight.armed
     assert companion.command(400, 0.0, 21196.0) == 0
@@ -407,10 +401,7 @@ def test_a_lost_ground_station_sends_it_home_where_it_is_to(
     ],
 )
 def test_its_own_fence_holds_it(flavour: FlavourName, keys: dict[str, float]) -> None:
-    companion = Companion(flavour)
-    for name, value in keys.items():
-        set_parameter(companion, name, value)
-    companion.climb()
+    companion = climbed(flavour, **keys)
     companion.velocity = (2.0, 0.0, 0.0)
     companion.run(8.0)
     assert companion.flight.mode is FlightMode.HOLD
@@ -556,8 +547,7 @@ def test_position_and_velocity_are_flown_together(ardupilot: Companion) -> None:
 
 def test_a_position_is_flown_to_when_nobody_is_left() -> None:
     """Ablation of sending velocities alone: ArduCopter goes on, far beyond its time-out."""
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     companion.position, companion.velocity = (60.0, 0.0, 5.0), (0.0, 0.0, 0.0)
     companion.setpoint()
     companion.position = companion.velocity = None
@@ -579,8 +569,7 @@ def test_a_setpoint_that_cannot_be_flown_is_none(
     change: Callable[[Companion], None], mask: int
 ) -> None:
     """No number, nothing in it, or accelerations, which nobody here sends."""
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     change(companion)
     before = companion.autopilot.figures()["rejected"]
     companion.setpoint(mask)
@@ -677,8 +666,7 @@ def test_any_message_with_any_fields_is_survived(data: st.DataObject) -> None:
 
 
 def test_a_process_that_has_slept_goes_on_from_where_it_was() -> None:
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     before_ns = companion.flight.now_ns
     companion.now_ns += 3600 * 10**9
     companion.autopilot.wake(now_ns=companion.now_ns)
@@ -698,8 +686,7 @@ def test_the_same_seed_is_the_same_flight() -> None:
 
 
 def test_another_wind_blows_when_it_is_told() -> None:
-    companion = Companion()
-    companion.climb()
+    companion = climbed()
     before = companion.flight.quadrotor.attitude().roll
     windy = check({"vehicle": {"steady_wind_mps": [0.0, 5.0]}}, "test")
     companion.autopilot.change(windy, frozenset({"vehicle.steady_wind_mps"}), now_ns=0)

@@ -3,17 +3,17 @@
 import json
 import re
 import shlex
-import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from helpers import refused
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
-from warm import Command, skytether
+from warm import Process
 
 ROOT = Path(__file__).parents[2]
 LINES = re.findall(
@@ -30,15 +30,6 @@ def companion() -> Iterator[socket.socket]:
         yield own
 
 
-def listening(command: Command) -> int:
-    """Port at which it listens, once it does."""
-    for line in command.stdout:
-        said = json.loads(line)["event"]
-        if said["type"] == "Listening":
-            return int(said["port"])
-    raise AssertionError("it has ended")
-
-
 def heartbeat(own: socket.socket) -> object:
     """The next heartbeat that comes."""
     codec = Codec(255, 190)
@@ -49,22 +40,23 @@ def heartbeat(own: socket.socket) -> object:
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_documented_autopilot_is_one(line: str, tmp_path: Path) -> None:
+def test_a_documented_autopilot_is_one(
+    line: str, start: Callable[..., Process], tmp_path: Path
+) -> None:
     counted = tmp_path / "counted.json"
     with companion() as own:
         port = own.getsockname()[1]
         argv = shlex.split(re.sub(r"--to \S+", f"--to 127.0.0.1:{port}", line))
         if "--to" not in line:
             argv += ["--bind", "127.0.0.1:0"]
-        with Command(*argv, "--log", "json", "--json", str(counted)) as command:
-            at = listening(command)
-            if "--to" not in line:
-                beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
-                own.sendto(Codec(255, 190).encode(beat), ("127.0.0.1", at))
-            flavour = 12 if "px4" in line else 3
-            assert heartbeat(own).autopilot == flavour  # type: ignore[attr-defined]
-            command.send_signal(signal.SIGTERM)
-            assert command.wait(20.0) == 0
+        autopilot = start(*argv, "--log", "json", "--json", str(counted))
+        host, _, at = autopilot.address().partition(":")
+        if "--to" not in line:
+            beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+            own.sendto(Codec(255, 190).encode(beat), (host, int(at)))
+        flavour = 12 if "px4" in line else 3
+        assert heartbeat(own).autopilot == flavour  # type: ignore[attr-defined]
+        assert autopilot.end() == 0
     assert json.loads(counted.read_text())["peers"] == 1
 
 
@@ -79,15 +71,13 @@ def test_a_documented_autopilot_is_one(line: str, tmp_path: Path) -> None:
         (["--vehicle.battery", "2"], "battery"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(argv: list[str], said: str) -> None:
-    run = skytether("autopilot", *argv)
-    assert run.returncode == 2
-    assert said in run.stderr
-    assert run.stderr.count("\n") == 1 or "--vehicle" in argv[0]
+def test_what_cannot_be_is_refused_in_a_line(
+    argv: list[str], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert said in refused(["autopilot", *argv], capfd)
 
 
-def test_an_insecure_one_may_be_reached() -> None:
-    with Command("autopilot", "--bind", "0.0.0.0:0", "--insecure", "--log", "json") as command:
-        assert listening(command)
-        command.send_signal(signal.SIGTERM)
-        assert command.wait(20.0) == 0
+def test_an_insecure_one_may_be_reached(start: Callable[..., Process]) -> None:
+    autopilot = start("autopilot", "--bind", "0.0.0.0:0", "--insecure", "--log", "json")
+    assert autopilot.address().startswith("0.0.0.0:")
+    assert autopilot.end() == 0

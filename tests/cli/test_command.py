@@ -9,17 +9,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
-from functools import partial
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from helpers import until
+from helpers import refused, until
 from skytether.__main__ import COMMANDS, main
-from skytether.cli.fly import FlyOptions
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import (
     Counted,
@@ -36,12 +34,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import client_columns, read
 from skytether.shared.wire.protocol import Hello, encode
 from skytether.shell import command
-from skytether.shell.command import parse
 from skytether.shell.log import LogLine
-from warm import Command, skytether
-
-PATIENCE_S = 30.0
-"""Longest wait of a test for a condition [s]."""
+from warm import PATIENCE_S, Command, Process, skytether
 
 QUICK = [
     *("--network.uplink.delay", "constant", "--network.downlink.delay", "constant"),
@@ -50,52 +44,6 @@ QUICK = [
     *("--link.heartbeat-s", "0.1", "--link.timeout-s", "0.5"),
 ]
 """A short link without losses, and a session that notices silence soon."""
-
-
-class Process:
-    """A command that goes on, and what it has said."""
-
-    def __init__(self, stack: ExitStack, *argv: str, file_bytes: int | None = None) -> None:
-        self.popen = stack.enter_context(Command(*argv, file_bytes=file_bytes))
-        stack.callback(self.popen.kill)
-        self._stdout = self.popen.stdout
-        self.said: list[str] = []
-
-    def wait_for(self, pattern: str) -> re.Match[str]:
-        """The first line from here on that has the pattern; the test's time limit bounds it."""
-        for line in self._stdout:
-            self.said.append(line.rstrip())
-            found = re.search(pattern, line)
-            if found:
-                return found
-        raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
-
-    def address(self) -> str:
-        return self.wait_for(r"listening on (\S+:\d+), waiting for")[1]
-
-    def counted(self, name: str) -> int:
-        """A number that it has counted, asked for by SIGUSR1; 0 where there is none of it."""
-        self.popen.send_signal(signal.SIGUSR1)
-        self.wait_for("counted so far:")
-        first = len(self.said)
-        self.wait_for("send_errors")  # the last line
-        found = [re.search(rf": +{name} +(\d+)$", line) for line in self.said[first:]]
-        return next((int(match[1]) for match in found if match), 0)
-
-    def end(self, number: int = signal.SIGTERM) -> int:
-        self.popen.send_signal(number)
-        return self.ended()
-
-    def ended(self) -> int:
-        self.said += self._stdout.read().splitlines()
-        return self.popen.wait(PATIENCE_S)
-
-
-@pytest.fixture
-def start() -> Iterator[Callable[..., Process]]:
-    """Starts processes; what is still running at the end of the test is killed."""
-    with ExitStack() as stack:
-        yield partial(Process, stack)
 
 
 # -- mistakes ------------------------------------------------------------------------------------
@@ -117,6 +65,7 @@ def start() -> Iterator[Callable[..., Process]]:
             "fly: demo-committed and the command line: control.horizon: got 5, expected",
         ),
         ("fly --figure flight.gif", "fly: flight.gif: expected"),
+        ("fly --record a.mp4", "fly: --record: got a.mp4, expected a file that ends in .mcap"),
         ("server --bind 47001", "server: --bind: got '47001', expected HOST:PORT"),
         ("server --bind ::1:47001", "server: --bind: got '::1:47001', expected HOST:PORT"),
         ("server --bind [::1]", "server: --bind: got '[::1]', expected HOST:PORT"),
@@ -126,6 +75,15 @@ def start() -> Iterator[Callable[..., Process]]:
         ("client --id -1", "client: --id: got -1, expected 0 to 65535"),
         ("netem --server nobody.invalid:1", "netem: cannot find nobody.invalid: "),
         ("scenarios paper", "scenarios: got 'paper', expected nothing"),
+        ("fleet --vehicles 0", "fleet: --vehicles: got 0, expected 1 to 65535"),
+        ("fleet --workers 99", "fleet: --workers: got 99, expected 1 to 64"),
+        ("fleet --virtual --workers 2", "fleet: --workers: got --virtual as well, expected 1 in"),
+        ("fleet --virtual --page 127.0.0.1:0", "fleet: --page: got --virtual as well, expected a"),
+        ("fleet demo --mission swap", "fleet: --mission: got the scenario demo as well, expected"),
+        ("fleet --mission swap --vehicles 3", "fleet: --vehicles: got 3, expected 16 on this"),
+        ("server --vehicles -1", "server: --vehicles: got -1, expected 1 to 65536"),
+        ("netem --flows 0", "netem: --flows: got 0, expected 1 to 65536"),
+        ("client --id 65530 --vehicles 10", "client: --id: got 65530 to 65539, expected 0 to 6"),
     ],
 )
 def test_a_mistake_is_one_clear_line(
@@ -157,9 +115,8 @@ def test_a_wrong_flag_is_explained(wrong: str, capfd: pytest.CaptureFixture[str]
 def test_a_broken_scenario_file_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "mine.toml"
     file.write_text('extends = "paper"\n[network.uplink]\nlos = 0.3\n')
-    assert main(["fly", str(file)]) == 2
-    said = capfd.readouterr().err
-    assert said == f"fly: {file}: network.uplink.los: no such key; did you mean loss?\n"
+    said = f"fly: {file}: network.uplink.los: no such key; did you mean loss?"
+    assert refused(["fly", str(file)], capfd) == said
 
 
 def test_a_port_in_use_is_named(capfd: pytest.CaptureFixture[str]) -> None:
@@ -245,17 +202,6 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
     assert "RMSE x, y, xy [m]" in run.stdout
 
 
-def test_flags_lie_over_the_scenario(tmp_path: Path) -> None:
-    ratios = []
-    for trigger in ("always", "state_gap"):
-        file = tmp_path / f"{trigger}.json"
-        flags = ["--virtual", "--duration", "8", "--control.trigger", trigger, "--json", str(file)]
-        assert skytether("fly", *flags, "paper").returncode == 0
-        ratios.append(json.loads(file.read_text())["event_ratio"])
-    assert ratios[0] == 1.0
-    assert ratios[1] < 0.8
-
-
 @pytest.fixture
 def contradictory(tmp_path: Path) -> str:
     """File of a scenario whose loss of 40 % asks for a longer horizon than it has."""
@@ -324,20 +270,12 @@ def test_a_second_scenario_is_judged_as_it_is_flown(
     assert "fenced.toml: fence.radius_m: got 6.0, expected more" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(("given", "bound"), [("0.55", 0.55), ("auto", "auto")])
-def test_a_flag_may_be_a_number_or_a_word(given: str, bound: float | str, tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text('extends = "demo"\ncontrol.delay_bound = 0.5')
-    options = parse(FlyOptions(), [str(file), "--control.delay-bound", given], "fly", None)
-    assert options.config.control.delay_bound == bound
-
-
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     file = tmp_path / "real.json"
-    run = skytether("fly", "demo-committed", *QUICK, "--duration", "2", "--json", str(file))
+    run = skytether("fly", "demo-committed", *QUICK, "--duration", "3", "--json", str(file))
     assert run.returncode == 0, run.stderr
     summary = json.loads(file.read_text())
-    assert summary["steps"] + summary["deadline_misses"] >= 40
+    assert summary["steps"] + summary["deadline_misses"] >= 60
     absent = {key for key, value in summary.items() if value is None}
     assert absent == {"rmse_z", "estimate_error_m"}
     assert summary["solve_ms_p50"] > 0.0
@@ -373,7 +311,7 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     address = server.address()
     netem = start("netem", "demo", "--bind", f"{host}:0", "--server", address, *QUICK)
     address = netem.address()
-    argv = ["client", "demo", "--server", address, "--duration", "2", "--json", str(file)]
+    argv = ["client", "demo", "--server", address, "--duration", "3", "--json", str(file)]
     client = start(*argv, *QUICK)
     client.wait_for(rf"waiting for the server at {re.escape(host)}:\d+")
     client.wait_for("session open, flying")
@@ -392,7 +330,7 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     assert loud == [True, False, True]
     assert any("error_ms_p99" in line for line in netem.said[-20:])
     summary = json.loads(file.read_text())
-    assert summary["steps"] + summary["deadline_misses"] == 40
+    assert summary["steps"] + summary["deadline_misses"] == 60
     assert summary["event_ratio"] is None
 
 
@@ -436,7 +374,7 @@ def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
 
 def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
     server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
-    argv = ["--server", server.address(), "--duration", "1", "--log", "json", *QUICK]
+    argv = ["--server", server.address(), "--duration", "3", "--log", "json", *QUICK]
     began_ns = time.monotonic_ns()
     run = skytether("client", "demo", *argv)
     assert run.returncode == 0, run.stderr
@@ -540,12 +478,9 @@ def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals)
 
 def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]) -> None:
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--log", "json")
-    server.wait_for("Listening")
-    listening = msgspec.json.decode(server.said[-1], type=LogLine)
-    assert isinstance(listening.event, Listening)
-    call_as_strangers(listening.event.port, 2000)
+    call_as_strangers(int(server.address().rpartition(":")[2]), 2000)
     assert server.end() == 0
-    events = [msgspec.json.decode(line, type=LogLine).event for line in server.said]
+    events = server.events()
     told = sum(isinstance(event, SessionRefused) for event in events)
     omitted = [event for event in events if isinstance(event, Omitted)]
     assert {event.kind for event in omitted} == {"SessionRefused"}

@@ -5,20 +5,20 @@ import pty
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, CompletedProcess, Popen
+from typing import Any
 
 import pytest
 
-from helpers import until
+from helpers import SKYTETHER, ran, until
 from skytether.__main__ import main
 
 pytestmark = pytest.mark.long
 
-SKYTETHER = [sys.executable, "-P", "-m", "skytether"]
 PATIENCE_S = 60.0
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 """Bit of SIGUSR1 in the mask of ignored signals."""
@@ -28,37 +28,42 @@ SHORT = ["--duration", "2", "--settle", "0"]
 for _direction in ("uplink", "downlink"):  # a plan comes at once
     SHORT += [f"--network.{_direction}.delay", "none"]
 
-ASCII: dict[str, str | None] = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+POOR = {
+    "PYTHONWARNINGS": "error",
+    "HOME": None,
+    "TERM": "dumb",
+    "TMPDIR": "/nowhere",
+    "LC_ALL": "C",
+    "PYTHONUTF8": "0",
+    "PYTHONCOERCECLOCALE": "0",
+}
 ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
-    "warnings are errors": ({"PYTHONWARNINGS": "error"}, "{}"),
-    "64 open files": ({}, "ulimit -n 64; {}"),
     "no stdin": ({}, "{} <&-"),
     "no stdout": ({}, "{} >&-"),
     "no stderr": ({}, "{} 2>&-"),
     "no stream at all": ({}, "{} <&- >&- 2>&-"),
-    "only ASCII": (ASCII, "{}"),
-    "a dumb terminal": ({"TERM": "dumb"}, "{}"),
-    "no home": ({"HOME": None}, "{}"),
-    "no temporary folder": ({"TMPDIR": "/nowhere"}, "{}"),
-    "everything at once": (
-        {"PYTHONWARNINGS": "error", "HOME": None, "TERM": "dumb"} | ASCII,
-        "ulimit -n 64; {} </dev/null >&- 2>&-",
-    ),
+    "64 open files": ({}, "ulimit -n 64; {}"),
+    "warnings are errors, ASCII alone, neither home nor terminal": (POOR, "{}"),
+    "everything at once": (POOR, "ulimit -n 64; {} </dev/null >&- 2>&-"),
 }
 """Differences from this environment: variables, and the shell line around a command."""
 
 
-def run(argv: list[str], environment: str = "") -> subprocess.CompletedProcess[str]:
-    variables, line = ENVIRONMENTS.get(environment, ({}, "{}"))
+def run(argv: list[str], environment: str = "", line: str = "{}") -> CompletedProcess[str]:
+    """One command to its end, in one of the environments or within a line of shell."""
+    variables, line = ENVIRONMENTS.get(environment, ({}, line))
     merged = {**os.environ, **variables}
-    return subprocess.run(
-        ["sh", "-c", line.replace("{}", shlex.join([*SKYTETHER, *argv]))],
+    return ran(
+        *("sh", "-c", line.replace("{}", shlex.join([*SKYTETHER, *argv]))),
         env={name: value for name, value in merged.items() if value is not None},
-        capture_output=True,
-        text=True,
         timeout=PATIENCE_S,
-        check=False,
     )
+
+
+def begun(*argv: str, **keys: Any) -> "Popen[str]":
+    """A command that goes on, as a user starts it."""
+    begun: Popen[str] = Popen([*SKYTETHER, *argv], stdout=PIPE, stderr=PIPE, text=True, **keys)
+    return begun
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
@@ -98,7 +103,7 @@ def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> 
         f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
     )
     line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"
-    subprocess.run(["sh", "-c", line], check=True)
+    assert ran("sh", "-c", line).returncode == 0
     assert file.read_text().split() == ["/dev/null"] * 3
 
 
@@ -114,7 +119,7 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     ours, theirs = pty.openpty()
     argv = [*SKYTETHER, "fleet", *VIRTUAL]
     environment = os.environ | {"TERM": term}
-    with subprocess.Popen(argv, stdout=theirs, stderr=theirs, env=environment) as command:
+    with Popen(argv, stdout=theirs, stderr=theirs, env=environment) as command:
         os.close(theirs)
         shown = b""
         with suppress(OSError):  # its other end is closed
@@ -147,9 +152,7 @@ def test_too_few_open_files_are_told_before_anything_flies(argv: list[str], flag
 
 def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
     line = f"ulimit -n 64; exec {shlex.join([*SKYTETHER, 'netem', '--bind', '127.0.0.1:0'])}"
-    with subprocess.Popen(
-        ["sh", "-c", line], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as netem:
+    with Popen(["sh", "-c", line], stdout=PIPE, stderr=PIPE, text=True) as netem:
         assert netem.stdout is not None
         assert "listening" in netem.stdout.readline()
         netem.terminate()
@@ -193,21 +196,10 @@ def test_a_process_that_cannot_write_does_not_start(
 
 
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
-    full = subprocess.run(
-        ["sh", "-c", f"{shlex.join([*SKYTETHER, 'scenarios'])} >/dev/full"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    full = run(["scenarios"], line="{} >/dev/full")
     assert (full.returncode, full.stderr) == (1, "scenarios: No space left on device\n")
     file = tmp_path / "summary.json"
-    argv = [*SKYTETHER, "fly", "--virtual", *SHORT, "--json", str(file)]
-    flown = subprocess.run(
-        ["sh", "-c", f"ulimit -f 0; {shlex.join(argv)}"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    flown = run(["fly", "--virtual", *SHORT, "--json", str(file)], line="ulimit -f 0; {}")
     said = f"fly: {file}: cannot be written: File too large\n"
     assert (flown.returncode, flown.stderr) == (1, said)
 
@@ -258,9 +250,7 @@ def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) ->
     """It asks for figures, which there are none of yet: it is ignored from the first moment."""
     module = argv[0] if argv[0] == "skytether" else f"skytether.{argv[0]}"
     command = [sys.executable, "-P", "-m", module, *argv[1:]]
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
+    with Popen(command, cwd=tmp_path, stdout=DEVNULL, stderr=DEVNULL) as process:
         until(lambda: ignores_usr1(process.pid))
         for _ in range(20):
             process.send_signal(signal.SIGUSR1)
@@ -271,8 +261,7 @@ def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) ->
 
 
 def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
-    argv = [*SKYTETHER, "fly", *SHORT]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
+    with begun("fly", *SHORT) as fly:
         until(lambda: ignores_usr1(fly.pid))
         while fly.poll() is None:
             for pid in (fly.pid, *children(fly.pid)):
@@ -296,11 +285,8 @@ def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
     folder = tmp_path / "tmp"
     folder.mkdir()
     # A horizon that never comes: the flight cannot begin before the signal does.
-    argv = [*SKYTETHER, "fly", "--network.uplink.loss", "1"]
     environment = os.environ | {"TMPDIR": str(folder)}
-    with subprocess.Popen(
-        argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as fly:
+    with begun("fly", "--network.uplink.loss", "1", env=environment) as fly:
         until(lambda: len(children(fly.pid)) == count)
         started = children(fly.pid)
         fly.send_signal(number)
@@ -311,8 +297,7 @@ def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
 
 
 def test_ctrl_c_while_a_command_is_imported_is_no_traceback() -> None:
-    argv = [*SKYTETHER, "fly"]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fly:
+    with begun("fly") as fly:
         until(lambda: ignores_usr1(fly.pid))  # the imports have just begun
         fly.send_signal(signal.SIGINT)
         out, err = fly.communicate(timeout=PATIENCE_S)

@@ -12,45 +12,20 @@ from pathlib import Path
 import pytest
 
 import skytether
+from helpers import ran
 from skytether.__main__ import COMMANDS
 from skytether.shared.base import extras
 from skytether.shared.base.extras import MODULES
 
-ALL = (
-    "server",
-    "mavlink",
-    "page",
-    "plot",
-    "record",
-    "pandas",
-    "parquet",
-    "cluster",
-    "lab",
-)
+ALL = ["server", "mavlink", "page", "plot", "record", "pandas", "parquet", "cluster", "lab"]
 LAB = (
-    "crowd",
-    "sweep",
-    "envelope",
-    "margins",
-    "identify",
-    "torture",
-    "adversary",
-    "reproduce",
-    "compare",
-    "calibrate",
+    *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
+    *("compare", "calibrate"),
 )
+LISTS = ("scenarios", "triggers", "reports", "references", "vehicles", "impairments")
+BARE = ("client", "netem", "keygen", "set", "probe", *LISTS)
 NEEDS: dict[str, tuple[str, ...]] = {
-    "client": (),
-    "netem": (),
-    "keygen": (),
-    "scenarios": (),
-    "triggers": (),
-    "reports": (),
-    "references": (),
-    "impairments": (),
-    "vehicles": (),
-    "set": (),
-    "probe": (),
+    **dict.fromkeys(BARE, ()),
     "server": ("server",),
     "autopilot": ("mavlink", "server"),
     "station": ("mavlink",),
@@ -89,12 +64,7 @@ def packages(*names: str) -> set[str]:
 def run(argv: list[str], installed: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
     """A command where only these extras are installed."""
     missing = packages(*ALL) - packages(*installed) or {"none"}
-    return subprocess.run(
-        [sys.executable, "-P", "-c", RUN, ",".join(missing), *argv],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return ran(sys.executable, "-P", "-c", RUN, ",".join(missing), *argv)
 
 
 def refusal(prog: str, module: str, extra: str) -> str:
@@ -139,8 +109,7 @@ def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str
 
     One command of the laboratory stands for all: their package asks for the extra.
     """
-    lists = command in ("scenarios", "triggers", "reports", "references", "vehicles", "impairments")
-    shown = run([command] if lists else [command, "--help"], NEEDS[command])
+    shown = run([command, *(["--help"] if command not in LISTS else [])], NEEDS[command])
     assert (shown.returncode, shown.stderr) == (0, "")
     if not NEEDS[command]:
         return

@@ -1,8 +1,7 @@
 """Recordings by hand: each process writes one of its own, and they become one flight."""
 
 import signal
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -23,7 +22,7 @@ from skytether.sim import flight
 from skytether.view.frames import of_flight
 from skytether.view.recorded import read
 from skytether.view.recording import Recording
-from warm import Command
+from warm import Process
 
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=5.0, settle=3.0)
 OFFSETS_NS = {"client": 10**18, "server": 10**18 + 7 * 10**9, "netem": 10**18 - 3 * 10**9}
@@ -109,32 +108,21 @@ def test_what_is_not_of_one_flight_is_refused(
     capsys.readouterr()
 
 
-def port(process: Command) -> str:
-    line = next(line for line in process.stdout if "listening on" in line)
-    return line.split("127.0.0.1:")[1].split(",")[0].split()[0]
-
-
 def test_a_flight_by_hand_is_recorded_and_joined(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    start: Callable[..., Process], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = {name: tmp_path / f"{name}.mcap" for name in OFFSETS_NS}
-    with ExitStack() as stack:
 
-        def start(name: str, *argv: str) -> Command:
-            flags = ["--duration", "2", *AT_ONCE, "--record", str(files[name])]
-            command = stack.enter_context(Command(name, "demo", *argv, *flags))
-            stack.callback(command.kill)
-            return command
+    def begin(name: str, *argv: str) -> Process:
+        flags = ["--duration", "3", *AT_ONCE, "--record", str(files[name])]
+        return start(name, "demo", *argv, *flags)
 
-        server = start("server", "--bind", "127.0.0.1:0")
-        netem = start("netem", "--bind", "127.0.0.1:0", "--server", f"127.0.0.1:{port(server)}")
-        client = start("client", "--server", f"127.0.0.1:{port(netem)}")
-        said = client.stdout.read()
-        assert client.wait(120) == 0, said
-        for process in (server, netem):
-            process.send_signal(signal.SIGINT)
-            said = process.stdout.read()
-            assert process.wait(60) == 0, said
+    server = begin("server", "--bind", "127.0.0.1:0")
+    netem = begin("netem", "--bind", "127.0.0.1:0", "--server", server.address())
+    client = begin("client", "--server", netem.address())
+    assert client.ended() == 0, client.said
+    for process in (server, netem):
+        assert process.end(signal.SIGINT) == 0, process.said
     out = tmp_path / "flight.mcap"
     for path in files.values():
         assert command.main(export, [str(path), "--csv", str(tmp_path / path.stem)], "it") == 0

@@ -8,7 +8,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
+from helpers import until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.base import files
 from skytether.shared.scenario.registry import REFERENCES
@@ -285,10 +285,7 @@ def test_a_flight_that_is_killed_leaves_the_older_recording(
     argv = ["fly", "demo", "--no-page", "--duration", "60", "--record", str(at)]
     child = subprocess.Popen([sys.executable, "-P", "-m", "skytether", *argv])
     try:
-        until_s = time.monotonic() + 120.0
-        while not part.exists() or part.stat().st_size < 100_000:
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        until(lambda: part.exists() and part.stat().st_size >= 100_000)
         assert main(["fly", "demo", *SHORT, "--record", str(at)]) == 2
         assert "another command is writing it" in capsys.readouterr().err
     finally:

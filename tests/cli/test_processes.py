@@ -4,6 +4,7 @@ import asyncio
 import os
 import resource
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -29,6 +30,7 @@ from skytether.shared.core.events import (
 from skytether.shared.scenario.reading import load
 from skytether.shell.command import CommandError
 from skytether.shell.log import LogLine
+from warm import Process
 
 
 async def test_a_child_is_known_by_its_events() -> None:
@@ -42,16 +44,18 @@ async def test_a_child_is_known_by_its_events() -> None:
     assert server.last_words().startswith("server: PLAINTEXT, no keys: anybody on the network")
 
 
+@pytest.mark.parametrize("scenario", ["paper", "demo"])
 @pytest.mark.parametrize("name", ["server", "client", "netem"])
-async def test_a_scenario_without_a_failsafe_is_warned_of(name: str) -> None:
+def test_a_scenario_without_a_failsafe_is_warned_of(
+    name: str, scenario: str, start: Callable[..., Process]
+) -> None:
     """`paper` is one; `demo` has a failsafe, and netem flies nothing."""
-    argv = {"client": ("--server", "127.0.0.1:9")}.get(name, ("--bind", "127.0.0.1:0"))
-    for scenario in ("paper", "demo"):
-        heard: list[LogLine] = []
-        async with started(name, scenario, *argv, on_event=heard.append):
-            pass
-        warned = NoFailsafe() in [line.event for line in heard]
-        assert warned == (scenario == "paper" and name != "netem")
+    place = ("--server", "127.0.0.1:9") if name == "client" else ("--bind", "127.0.0.1:0")
+    process = start(name, scenario, *place, "--log", "json")
+    process.address()
+    process.end()
+    warned = NoFailsafe() in process.events()
+    assert warned == (scenario == "paper" and name != "netem")
 
 
 async def test_metrics_that_others_can_read_are_warned_of() -> None:
@@ -119,28 +123,26 @@ def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) ->
     ]
 
 
-async def test_a_line_without_end_hides_nothing_that_follows() -> None:
-    heard: list[LogLine] = []
-    stream = asyncio.StreamReader(limit=1000)
-    line = LogLine(process="client", time_ns=5, event=Flying(vehicle=1))
-    stream.feed_data(b"x" * 5000 + b"\n" + msgspec.json.encode(line) + b"\n")
-    stream.feed_eof()
-    process = cast(asyncio.subprocess.Process, None)
-    await _read(Child("client", process), stream, heard.append)
-    assert heard == [line]
+DEEP = b'{"process":"client","event":' + b"[" * 50_000
 
 
-async def test_a_line_that_is_nested_deeply_hides_nothing_that_follows() -> None:
+@pytest.mark.parametrize(
+    ("before", "last"),
+    [(b"x" * 500_000, "client: ended with 1"), (DEEP, DEEP.decode())],
+    ids=["long", "deep"],
+)
+async def test_a_line_that_cannot_be_read_hides_nothing_that_follows(
+    before: bytes, last: str
+) -> None:
     heard: list[LogLine] = []
     stream = asyncio.StreamReader(limit=100_000)
-    line = LogLine(process="client", time_ns=5, event=Counted(figures={"deep": [[]]}))
-    known = msgspec.json.encode(line)
-    stream.feed_data(known.replace(b"[[]]", b"[" * 50_000) + b"\n" + known + b"\n")
+    line = LogLine(process="client", time_ns=5, event=Counted(figures={}))
+    stream.feed_data(before + b"\n" + msgspec.json.encode(line) + b"\n")
     stream.feed_eof()
     child = Child("client", cast(asyncio.subprocess.Process, SimpleNamespace(returncode=1)))
     await _read(child, stream, heard.append)
     assert heard == [line]
-    assert child.last_words().startswith('{"process":"client"')
+    assert child.last_words() == last
 
 
 def test_a_flight_shows_what_happens_to_its_server_and_nothing_else(

@@ -4,13 +4,13 @@ import asyncio
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
-from helpers import until
+from helpers import Idle, until
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.core.events import Event, Fault
@@ -110,6 +110,7 @@ def test_the_kernel_tells_when_each_came(
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
+    """Timers and other sockets have their turn in between."""
     here, there = ends
     batch, numbered = Batch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
@@ -234,7 +235,7 @@ def test_segments_that_the_kernel_refuses_are_not_tried_again() -> None:
 # -- the driver ------------------------------------------------------------------------------
 
 
-class Answering(Endpoint):
+class Answering(Idle):
     """An endpoint that answers what it hears, in one go, once it has heard enough."""
 
     def __init__(self, enough: int, answer: Callable[[Datagram], Sequence[Datagram]]) -> None:
@@ -256,12 +257,6 @@ class Answering(Endpoint):
         if datagram.payload == b"fail":
             raise ZeroDivisionError("by zero")
 
-    def wake(self, *, now_ns: int) -> None:
-        """Do nothing."""
-
-    def next_wake_ns(self) -> int | None:
-        return None
-
 
 @pytest.fixture(params=[True, False], ids=["batches", "plain"])
 def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
@@ -276,10 +271,10 @@ def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return bool(request.param)
 
 
-def converse(
-    endpoint: Endpoint, pieces: Sequence[tuple[socket.socket, Sequence[bytes]]]
+def drive(
+    endpoint: Endpoint, talk: Callable[[Shell], Awaitable[None]]
 ) -> tuple[Shell, list[Event]]:
-    """Send pieces to a driven endpoint, each after the one before was heard, until it finishes."""
+    """Drive an endpoint while somebody talks to it, and until it has finished."""
     events: list[Event] = []
 
     async def fly() -> Shell:
@@ -288,15 +283,31 @@ def converse(
         loop.set_exception_handler(lambda _, context: events.append(driver._fault(context)))
         task = loop.create_task(shell.run(events.append))
         await asyncio.sleep(0)
-        for sock, payloads in pieces:
-            for payload in payloads:
-                sock.sendto(payload, shell.address)
-            await asyncio.sleep(0.01)
+        await talk(shell)
         await asyncio.wait_for(task, 5.0)
         return shell
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         return runner.run(fly()), events
+
+
+async def has_heard(endpoint: "Answering", count: int) -> None:
+    while len(endpoint.heard) < count:
+        await asyncio.sleep(0.001)
+
+
+def converse(
+    endpoint: Endpoint, pieces: Sequence[tuple[socket.socket, Sequence[bytes]]]
+) -> tuple[Shell, list[Event]]:
+    """Send pieces to a driven endpoint, each after the one before was heard, until it finishes."""
+
+    async def talk(shell: Shell) -> None:
+        for sock, payloads in pieces:
+            for payload in payloads:
+                sock.sendto(payload, shell.address)
+            await asyncio.sleep(0.01)
+
+    return drive(endpoint, talk)
 
 
 @pytest.mark.usefixtures("batches")
@@ -389,22 +400,16 @@ class Crowd:
     def send(self, counts: Sequence[int]) -> None:
         """Send so many datagrams at once, one time after the other, and end once all are heard."""
 
-        async def fly() -> None:
-            shell = Shell(self.endpoint, ("127.0.0.1", 0))
-            task = asyncio.get_running_loop().create_task(shell.run())
-            await asyncio.sleep(0)
+        async def talk(shell: Shell) -> None:
             with open_socket(("127.0.0.1", 0)) as sock:
                 heard = 0
                 for count in counts:
                     for _ in range(count):
                         sock.sendto(b"x", shell.address)
                     heard += count
-                    while len(self.endpoint.heard) < heard:
-                        await asyncio.sleep(0.001)
-            await asyncio.wait_for(task, 5.0)
+                    await has_heard(self.endpoint, heard)
 
-        with asyncio.Runner(loop_factory=new_event_loop) as runner:
-            runner.run(fly())
+        drive(self.endpoint, talk)
 
 
 def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
@@ -439,14 +444,10 @@ def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
     """
     endpoint = TwoSockets(1 + sum(map(len, pieces)), lambda _: [])
 
-    async def fly() -> None:
-        shell = Shell(endpoint, ("127.0.0.1", 0))
-        task = asyncio.get_running_loop().create_task(shell.run())
-        await asyncio.sleep(0)
+    async def talk(shell: Shell) -> None:
         with open_socket(("127.0.0.1", 0)) as sock:
             sock.sendto(b"hello", shell.address)
-            while not endpoint.heard:
-                await asyncio.sleep(0.001)
+            await has_heard(endpoint, 1)
             sock.setblocking(True)
             sock.settimeout(5.0)
             addresses = [shell.address, sock.recvfrom(10)[1]]
@@ -455,12 +456,9 @@ def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
                 for number in piece:
                     sock.sendto(b"%d" % sent, addresses[number])
                     sent += 1
-                while len(endpoint.heard) <= sent:
-                    await asyncio.sleep(0.001)
-        await asyncio.wait_for(task, 5.0)
+                await has_heard(endpoint, sent + 1)
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(fly())
+    drive(endpoint, talk)
     return endpoint
 
 

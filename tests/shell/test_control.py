@@ -6,7 +6,6 @@ import socket
 import stat
 import tempfile
 import threading
-from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 
 import skytether.shell.control
+from helpers import HandLoop
 from skytether.cli.set import set_keys
 from skytether.netem.proxy import Proxy
 from skytether.shared.core.change import Running
@@ -42,33 +42,9 @@ def running() -> Running:
     return Running(Proxy(DEMO, server=("server", 0)), DEMO)
 
 
-class Loop:
-    """A loop in which time passes when it is told to."""
-
-    def __init__(self) -> None:
-        self.reads: Callable[[], None] | None = None
-        self.rests: list[tuple[float, Callable[[], None]]] = []
-
-    def add_reader(self, _: object, read: Callable[[], None]) -> None:
-        self.reads = read
-
-    def remove_reader(self, _: object) -> None:
-        self.reads = None
-
-    def call_later(self, delay_s: float, then: Callable[[], None]) -> None:
-        self.rests.append((delay_s, then))
-
-    def turn(self) -> bool:
-        """Let it read if it wants to; whether it wanted."""
-        if self.reads is None:
-            return False
-        self.reads()
-        return True
-
-
-def heeding(control: Control) -> tuple[Loop, list[None]]:
+def heeding(control: Control) -> tuple[HandLoop, list[None]]:
     """A loop in which requests are heeded, and a list that grows by one with each."""
-    loop, heeded = Loop(), []  # type: ignore[var-annotated]
+    loop, heeded = HandLoop(), []  # type: ignore[var-annotated]
     control.begin(loop, lambda: heeded.append(None))  # type: ignore[arg-type]
     return loop, heeded
 
@@ -111,33 +87,34 @@ def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_pa
                     sent += 1
         assert sent < 100_000
         for count in range(1, 6):
-            assert loop.turn()
-            assert not loop.turn()
+            assert loop.look()
+            assert not loop.look()
             assert len(heeded) == count
-            ((rest_s, listen),) = loop.rests
+            ((rest_s, listen),) = loop.later
             assert rest_s >= REST_S
-            loop.rests.clear()
+            loop.later.clear()
             listen()
 
 
 def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Requests cost a share of the time, whatever they ask for."""
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
         monkeypatch.setattr(skytether.shell.control.time, "monotonic", lambda: next(seconds))
-        loop.turn()
-    assert [rest_s for rest_s, _ in loop.rests] == [0.5 * RESTS]
+        loop.look()
+    assert [rest_s for rest_s, _ in loop.later] == [0.5 * RESTS]
 
 
 def test_a_socket_that_is_closed_while_it_rests_reads_no_more(tmp_path: Path) -> None:
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
-        loop.turn()
+        loop.look()
         control.end()
-        loop.rests[0][1]()
-        assert not loop.turn()
+        loop.later[0][1]()
+        assert not loop.look()
 
 
 def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: Path) -> None:
@@ -152,23 +129,24 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
                 if count == 500:  # from here on answers have nowhere to go
                     (tmp_path / "hostile").unlink()
                 hostile.sendto(rng.randbytes(rng.randrange(9000)), str(path))
-                loop.turn()
-                loop.rests.pop()[1]()
+                loop.look()
+                loop.later.pop()[1]()
         assert len(heeded) == 1000
         caller = Caller(path)
         caller._socket.send(b"{}")
-        loop.turn()
+        loop.look()
         assert b"network.uplink.loss" in caller._socket.recv(9000)
         caller.close()
 
 
 def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> None:
+    """A change may not be cut off where it still makes sense."""
     path = tmp_path / "netem"
     flown = running()
     with closing(Control(path, flown)) as control, closing(Caller(path)) as caller:
         loop, _ = heeding(control)
         caller._socket.send(b'{"network.uplink.loss":0.5}' + b" " * 5000)
-        loop.turn()
+        loop.look()
         assert b"expected a shorter request" in caller._socket.recv(9000)
     assert flown.change({"network.uplink.loss": 0.1}, now_ns=0) == ()
 

@@ -1,11 +1,11 @@
 """The driver: mistakes of an endpoint's code are told, and the endpoint is driven on."""
 
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from helpers import Idle
 from skytether.shared.core.events import Event, Fault, Flying
 from skytether.shell.driver import Shell, run
 
 
-class Faulty(Endpoint):
+class Faulty(Idle):
     """An endpoint that fails at its first wake, and has finished after its second."""
 
     def __init__(self) -> None:
@@ -15,9 +15,6 @@ class Faulty(Endpoint):
     @property
     def finished(self) -> bool:
         return self.wakes == 2
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Take nothing."""
 
     def wake(self, *, now_ns: int) -> None:  # noqa: ARG002
         self.wakes += 1

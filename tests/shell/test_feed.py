@@ -5,7 +5,6 @@ import io
 import os
 import socket
 import stat
-import subprocess
 import sys
 import tempfile
 import threading
@@ -22,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether.shell.feed
+from helpers import HandLoop, ran
 from skytether.netem.proxy import Proxy
 from skytether.server.common import splines
 from skytether.server.schemes import horizons
@@ -171,60 +171,29 @@ def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
 # -- the socket ------------------------------------------------------------------------------------
 
 
-class Loop:
-    """A loop in which everything happens when it is told to."""
-
-    def __init__(self) -> None:
-        self.reads: Callable[[], None] | None = None
-        self.writes: dict[socket.socket, Callable[[], None]] = {}
-        self.later: list[Callable[[], None]] = []
-
-    def add_reader(self, _: socket.socket, read: Callable[[], None]) -> None:
-        self.reads = read
-
-    def remove_reader(self, _: socket.socket) -> None:
-        self.reads = None
-
-    def add_writer(self, sock: socket.socket, write: Callable[[Any], None], reader: Any) -> None:
-        self.writes[sock] = lambda: write(reader)
-
-    def remove_writer(self, sock: socket.socket) -> None:
-        del self.writes[sock]
-
-    def call_later(self, _: float, then: Callable[[], None]) -> "Loop":
-        self.later.append(then)
-        return self
-
-    def cancel(self) -> None:
-        """See asyncio's `TimerHandle`."""
-
-    def turn(self) -> None:
-        """Let time pass, and let happen what can."""
-        later, self.later = self.later, []
-        for then in later:
-            then()
-        if self.reads is not None:
-            self.reads()
-        for write in tuple(self.writes.values()):
-            write()
-
-
 class Driven:
     """A feed in a loop, and its readers."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.loop = Loop()
+        self.loop = HandLoop()
         self.feed = Feed(path)
         self.part = self.feed.part("netem", PACKET_COLUMNS)
         self.feed.open(lambda: OPENED)
         self.feed.begin(self.loop)  # type: ignore[arg-type]
         self.opened: list[Looker] = []
 
+    def turn(self) -> None:
+        """Let time pass, and let happen what can."""
+        self.loop.pass_time()
+        self.loop.look()
+        for write in tuple(self.loop.writes.values()):
+            write()
+
     def look(self) -> "Looker":
         """Somebody who looks on from now on."""
         self.opened.append(Looker(self.path))
-        self.loop.turn()
+        self.turn()
         return self.opened[-1]
 
     def tell(self, *numbers: int, size: int = 28) -> None:
@@ -232,7 +201,7 @@ class Driven:
         for number in numbers:
             self.part.write(bytes([number % 256]) * size)
             self.feed.take()
-            self.loop.turn()
+            self.turn()
 
 
 class Looker:
@@ -301,7 +270,7 @@ def test_rows_of_one_call_are_one_frame_of_each_part(driven: Driven) -> None:
         driven.part.write(b"a" * 36)
     plans.write(b"b" * 400)
     driven.feed.take()
-    driven.loop.turn()
+    driven.turn()
     _, netem, plan = looker.read()
     assert isinstance(netem, Rows)
     assert isinstance(plan, Rows)
@@ -312,7 +281,7 @@ def test_rows_of_one_call_are_one_frame_of_each_part(driven: Driven) -> None:
     driven.feed.take()
     sizes: list[int] = []
     while sum(sizes) < 300 * 3600:
-        driven.loop.turn()
+        driven.turn()
         sizes += [len(frame.rows) for frame in looker.read() if isinstance(frame, Rows)]
     longest = (ROWS_BYTES_MAX // 3600 + 1) * 3600
     assert sizes == [longest] * 4 + [300 * 3600 - 4 * longest]
@@ -323,7 +292,7 @@ def test_what_is_kept_for_readers_to_come_is_bounded(driven: Driven) -> None:
     driven.tell(*range(250), size=size)
     looker, frames = driven.look(), list[Frame]()
     for _ in range(30):
-        driven.loop.turn()
+        driven.turn()
         frames += looker.read()
     assert frames[0] == OPENED
     kept = numbers(frames)
@@ -342,7 +311,7 @@ def flooded(driven: Driven) -> tuple[int, int]:
     for number in range(128):
         driven.tell(number, size=65536)
         for _ in range(2):
-            driven.loop.turn()
+            driven.turn()
         got += quick.read()
         waiting = max([waiting, *(len(reader.waiting) for reader in driven.feed._readers)])
     assert numbers(got) == list(range(128))
@@ -409,17 +378,14 @@ def test_one_reader_is_let_in_at_a_time_with_a_rest_after_each(driven: Driven) -
     waiting = [Looker(driven.path) for _ in range(4)]
     driven.opened += waiting
     for count in range(1, 5):
-        assert driven.loop.reads is not None
-        driven.loop.reads()
+        assert driven.loop.look()
         assert driven.loop.reads is None
         assert driven.feed.figures()["readers"] == count
-        later, driven.loop.later = driven.loop.later, []
-        for then in later:
-            then()
+        driven.loop.pass_time()
 
 
 def test_with_nobody_reading_nothing_is_sent_or_timed(driven: Driven) -> None:
-    driven.loop.turn()
+    driven.turn()
     driven.loop.later.clear()
     driven.part.write(b"x" * 36)
     driven.feed.take()
@@ -469,12 +435,12 @@ def test_another_user_is_refused_by_the_system() -> None:
         Path(folder).chmod(0o755)
         one = Driven(Path(folder) / "netem.feed")
         with closing(one.feed):
-            argv = [sys.executable, "-I", "-S", "-c", code, str(one.path)]
-            said.append(subprocess.run(argv, capture_output=True, check=False).stderr)
+            argv = (sys.executable, "-I", "-S", "-c", code, one.path)
+            said.append(ran(*argv).stderr)
             one.path.chmod(0o666)
-            said.append(subprocess.run(argv, capture_output=True, check=False).stderr)
-    assert b"PermissionError" in said[0]
-    assert said[1] == b""
+            said.append(ran(*argv).stderr)
+    assert "PermissionError" in said[0]
+    assert said[1] == ""
 
 
 def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
@@ -680,6 +646,7 @@ def test_the_plans_told_are_those_that_are_sent(
 
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
+    """Thousands of them would fill the memory."""
     flown = msgspec.structs.replace(DEMO, duration=6.0)
     (one,) = flight.fly_batch(flown, [1])
     assert len(one.plan) == 0

@@ -56,6 +56,13 @@ def driven(folder: Path, ask: Callable[[Caller], Any]) -> tuple[list[Any], list[
     return answers, events
 
 
+def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
+    """Keep what is set in a flight of a scenario."""
+    kept_by = begun(folder, scenario).journal
+    assert kept_by
+    kept_by.write(values)
+
+
 @pytest.fixture(autouse=True)
 def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a netem end when it is told to."""
@@ -105,9 +112,7 @@ def test_without_a_control_socket_there_is_none() -> None:
 def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
     tmp_path: Path,
 ) -> None:
-    first = begun(tmp_path, SWAP)
-    assert first.journal
-    first.journal.write({"mission.zones": BOX})
+    write(tmp_path, SWAP, {"mission.zones": BOX})
     again = begun(tmp_path, SWAP)
     assert again.scenario.mission.zones == BOX
     assert [zone.name for zone in again.scenario.zones.zones] == [BOX]
@@ -115,9 +120,7 @@ def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
 
 def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path: Path) -> None:
     """A process that would begin with other values does not begin."""
-    first = begun(tmp_path, SWAP)
-    assert first.journal
-    first.journal.write({"mission.zones": BOX})
+    write(tmp_path, SWAP, {"mission.zones": BOX})
     whole = kept(tmp_path).read_bytes()
     wrong = [whole[:size] for size in range(len(whole))]
     wrong += [
@@ -142,9 +145,7 @@ def test_one_of_another_flight_is_refused_in_words(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    first = begun(tmp_path)
-    assert first.journal
-    first.journal.write({"network.uplink.loss": 0.25})
+    write(tmp_path, DEMO, {"network.uplink.loss": 0.25})
     now_s = journal.time.time() + later_s
     monkeypatch.setattr(journal.time, "time", lambda: now_s)
     with pytest.raises(CommandError, match=said) as refused:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from helpers import Idle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.core.line import LINE, Line, parse_line
@@ -39,7 +40,7 @@ def test_what_is_no_line_is_refused_with_its_key(text: str) -> None:
         parse_line("vehicle.address", text)
 
 
-class Echo(Endpoint):
+class Echo(Idle):
     """Says what it hears at socket 1 back to whoever said it; ends once it has heard `enough`."""
 
     def __init__(self, enough: bytes) -> None:
@@ -51,12 +52,6 @@ class Echo(Endpoint):
         assert datagram.socket == 1
         self.heard += datagram.payload
         self.send(datagram.payload, datagram.peer, 1)
-
-    def wake(self, *, now_ns: int) -> None:
-        """Nothing is due."""
-
-    def next_wake_ns(self) -> None:
-        """None: it is never woken."""
 
     @property
     def finished(self) -> bool:

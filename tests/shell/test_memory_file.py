@@ -1,12 +1,13 @@
 """The file of a client's memory: whole or refused in words, of this vehicle, and of one process."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from helpers import Idle
 from skytether.shell import memory
 from skytether.shell.memory import MAGIC, MemoryFile, MemoryRefused
 
@@ -36,7 +37,14 @@ def a_file(path: Path) -> bytes:
     return held
 
 
-class Keeps(Endpoint):
+def read(
+    path: Path, identity: Mapping[str, str] = IDENTITY, secret: bytes = SECRET
+) -> tuple[bytes, int | None] | None:
+    with closing(MemoryFile(path, dict(identity), secret)) as kept:
+        return kept.read()
+
+
+class Keeps(Idle):
     """An endpoint that keeps what it is told to."""
 
     keeps = True
@@ -45,15 +53,6 @@ class Keeps(Endpoint):
         super().__init__()
         self.wanted: list[bytes] = []
         self.written = 0
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
-
-    def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
-
-    def next_wake_ns(self) -> None:
-        """See `Endpoint`."""
 
     def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002
         return self.wanted.pop(0) if self.wanted else None
@@ -69,16 +68,12 @@ async def until(so: Callable[[], bool]) -> None:
 
 def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
     put(path, a_file(path))
-    kept = MemoryFile(path, IDENTITY, SECRET)
-    assert kept.read() == (CONTENT, WRITTEN_NS)
-    kept.close()
+    assert read(path) == (CONTENT, WRITTEN_NS)
 
 
 def test_without_a_file_there_is_nothing(path: Path) -> None:
-    kept = MemoryFile(path, IDENTITY)
-    assert kept.read() is None
+    assert read(path) is None
     assert path.parent.stat().st_mode & 0o777 == 0o700
-    kept.close()
 
 
 def test_after_a_restart_of_the_host_its_clock_says_nothing(
@@ -86,9 +81,7 @@ def test_after_a_restart_of_the_host_its_clock_says_nothing(
 ) -> None:
     put(path, a_file(path))
     monkeypatch.setattr(memory, "_host", lambda: "another run")
-    kept = MemoryFile(path, IDENTITY, SECRET)
-    assert kept.read() == (CONTENT, None)
-    kept.close()
+    assert read(path) == (CONTENT, None)
 
 
 def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
@@ -105,30 +98,25 @@ def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
     kept.close()
 
 
-@pytest.mark.parametrize("name", IDENTITY)
-def test_what_another_flight_has_kept_is_refused_with_what_differs(name: str, path: Path) -> None:
+@pytest.mark.parametrize(
+    ("other", "secret", "mode", "said"),
+    [
+        *(
+            ({name: "other"}, SECRET, 0o600, rf"{name}: got {value}, expected other")
+            for name, value in IDENTITY.items()
+        ),
+        ({}, SECRET[::-1], 0o600, "another key"),
+        ({}, SECRET, 0o666, "expected 0600"),
+    ],
+    ids=[*IDENTITY, "secret", "mode"],
+)
+def test_a_file_of_another_flight_or_secret_or_that_others_may_write_is_refused(
+    other: dict[str, str], secret: bytes, mode: int, said: str, path: Path
+) -> None:
     put(path, a_file(path))
-    kept = MemoryFile(path, IDENTITY | {name: "other"}, SECRET)
-    with pytest.raises(MemoryRefused, match=rf"{name}: got {IDENTITY[name]}, expected other"):
-        kept.read()
-    kept.close()
-
-
-def test_a_file_made_with_another_secret_is_refused(path: Path) -> None:
-    put(path, a_file(path))
-    kept = MemoryFile(path, IDENTITY, SECRET[::-1])
-    with pytest.raises(MemoryRefused, match=r"another key"):
-        kept.read()
-    kept.close()
-
-
-def test_a_file_that_others_may_write_is_refused(path: Path) -> None:
-    put(path, a_file(path))
-    path.chmod(0o666)
-    kept = MemoryFile(path, IDENTITY, SECRET)
-    with pytest.raises(MemoryRefused, match=r"expected 0600"):
-        kept.read()
-    kept.close()
+    path.chmod(mode)
+    with pytest.raises(MemoryRefused, match=said):
+        read(path, IDENTITY | other, secret)
 
 
 def test_two_processes_do_not_share_a_memory(path: Path) -> None:

@@ -33,6 +33,7 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
 
 
 def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
+    """A process that is killed keeps them."""
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 10)

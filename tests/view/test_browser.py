@@ -295,29 +295,28 @@ def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
     """Under a name that is not this machine's alone there are no buttons before the token."""
     with served("fly", "demo", "--duration", "120", "--page", "0.0.0.0:0") as address:
         port, token = re.search(r":(\d+)/.*token=(\S+)", address).groups()  # type: ignore[union-attr]
-        page = browser.new_page()
-        page.goto(f"http://0.0.0.0:{port}/")
-        until(lambda: flown_s(page) > 0, "it can be looked at")
-        assert page.get_by_role("button", name="Cut the link").count() == 0
-        put(page, "Token", "guessed")
-        page.wait_for_timeout(500)
-        assert page.get_by_role("button", name="Cut the link").count() == 0
-        put(page, "Token", token)
-        until(lambda: page.get_by_role("button", name="Cut the link").count(), "it can be played")
-        page.close()
-        page = browser.new_page()
-        page.goto(address.replace("127.0.0.1", "0.0.0.0"))
-        until(lambda: page.get_by_role("button", name="Cut the link").count(), "the link suffices")
-        page.close()
+        with opened(browser, f"http://0.0.0.0:{port}/") as page:
+            cuts = page.get_by_role("button", name="Cut the link")
+            until(lambda: flown_s(page) > 0, "it can be looked at")
+            assert cuts.count() == 0
+            put(page, "Token", "guessed")
+            page.wait_for_timeout(500)
+            assert cuts.count() == 0
+            put(page, "Token", token)
+            until(cuts.count, "it can be played")
+        with opened(browser, address.replace("127.0.0.1", "0.0.0.0")) as page:
+            cuts = page.get_by_role("button", name="Cut the link")
+            until(cuts.count, "the link suffices")
 
 
 def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path) -> None:
     file = tmp_path / "demo.mcap"
     record = [sys.executable, "-P", "-m", "skytether", "fly", "demo", "--virtual"]
     subprocess.run([*record, "--record", str(file)], check=True, capture_output=True)
-    with served("replay", str(file), "--page", "127.0.0.1:0") as address:
-        page = browser.new_page(viewport={"width": 1400, "height": 900})
-        page.goto(address)
+    with (
+        served("replay", str(file), "--page", "127.0.0.1:0") as address,
+        opened(browser, address) as page,
+    ):
         until(lambda: flown_s(page) > 0, "it plays")
         page.get_by_role("button", name="Pause").click()
         until(lambda: page.get_by_role("button", name="Go on").count(), "it is paused")
@@ -330,17 +329,16 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         page.wait_for_timeout(1500)
         assert flown_s(page) == paused_s
         picture(page, PICTURES / "replay-dark-wide.png")
-        page.close()
 
 
 def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
     names = "demo", "demo-no-compensation"
-    with served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address:
-        page = browser.new_page(viewport={"width": 1400, "height": 900})
-        page.goto(address)
+    with (
+        served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address,
+        opened(browser, address) as page,
+    ):
         until(lambda: min(flown_s(page, 0), flown_s(page, 1)) > 15, "both fly")
         for place, name in enumerate(names):
             assert status(page, place).startswith(name)
             assert page.locator(".u-legend").first.get_by_text(name, exact=True).count() == 1
         picture(page, PICTURES / "duel-dark-wide.png")
-        page.close()

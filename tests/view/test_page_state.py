@@ -68,23 +68,20 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
     shown = demo()
     track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
     dt = shown.scenario.control.dt
-    points = 1201  # a grid of the steps themselves
-    curves = track.curves(points)
+    curves = track.curves(1201)  # a grid of the steps themselves
     assert track.time_s == pytest.approx(client["step"][-1] * dt, abs=dt)
     steps = np.round(curves.time_s / dt).astype(int)
-    flown = {int(row["step"]): row for row in client}
-    planned = {int(row["step"]): row for row in server}
-    checked = 0
-    for index, step in enumerate(steps.tolist()):
-        if step in flown and step in planned and step >= 100:
-            assert curves.position[index] == pytest.approx(flown[step]["state"][:, 0])
-            assert curves.reference[index] == pytest.approx(planned[step]["reference"][:, 0])
-            assert curves.figure[index] == planned[step]["cost_gap"]
-            assert curves.threshold[index] == planned[step]["threshold"]
-            if flown[step]["age_ns"] >= 0:
-                assert curves.age_s[index] == flown[step]["age_ns"] / SECOND_NS
-            checked += 1
-    assert checked > 100
+    both, here, there = np.intersect1d(steps, server["step"], return_indices=True)
+    here, there = here[both >= 100], there[both >= 100]
+    assert len(here) > 100
+    flown, planned = client[np.searchsorted(client["step"], steps[here])], server[there]
+    np.testing.assert_array_equal(flown["step"], planned["step"])
+    np.testing.assert_allclose(curves.position[here], flown["state"][..., 0])
+    np.testing.assert_allclose(curves.reference[here], planned["reference"][..., 0])
+    np.testing.assert_array_equal(curves.figure[here], planned["cost_gap"])
+    np.testing.assert_array_equal(curves.threshold[here], planned["threshold"])
+    aged = flown["age_ns"] >= 0
+    np.testing.assert_array_equal(curves.age_s[here][aged], flown["age_ns"][aged] / SECOND_NS)
     assert curves.event.sum() == server["event"].sum() == track.sent
 
 

@@ -116,6 +116,17 @@ def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tup
     return code, line
 
 
+def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Lines of the two commands that refuse a recording."""
+    tables, page = str(folder / "tables"), str(folder / "page.html")
+    told = [
+        refusal([str(path), "--csv", tables], export, capsys),
+        refusal([str(path), "--out", page], report, capsys),
+    ]
+    assert [code for code, _ in told] == [2, 2]
+    return [line for _, line in told]
+
+
 # --- What is written comes back.
 
 
@@ -728,15 +739,6 @@ def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
     assert b"\x1b" not in written.out
 
 
-def test_parquet_without_pyarrow_is_one_line(
-    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    code, line = refusal([str(recording), "--parquet", "tables"], export, capsys)
-    assert code == 2
-    assert "pyarrow is not installed" in line
-
-
 def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     assert command.main(report, [str(recording), "--out", str(out)], "report") == 0
@@ -774,22 +776,9 @@ def test_what_is_no_recording_is_refused_in_a_line(
     path = tmp_path / "it.mcap"
     made(path)
     before = set(tmp_path.iterdir())
-    for of, flags in (
-        (export, ["--csv", str(tmp_path / "tables")]),
-        (report, ["--out", str(tmp_path / "page.html")]),
-    ):
-        code, line = refusal([str(path), *flags], of, capsys)
-        assert code == 2
+    for line in refused(path, tmp_path, capsys):
         assert line.startswith(f"it: {path}: {said}")
     assert set(tmp_path.iterdir()) == before
-
-
-def test_a_file_of_another_name_is_refused_before_anything_flies(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, line = refusal(["demo", "--record", str(tmp_path / "flight.mp4")], fly, capsys)
-    assert code == 2
-    assert line.endswith("flight.mp4, expected a file that ends in .mcap")
 
 
 # --- What somebody has changed with care.
@@ -866,12 +855,8 @@ def test_what_no_flight_says_is_refused_in_a_line(
     change: Any, why: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = changed(recording, tmp_path / "it.mcap", change)
-    for of, flags in (
-        (export, ["--csv", str(tmp_path / "tables")]),
-        (report, ["--out", str(tmp_path / "page.html")]),
-    ):
-        code, line = refusal([str(path), *flags], of, capsys)
-        assert (code, why in line) == (2, True), line
+    for line in refused(path, tmp_path, capsys):
+        assert why in line
 
 
 def chunk_starts(path: Path) -> list[int]:
@@ -881,41 +866,48 @@ def chunk_starts(path: Path) -> list[int]:
     return [each.chunk_start_offset for each in summary.chunk_indexes]
 
 
+def bombed(
+    recording: Path, chunk: Chunk, out: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[str, int]:
+    """Line about a recording with a chunk more, and the most memory that reading it took [B]."""
+    builder = RecordBuilder()
+    chunk.write(builder)
+    content, at = recording.read_bytes(), chunk_starts(recording)[2]
+    path = out / "it.mcap"
+    path.write_bytes(content[:at] + builder.end() + content[at:])
+    tracemalloc.start()
+    code, line = refusal([str(path), "--csv", str(out / "tables")], export, capsys)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert code == 2
+    return line, peak_bytes
+
+
+@pytest.mark.parametrize("size", [2**28, 1000])
+@pytest.mark.parametrize("lies", [False, True])
 def test_a_chunk_that_is_far_larger_inside_is_not_opened(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    size: int, lies: bool, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content, at = recording.read_bytes(), chunk_starts(recording)[1]
+    """Whether the chunk says so, its compressed frame does, or that lies of even more."""
     frame = zstandard.compress(bytes(2**28))
-    lying = b"\x28\xb5\x2f\xfd\xe0" + (2**40).to_bytes(8, "little") + frame[9:]
-    for data, size in ((frame, 2**28), (frame, 1000), (lying, 1000)):
-        builder = RecordBuilder()
-        Chunk("zstd", data, 2**60, 0, 0, size).write(builder)
-        bomb = builder.end()
-        path = tmp_path / "it.mcap"
-        path.write_bytes(content[:at] + bomb + content[at:])
-        tracemalloc.start()
-        code, line = refusal([str(path), "--csv", str(tmp_path / "tables")], export, capsys)
-        _, peak_bytes = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert (code, "a chunk" in line) == (2, True)
-        assert peak_bytes < 2**26
+    if lies:
+        frame = b"\x28\xb5\x2f\xfd\xe0" + (2**40).to_bytes(8, "little") + frame[9:]
+    chunk = Chunk("zstd", frame, 2**60, 0, 0, size)
+    line, peak_bytes = bombed(recording, chunk, tmp_path, capsys)
+    assert "a chunk" in line
+    assert peak_bytes < 2**26
 
 
 def test_more_messages_than_there_is_an_index_for_are_not_made(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A few bytes of a message take hundreds in memory, so the number of messages is bounded."""
-    content, builder, at = recording.read_bytes(), RecordBuilder(), chunk_starts(recording)[2]
+    builder = RecordBuilder()
     Message(2, 0, pack(Figures(time_ns=0, figures={})), 0, 0).write(builder)
     inside = builder.end() * 70_000
-    Chunk("zstd", zstandard.compress(inside), 2**60, 0, 0, len(inside)).write(builder)
-    path = tmp_path / "it.mcap"
-    path.write_bytes(content[:at] + builder.end() + content[at:])
-    tracemalloc.start()
-    code, line = refusal([str(path), "--csv", str(tmp_path / "tables")], export, capsys)
-    _, peak_bytes = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert (code, "more messages than fit into its size" in line) == (2, True), line
+    chunk = Chunk("zstd", zstandard.compress(inside), 2**60, 0, 0, len(inside))
+    line, peak_bytes = bombed(recording, chunk, tmp_path, capsys)
+    assert "more messages than fit into its size" in line
     assert peak_bytes < 2**26
 
 

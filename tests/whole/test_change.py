@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from helpers import packaged
+from helpers import Idle, packaged
 from skytether.client.endpoint import Client
 from skytether.client.failsafe import TABLE
 from skytether.client.fleet import Fleet
@@ -21,7 +21,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused, Event, Flying, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
@@ -33,7 +33,7 @@ DEMO = reading.load("demo")
 FORGOTTEN = {"control.epsilon": 2.5}
 
 
-class Probe(Endpoint):
+class Probe(Idle):
     """Takes note of the changes that are made."""
 
     changeable = frozenset({"control.epsilon", "network.uplink.loss", "vehicle.steady_wind_mps"})
@@ -41,15 +41,6 @@ class Probe(Endpoint):
     def __init__(self) -> None:
         super().__init__()
         self.changes: list[tuple[Scenario, frozenset[str], int]] = []
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Take nothing."""
-
-    def wake(self, *, now_ns: int) -> None:
-        """Do nothing."""
-
-    def next_wake_ns(self) -> None:
-        """None: it is never woken."""
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         self.changes.append((scenario, keys, now_ns))
@@ -173,6 +164,7 @@ def test_what_is_no_request_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_request_may_be_so_long_and_no_longer() -> None:
+    """The rest of a datagram that is too long was never read."""
     _, running = probe()
     request = b'{"control.epsilon":1}'
     assert answer(running, request + b" " * (REQUEST_BYTES_MAX - len(request))).changed

@@ -2,13 +2,13 @@
 
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from helpers import ran
 from skytether.client.__main__ import ClientOptions
 from skytether.shared.scenario import reading
 from skytether.shell import command
@@ -43,12 +43,11 @@ def test_a_profile_adds_services_and_changes_none() -> None:
 
 def test_compose_understands_its_file() -> None:
     docker = shutil.which("docker")
-    if docker is None or subprocess.run([docker, "compose", "version"], check=False).returncode:
+    if docker is None or ran(docker, "compose", "version").returncode:
         pytest.skip("no Compose")
     for profile, added in {"": set(), **PROFILES}.items():
         flag = ["--profile", profile] if profile else []
-        line = [docker, "compose", *flag, "config", "--services"]
-        done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
+        done = ran(docker, "compose", *flag, "config", "--services", cwd=ROOT)
         assert done.returncode == 0, done.stderr
         assert set(done.stdout.split()) == ALWAYS | added
 

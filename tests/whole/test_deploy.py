@@ -3,12 +3,12 @@
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from helpers import ran
 from skytether.client.__main__ import ClientOptions
 from skytether.server.__main__ import ServerOptions
 from skytether.shell import command
@@ -58,6 +58,5 @@ def test_the_server_keeps_what_was_set_where_it_outlives_the_computer() -> None:
 def test_systemd_finds_no_fault_with_a_unit(unit: Path, tmp_path: Path) -> None:
     copy = tmp_path / unit.name
     copy.write_text(unit.read_text().replace(BINARY, sys.executable))
-    verify = ["systemd-analyze", "verify", "--man=no", str(copy)]
-    run = subprocess.run(verify, capture_output=True, text=True, check=False)
+    run = ran("systemd-analyze", "verify", "--man=no", copy)
     assert (run.returncode, unit.name in run.stderr) == (0, False), run.stderr

@@ -183,14 +183,8 @@ class Containers:
         return attempt(*self.argv(*arguments), within_s=150.0, more_env=self.flight)
 
     def argv(self, *arguments: str) -> list[str]:
-        return [
-            *self.command,
-            "-f",
-            str(ROOT / "docker-compose.yml"),
-            "-p",
-            self.project,
-            *arguments,
-        ]
+        file = str(ROOT / "docker-compose.yml")
+        return [*self.command, "-f", file, "-p", self.project, *arguments]
 
     @property
     def flight(self) -> dict[str, str]:
@@ -379,16 +373,8 @@ class Containers:
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
         """Exit code and output of another client, where the client is."""
         argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}"]
-        argv += [
-            "skytether-client",
-            "client",
-            "demo",
-            "--id=2",
-            "--link.connect-s=2",
-            f"--server={host}:47001",
-        ]
-        argv += ["--insecure"]
-        return attempt(*argv)
+        argv += ["skytether-client", "client", "demo", "--id=2", "--link.connect-s=2"]
+        return attempt(*argv, f"--server={host}:47001", "--insecure")
 
 
 @contextlib.contextmanager

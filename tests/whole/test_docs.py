@@ -4,7 +4,6 @@ import re
 import shlex
 import signal
 import subprocess
-import sys
 import time
 from importlib import metadata
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import warm
+from helpers import SKYTETHER, ran
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
 from skytether.shell import command
@@ -46,7 +46,7 @@ ELSEWHERE = {
 def skytether(line: str) -> list[str]:
     name, *argv = shlex.split(line)
     assert name == "skytether"
-    return [sys.executable, "-P", "-m", "skytether", *argv]
+    return [*SKYTETHER, *argv]
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,7 @@ def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
     """Block of docs/running.md with keys, all of its hosts being this one."""
     _, on_three = terminals()
     keygen, *processes = on_three
-    made = subprocess.run(skytether(keygen), cwd=tmp_path, capture_output=True, check=False)
-    assert made.returncode == 0
+    assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
     processes = [re.sub(r"0\.0\.0\.0|ground|lab(?=:)", "127.0.0.1", line) for line in processes]
     assert "PLAINTEXT" not in fly_together(processes, tmp_path)
 
@@ -133,9 +132,7 @@ def fly_together(lines: list[str], folder: Path) -> str:
         subprocess.Popen(netem, cwd=folder, stdout=subprocess.DEVNULL) as two,
     ):
         try:
-            run = subprocess.run(
-                client, cwd=folder, capture_output=True, text=True, timeout=60, check=False
-            )
+            run = ran(*client, cwd=folder, timeout=60)
         finally:
             one.terminate()
             two.terminate()
@@ -242,9 +239,7 @@ def test_the_documented_python_runs_and_prints_what_it_says(
 
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))
 def test_documented_targets_exist(line: str) -> None:
-    run = subprocess.run(
-        ["make", "-n", *shlex.split(line)[1:]], cwd=ROOT, capture_output=True, check=False
-    )
+    run = ran("make", "-n", *shlex.split(line)[1:], cwd=ROOT)
     assert run.returncode == 0, run.stderr
 
 

@@ -2,23 +2,18 @@
 
 import json
 import os
-import signal
 import socket
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import pytest
 
-from skytether.shared.core.events import Listening, Plaintext, Unauthenticated
+from helpers import refused
+from skytether.shared.core.events import Plaintext, Unauthenticated
 from skytether.shared.scenario import reading
 from skytether.shared.wire.protocol import Hello, encode
-from skytether.shell.log import LogLine
-from warm import Command, skytether
+from warm import Process, skytether
 
-PATIENCE_S = 60.0
 QUICK = [
     *("--network.uplink.delay", "none", "--network.downlink.delay", "none", "--settle", "0"),
     *("--network.uplink.loss", "0", "--network.downlink.loss", "0"),
@@ -27,46 +22,7 @@ QUICK = [
 SECRET = "6f" * 32
 
 
-class Server:
-    def __init__(self, *argv: str) -> None:
-        self.popen = Command("server", "demo", "--bind", "127.0.0.1:0", "--log", "json", *argv)
-        self.events: list[object] = []
-        self._listens = threading.Event()
-        self.port = 0
-        self.reader = threading.Thread(target=self._read)
-        self.reader.start()
-        assert self._listens.wait(PATIENCE_S)
-
-    def _read(self) -> None:
-        with self.popen.stdout as said:
-            for line in said:
-                event = msgspec.json.decode(line, type=LogLine).event
-                self.events.append(event)
-                if isinstance(event, Listening):
-                    self.port = event.port
-                    self._listens.set()
-
-    def end(self) -> list[object]:
-        """All its events, once it has ended in order."""
-        self.popen.send_signal(signal.SIGTERM)
-        assert self.popen.wait(PATIENCE_S) == 0
-        self.reader.join()
-        return self.events
-
-    def address(self) -> str:
-        return f"127.0.0.1:{self.port}"
-
-
-@contextmanager
-def serving(*argv: str) -> Iterator[Server]:
-    """A server, which does not outlive the block."""
-    server = Server(*argv)
-    try:
-        yield server
-    finally:
-        server.popen.kill()
-        server.popen.wait(PATIENCE_S)
-        server.reader.join()
+SERVER = ("server", "demo", "--bind", "127.0.0.1:0", "--log", "json")
 
 
 def key_file(folder: Path, secret: str = SECRET, *, mode: int = 0o600, name: str = "keys") -> Path:
@@ -87,36 +43,40 @@ def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
     assert "sealed" in ended.stdout
 
 
-def test_a_wrong_key_is_one_line_at_each_end(tmp_path: Path) -> None:
-    ours = key_file(tmp_path)
+def test_a_wrong_key_is_one_line_at_each_end(start: Callable[..., Process], tmp_path: Path) -> None:
+    server = start(*SERVER, "--keys", str(key_file(tmp_path)))
     other = key_file(tmp_path, "70" * 32, name="other")
-    with serving("--keys", str(ours)) as server:
-        argv = ["client", "demo", "--server", server.address(), "--link.connect-s", "1"]
-        ended = skytether(*argv, "--keys", str(other))
-        events = server.end()
+    argv = ["client", "demo", "--server", server.address(), "--link.connect-s", "1"]
+    ended = skytether(*argv, "--keys", str(other))
+    assert server.end() == 0
     assert ended.returncode == 1
     assert len(ended.stderr.splitlines()) == 1
-    (told,) = [event for event in events if isinstance(event, Unauthenticated)]
+    (told,) = [event for event in server.events() if isinstance(event, Unauthenticated)]
     assert told.reason == "forged"
-    assert not any(isinstance(event, Plaintext) for event in events)
+    assert not any(isinstance(event, Plaintext) for event in server.events())
 
 
-def test_a_server_with_keys_answers_nothing_in_plaintext(tmp_path: Path) -> None:
-    with serving("--keys", str(key_file(tmp_path))) as server:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.settimeout(0.5)
-            hello = encode(Hello(1, 1, reading.load("demo").terms()))
-            for payload in (hello, b"\0", os.urandom(512)):
-                stranger.sendto(payload, ("127.0.0.1", server.port))
-            with pytest.raises(TimeoutError):
-                stranger.recv(2048)
-        server.end()
+def test_a_server_with_keys_answers_nothing_in_plaintext(
+    start: Callable[..., Process], tmp_path: Path
+) -> None:
+    server = start(*SERVER, "--keys", str(key_file(tmp_path)))
+    host, _, port = server.address().partition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.settimeout(0.5)
+        hello = encode(Hello(1, 1, reading.load("demo").terms()))
+        for payload in (hello, b"\0", os.urandom(512)):
+            stranger.sendto(payload, (host, int(port)))
+        with pytest.raises(TimeoutError):
+            stranger.recv(2048)
+    assert server.end() == 0
 
 
-def test_plaintext_is_said_loudly() -> None:
+def test_plaintext_is_said_loudly(start: Callable[..., Process]) -> None:
     """Also where only this machine can be reached."""
-    with serving() as server:
-        (told,) = [event for event in server.end() if isinstance(event, Plaintext)]
+    server = start(*SERVER)
+    server.address()
+    assert server.end() == 0
+    (told,) = [event for event in server.events() if isinstance(event, Plaintext)]
     assert told.local
     assert str(told).startswith("PLAINTEXT")
 
@@ -152,12 +112,12 @@ BAD_FILES = {
 @pytest.mark.parametrize(
     ("process", "name"), [*(("client", name) for name in BAD_FILES), ("server", "world-readable")]
 )
-def test_a_bad_key_file_is_one_line(name: str, process: str, tmp_path: Path) -> None:
+def test_a_bad_key_file_is_one_line(
+    name: str, process: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     secret, mode, said = BAD_FILES[name]
     file = tmp_path / "keys" if secret is None else key_file(tmp_path, secret, mode=mode)
-    ended = skytether(process, "demo", "--keys", str(file))
-    assert ended.returncode == 2
-    (line,) = ended.stderr.splitlines()
+    line = refused([process, "demo", "--keys", str(file)], capfd)
     assert str(file) in line
     assert said in line
     assert "6f6f" not in line
@@ -171,9 +131,6 @@ def test_a_bad_key_file_is_one_line(name: str, process: str, tmp_path: Path) -> 
     ],
 )
 def test_a_key_that_is_not_there_is_one_line(
-    more: tuple[str, ...], said: str, tmp_path: Path
+    more: tuple[str, ...], said: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    ended = skytether("client", "demo", "--keys", str(key_file(tmp_path)), *more)
-    assert ended.returncode == 2
-    (line,) = ended.stderr.splitlines()
-    assert said in line
+    assert said in refused(["client", "demo", "--keys", str(key_file(tmp_path)), *more], capfd)

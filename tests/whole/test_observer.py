@@ -9,7 +9,7 @@ import pytest
 
 import skytether.client.failsafe
 import skytether.shared.wire.channel
-from helpers import LOOPBACK, driven
+from helpers import LOOPBACK, Idle, driven
 from skytether.client.endpoint import Client
 from skytether.client.secure import SecureLink
 from skytether.client.simulated.vehicle import simulated
@@ -17,7 +17,7 @@ from skytether.server.endpoint import Server
 from skytether.server.secure import SecureGate
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -32,7 +32,7 @@ SERVER_SIDE, OWN, ADDRESSES = 1, 2, 50
 """Socket towards the server, first of the observer's own, and number of these."""
 
 
-class Observer(Endpoint):
+class Observer(Idle):
     """Passes on everything at once between a vehicle and its server.
 
     Args:
@@ -65,12 +65,6 @@ class Observer(Endpoint):
         if self._attacks:
             self.send(payload, self._vehicle)
             self.send(payload, self._vehicle, own)
-
-    def wake(self, *, now_ns: int) -> None:
-        """Never."""
-
-    def next_wake_ns(self) -> None:
-        return
 
 
 @dataclass

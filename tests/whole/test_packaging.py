@@ -2,7 +2,6 @@
 
 import os
 import re
-import subprocess
 import sys
 import sysconfig
 import tarfile
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers import ran
 from skytether.shared.scenario import reading
 
 ROOT = Path(__file__).parents[2]
@@ -22,8 +22,8 @@ SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
 
 def hatchling(source: Path, target: str, folder: Path) -> Path:
-    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
-    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    build = ("-m", "hatchling", "build", "-t", target, "-d", folder)
+    assert ran(sys.executable, *build, cwd=source).returncode == 0
     (built,) = folder.iterdir()
     return built
 
@@ -102,7 +102,7 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
     before = names(packages)
     what = [str(wheel)] if kind == "wheel" else ["--no-build-isolation", "--editable", str(ROOT)]
     install = ["-m", "uv", "pip", "install", "--offline", "--no-deps", "--python", str(python)]
-    subprocess.run([sys.executable, *install, *what], check=True, capture_output=True)
+    assert ran(sys.executable, *install, *what).returncode == 0
     added = names(packages) - before
     if kind == "wheel":
         assert added == {"skytether", "skytether-0.1.0.dist-info"}
@@ -113,8 +113,8 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
     example += "\nimport server\nprint(skytether.__file__, server.NAME)"
     beside = tmp_path / "beside"
     strangers(beside, *(name for name in OLD_NAMES if name != "server"))
-    run = [str(python), "-c", example]  # -c, without -P: folders here come before those installed
-    done = subprocess.run(run, cwd=beside, capture_output=True, text=True, check=False)
+    # -c, without -P: folders here come before those installed
+    done = ran(python, "-c", example, cwd=beside)
     assert done.returncode == 0, done.stderr
     compiled = "compiling the control loops, once on this machine: it takes up to a minute\n"
     assert done.stderr in ("", compiled)
@@ -123,8 +123,8 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
     home = packages if kind == "wheel" else ROOT
     assert where == f"{home / 'skytether' / '__init__.py'} unrelated"
 
-    command = [str(python.with_name("skytether")), "fly", "demo", "--virtual", "--duration", "10"]
-    done = subprocess.run(command, cwd=beside, capture_output=True, text=True, check=False)
+    command = ("fly", "demo", "--virtual", "--duration", "10")
+    done = ran(python.with_name("skytether"), *command, cwd=beside)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -138,9 +138,8 @@ def environment(folder: Path) -> tuple[Path, Path]:
     python = folder / "bin" / "python"
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     (packages / "those_of_the_tests.pth").write_text(sysconfig.get_path("purelib"))
-    look = [python, "-P", "-c", "import numpy, skytether"]
-    missing = subprocess.run(look, capture_output=True, check=False)
-    assert b"No module named 'skytether'" in missing.stderr
+    missing = ran(python, "-P", "-c", "import numpy, skytether")
+    assert "No module named 'skytether'" in missing.stderr
     return python, packages
 
 
@@ -159,8 +158,7 @@ def strangers(folder: Path, *packages: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["server", "netem", "client"])
 def test_rooms_of_a_checkout_run_as_processes(name: str) -> None:
-    run = [sys.executable, "-m", name, "--help"]
-    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = ran(sys.executable, "-m", name, "--help", cwd=ROOT)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"skytether {name}" in done.stdout
 
@@ -177,5 +175,5 @@ def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
         [skytether, "sweep", "demo", *flags, "--runs", "1", "--workers", "1", "--out", "swept"],
         [sys.executable, "-P", "-m", "skytether.server", "--help"],
     ):
-        done = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True, check=False)
+        done = ran(*argv, cwd=tmp_path)
         assert done.returncode == 0, done.stderr

@@ -1,7 +1,6 @@
 """The site of docs/, and that its pages of commands and of the library name all there are."""
 
 import re
-import subprocess
 import sys
 from importlib import util
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import skytether
+from helpers import ran
 from skytether.__main__ import COMMANDS
 
 ROOT = Path(__file__).parents[2]
@@ -31,13 +31,8 @@ def test_the_page_of_the_library_has_every_name() -> None:
 def test_the_site_is_built_and_loads_nothing_from_outside(tmp_path: Path) -> None:
     """Strictly: a link that leads nowhere fails. What a browser loads by itself lies in it."""
     site = tmp_path / "site"
-    run = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    build = ("-m", "mkdocs", "build", "--strict", "--site-dir", site)
+    run = ran(sys.executable, *build, cwd=ROOT)
     assert run.returncode == 0, run.stderr
     built = [path.relative_to(site).as_posix() for path in site.glob("*.html")]
     assert set(built) == {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {"404.html"}

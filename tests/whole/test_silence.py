@@ -3,12 +3,13 @@
 import os
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+
+from helpers import ran
 
 ROOT = Path(__file__).parents[2]
 CORES = (
@@ -58,14 +59,9 @@ def append(lines: str, files: Iterable[Path]) -> None:
 
 def complaints(copy: Path, *imported: str) -> list[set[str]]:
     """Modules said to import each of `imported` against a contract; none where all are kept."""
-    run = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
-        cwd=copy.parent,
-        env={**os.environ, "PYTHONPATH": str(copy.parent), "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    lint = Path(sys.executable).with_name("lint-imports")
+    environment = {**os.environ, "PYTHONPATH": str(copy.parent), "COLUMNS": "200"}
+    run = ran(lint, "--no-cache", cwd=copy.parent, env=environment)
     found = [
         set(re.findall(rf"^ *-? *([\w.]+) -> {each} \(l\.\d+\)", run.stdout, re.MULTILINE))
         for each in imported
