@@ -98,6 +98,17 @@ def bounded(u: float, bound: float) -> float:
     return min(u, bound)
 
 
+def braked(speed: float, steps: int, brake: float) -> float:
+    """Speed that is left after so many steps of braking [m/s].
+
+    Args:
+        speed: speed before [m/s].
+        steps: number of them.
+        brake: speed that braking takes away in a step [m/s].
+    """
+    return max(0.0, speed - steps * brake)
+
+
 def remaining(stage: int, length: int, speed: float, brake: float) -> float:
     """Share of the input at `entry` that is told: 1, and after the last what braking leaves of it.
 
@@ -111,7 +122,7 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
     if stage < length or brake == 0.0:
         return 1.0
     # One share for all axes: the vehicle slows down without turning.
-    return max(0.0, speed - (stage - length + 1) * brake) / speed if speed > 0.0 else 0.0
+    return braked(speed, stage - length + 1, brake) / speed if speed > 0.0 else 0.0
 
 
 def leading(told: float, disturbance: float, share: float) -> float:
