@@ -21,6 +21,7 @@ from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.model import ALTITUDE, Array
+from skytether.shared.law.rule import braked
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
@@ -331,7 +332,7 @@ class Pilot:
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
         if has_plan or not brakes:
             return math.inf
-        return max(0.0, self._speed - (0.0 if had_plan else self._terms.brake))
+        return braked(self._speed, 0 if had_plan else 1, self._terms.brake)
 
     # -- what is told of a step --------------------------------------------------------------
 

@@ -99,6 +99,17 @@ def bounded(u: float, bound: float) -> float:
     return min(u, bound)
 
 
+def braked(speed: float, steps: int, brake: float) -> float:
+    """Speed that is left after so many steps of braking [m/s].
+
+    Args:
+        speed: speed before [m/s].
+        steps: number of them.
+        brake: speed that braking takes away in a step [m/s].
+    """
+    return max(0.0, speed - steps * brake)
+
+
 def remaining(stage: int, length: int, speed: float, brake: float) -> float:
     """Braking factor of the input at `entry`: 1 until the horizon ends, then falling to 0.
 
@@ -112,7 +123,7 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
     if stage < length or brake == 0.0:
         return 1.0
     # The same factor for all axes: the vehicle slows down without turning.
-    return max(0.0, speed - (stage - length + 1) * brake) / speed if speed > 0.0 else 0.0
+    return braked(speed, stage - length + 1, brake) / speed if speed > 0.0 else 0.0
 
 
 def reference_input(without_feedback: float, disturbance: float, share: float) -> float:
