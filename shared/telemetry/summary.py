@@ -1,7 +1,8 @@
 """Summary of a flight, computed from its record; its names are used everywhere."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -10,6 +11,7 @@ from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.pace import is_known, is_too_fast
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
@@ -73,6 +75,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets overtaken by a later one, both ways."""
     stale: int
     """Number of messages discarded at either end because a newer one had arrived."""
+    drops: dict[str, dict[str, int]] | None = None
+    """Number of packets that server, netem and client dropped, by reason (docs/operating.md); those
+    of server and netem are of all vehicles. None where the processes' figures are not known."""
     age_ms_p50: float | None
     """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
@@ -110,6 +115,7 @@ def summarise(
     server: Rows | None = None,
     netem: Rows | None = None,
     *,
+    figures: Mapping[str, Mapping[str, Any]] | None = None,
     secure: bool = False,
 ) -> Summary:
     """Summary of one vehicle's flight.
@@ -120,6 +126,7 @@ def summarise(
         client: rows of the vehicle in the client's part.
         server: rows of the server, of any vehicles.
         netem: rows of netem; all flows count.
+        figures: figures of each process by its name, as in `Record.figures`.
         secure: whether the link was authenticated and encrypted.
     """
     error = position_error(scenario, client, server)
@@ -172,6 +179,7 @@ def summarise(
         lost=None if netem is None else int(netem["lost"].sum()),
         reordered=None if netem is None else int(netem["overtaken"].sum()),
         stale=stale,
+        drops=drops(figures, int(client["vehicle"][0])) if figures and len(client) else None,
         age_ms_p50=_quantile(age_ms, 0.5),
         age_ms_p99=_quantile(age_ms, 0.99),
         aoi_s_mean=_mean(aoi_s),

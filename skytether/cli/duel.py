@@ -124,4 +124,5 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> N
         if not len(flown.client):
             raise CommandError("interrupted before the first step", command.INTERRUPTED)
         title = f"{name}, over UDP on loopback, seed {scenario.seed}"
-        terminal.finish(summarise(scenario, name, flown.client, flown.server, flown.netem), title)
+        parts = flown.client, flown.server, flown.netem
+        terminal.finish(summarise(scenario, name, *parts, figures=flown.figures), title)

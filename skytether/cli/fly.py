@@ -189,7 +189,8 @@ def _beside(options: FlyOptions) -> Scenario | None:
 
 
 def _summarise(scenario: Scenario, name: str, flown: Record, *, secure: bool = False) -> Summary:
-    return summarise(scenario, name, flown.client, flown.server, flown.netem, secure=secure)
+    parts = flown.client, flown.server, flown.netem
+    return summarise(scenario, name, *parts, figures=flown.figures, secure=secure)
 
 
 def _virtually(

@@ -117,8 +117,9 @@ class Flight:
         """Figures of the flight; with several vehicles, those of the first."""
         client = self.record.client
         client = client[client["vehicle"] == client["vehicle"][:1]]
-        others = self.record.server, self.record.netem
-        return summarise(self.scenario, self.name, client, *others, secure=self.secure)
+        rows = client, self.record.server, self.record.netem
+        known = self.record.figures
+        return summarise(self.scenario, self.name, *rows, figures=known, secure=self.secure)
 
     @property
     def events(self) -> tuple[FlightEvent, ...]:

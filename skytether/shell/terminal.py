@@ -1,7 +1,7 @@
 """Output of commands on the terminal: progress bars, tables, and a flight's summary."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -122,6 +122,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ),
         ("lost, reordered packets", _values("d", s.lost, s.reordered)),
         ("stale packets", _values("d", s.stale)),
+        *((f"dropped by {end}", _counts(reasons)) for end, reasons in (s.drops or {}).items()),
         ("link", "sealed" if s.secure else "plaintext"),
         ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
         ("mean age, its peaks, age of the plan [s]", ages),
@@ -130,6 +131,10 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("deadline misses", _values("d", s.deadline_misses)),
     ]
     return [(name, values) for name, values in rows if values]
+
+
+def _counts(reasons: Mapping[str, int]) -> str:
+    return ", ".join(f"{reason} {count}" for reason, count in reasons.items())
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:

@@ -44,7 +44,8 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
     streams = [_moved(each, about.offset_ns) for each in recordings]
     for process, frame in merge(*streams, key=lambda each: each[1].time_ns):
         joined.add(process, frame)
-    joined.finish(summary_of(scenario, about, _parts(recordings)))
+    figures = {name: counted for each in recordings for name, counted in each.figures.items()}
+    joined.finish(summary_of(scenario, about, _parts(recordings), figures))
 
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:

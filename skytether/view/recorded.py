@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,8 +21,8 @@ from skytether.shared.core.events import Counted, Event
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry import feed
-from skytether.shared.telemetry.feed import Frame, Opened, Rows, Said, columns_of
+from skytether.shared.telemetry import drops, feed
+from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.view.container import Container, reading
@@ -57,7 +58,16 @@ class Recorded:
     @cached_property
     def summary(self) -> Summary | None:
         """Summary of the flight; None where nothing was flown."""
-        return summary_of(self.scenario, self.about, self.parts)
+        return summary_of(self.scenario, self.about, self.parts, self.figures)
+
+    @cached_property
+    def figures(self) -> dict[str, dict[str, Any]]:
+        """Newest figures of each process, by its name."""
+        return {
+            process: frame.figures
+            for _, process, frame in self.frames
+            if isinstance(frame, Figures)
+        }
 
     @property
     def begin_ns(self) -> int:
@@ -71,14 +81,19 @@ class Recorded:
                 yield time_ns, process, frame.event
 
 
-def summary_of(scenario: Scenario, about: About, parts: Mapping[str, Table]) -> Summary | None:
+def summary_of(
+    scenario: Scenario,
+    about: About,
+    parts: Mapping[str, Table],
+    figures: Mapping[str, Mapping[str, Any]],
+) -> Summary | None:
     """Summary of the first vehicle's flight; None where nothing was flown."""
     client = parts.get("client")
     if client is None or not len(client):
         return None
     client = client[client["vehicle"] == client["vehicle"].min()]
-    others = parts.get("server"), parts.get("netem")
-    return summarise(scenario, about.scenario, client, *others, secure=about.secure)
+    rows = client, parts.get("server"), parts.get("netem")
+    return summarise(scenario, about.scenario, *rows, figures=figures, secure=about.secure)
 
 
 def read(path: Path) -> Recorded:
@@ -148,6 +163,8 @@ class _Frames:
                 rows.append((frame.time_ns, feed.table(frame.rows, known)))
                 if rows[0][1].dtype != known:
                     raise ValueError(f"the part {frame.part} has columns of two kinds")
+            case Figures():
+                drops.counted(frame.figures)
         self._frames.append((process, frame))
 
     def together(self) -> tuple[list[Timed], dict[str, Table], dict[str, Indices]]:

@@ -191,7 +191,16 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
         *("event_ratio", "uplink_horizons", "uplink_packets", "uplink_bytes"),
         *("downlink_packets", "downlink_bytes", "uplink_packets_per_s", "uplink_bytes_per_s"),
         *("downlink_packets_per_s", "downlink_bytes_per_s", "packets_per_s", "bytes_per_s"),
-        *("lost", "reordered", "stale", "age_ms_p50", "age_ms_p99", "aoi_s_mean", "aoi_s_peak"),
+        *(
+            "lost",
+            "reordered",
+            "stale",
+            "drops",
+            "age_ms_p50",
+            "age_ms_p99",
+            "aoi_s_mean",
+            "aoi_s_peak",
+        ),
         *("plan_age_s_mean", "effort_mps", "saturated", "too_fast"),
         *("solve_ms_p50", "solve_ms_p99"),
         *("deadline_misses", "estimate_error_m", "secure"),
@@ -200,6 +209,20 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
     assert summary["solve_ms_p50"] is None
     assert (tmp_path / "flight.png").read_bytes().startswith(b"\x89PNG")
     assert "RMSE x, y, xy [m]" in run.stdout
+
+
+def test_a_flight_tells_what_was_dropped_and_why(tmp_path: Path) -> None:
+    """By each end, in the file and in the table; what occurred alone."""
+    file = tmp_path / "flight.json"
+    argv = ["fly", "demo", "--virtual", "--secure", "--duration", "8", "--json", str(file)]
+    run = skytether(*argv, "--network.downlink", "constant(0.1) & duplicate(0.5) & loss(0.2)")
+    summary = json.loads(file.read_text())
+    told = summary["drops"]
+    assert told["netem"].keys() == {"uplink lost", "downlink lost"}
+    assert sum(told["netem"].values()) == summary["lost"] > 0
+    assert told["server"].keys() == {"replayed"}
+    count = told["server"]["replayed"]
+    assert re.search(rf"dropped by server +│ replayed {count} ", run.stdout)
 
 
 @pytest.fixture

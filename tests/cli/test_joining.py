@@ -68,7 +68,8 @@ def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> No
     out = tmp_path / "flight.mcap"
     assert together(paths, out) == 0
     joined = read(out)
-    assert joined.summary == summarise(SCENARIO, "demo", flown.client, flown.server, flown.netem)
+    rows = flown.client, flown.server, flown.netem
+    assert joined.summary == summarise(SCENARIO, "demo", *rows, figures=flown.figures)
     for part in ("client", "server", "plan", "netem"):
         assert joined.parts[part].tobytes() == getattr(flown, part).tobytes()
     times_ns = [time_ns for time_ns, *_ in joined.frames]

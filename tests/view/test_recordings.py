@@ -70,7 +70,8 @@ def flown() -> Record:
 
 def record(path: Path, scenario: Scenario = SCENARIO, of: Record | None = None) -> Path:
     of = of or flown()
-    summary = summarise(scenario, "demo", of.client, of.server, of.netem)
+    rows = of.client, of.server, of.netem
+    summary = summarise(scenario, "demo", *rows, figures=of.figures)
     assert recorder.write(path, scenario, "demo", of, summary) is None
     return path
 
@@ -102,7 +103,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def summary_of(of: Record) -> Summary:
-    return summarise(SCENARIO, "demo", of.client, of.server, of.netem)
+    rows = of.client, of.server, of.netem
+    return summarise(SCENARIO, "demo", *rows, figures=of.figures)
 
 
 def is_named(record: Any, name: str) -> bool:
@@ -747,6 +749,8 @@ def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path:
     assert "://" not in page.replace("data:", "")
     for shown in ("RMSE x, y, xy [m]", "session open, flying", "[network.uplink]", "seed 1"):
         assert shown in page
+    lost = flown().figures["netem"]["uplink"]["lost"]
+    assert f"uplink lost {lost}" in page[page.index("dropped by netem") :]
 
 
 # --- What is refused.
@@ -909,6 +913,17 @@ def test_more_messages_than_there_is_an_index_for_are_not_made(
     line, peak_bytes = bombed(recording, chunk, tmp_path, capsys)
     assert "more messages than fit into its size" in line
     assert peak_bytes < 2**26
+
+
+def test_figures_of_a_damaged_recording_are_checked(recording: Path, tmp_path: Path) -> None:
+    """Drops are counted of them whenever a summary is asked for, long after the file was read."""
+
+    def say_more(found: list[Any]) -> None:
+        at, frame = next(iter(frames_of(found, "Figures").items()))
+        put(found, at, frame | {"figures": {"dropped": {"forged": "many"}}})
+
+    with pytest.raises(RecordingError, match="it is damaged: Expected `int`, got `str`"):
+        read(changed(recording, tmp_path / "it.mcap", say_more))
 
 
 def test_packets_are_drawn_of_a_flight_that_began_before_all_time() -> None:
