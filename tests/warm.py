@@ -194,6 +194,7 @@ def _become(
     sys.stdout = os.fdopen(1, "w", buffering=1, encoding="utf-8", closefd=False)
     sys.stderr = os.fdopen(2, "w", buffering=1, encoding="utf-8", closefd=False)
     if file_bytes is not None:
+        sys.dont_write_bytecode = True  # Python keeps half of a .pyc, and reads it ever after
         _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, hard))
     sys.argv = ["skytether", *argv]

@@ -302,10 +302,13 @@ def test_a_flight_that_is_killed_leaves_the_older_recording(
 def room_for(size: int) -> Iterator[None]:
     """No file may be longer."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    writes = sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # Python keeps half of a .pyc, and reads it ever after
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
         yield
     finally:
+        sys.dont_write_bytecode = writes
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 

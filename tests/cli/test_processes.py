@@ -88,8 +88,11 @@ async def test_a_child_that_is_killed_is_said_to_be() -> None:
     assert netem.last_words() == "netem: ended by a signal: Killed"
 
 
-async def test_a_child_whose_record_is_incomplete_has_told_so(tmp_path: Path) -> None:
+async def test_a_child_whose_record_is_incomplete_has_told_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It is no failure of the child, which goes on and ends with 1."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python keeps half of a .pyc
     heard: list[LogLine] = []
     file = str(tmp_path / "netem")
     argv = ("demo", "--bind", "127.0.0.1:0", "--record", file)
