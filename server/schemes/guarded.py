@@ -35,7 +35,7 @@ from skytether.shared.wire.protocol import (
 class GuardedScheme(Scheme):
     """The scheme of a plug-in, and what is to happen where it fails.
 
-    It is asked for all vehicles of a block at once, and where it fails for each alone.
+    It is asked for all vehicles of a block together, and where that fails for each alone.
 
     Args:
         name: its name, for the message.
@@ -68,7 +68,7 @@ class GuardedScheme(Scheme):
             return False
 
     def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """See `Scheme`; the scheme itself is asked in `plan`, for one vehicle after the other."""
+        """See `Scheme`; the scheme itself is asked in `plan`, both at once."""
 
     def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
         """See `Scheme`; unsolved is what it fails for, and what could not be flown."""

@@ -11,8 +11,10 @@ from types import ModuleType
 
 from skytether.server.common import splines
 from skytether.server.common.scheme import Fleet, Scheme
+from skytether.server.common.splines import SplineScheme
 from skytether.server.schemes import horizons
 from skytether.server.schemes.guarded import GuardedScheme
+from skytether.server.schemes.horizons import InputScheme
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.registry import SCHEMES
@@ -34,12 +36,15 @@ def make(fleet: Fleet) -> Scheme:
     if entry.is_ours:
         made: Scheme = OURS[text].make(fleet)
         return made
+    other = InputScheme if fleet.terms.splines else SplineScheme
     try:
         inner = entry.make(fleet, *entry.numbers(numbers, fleet.scenario.control))
+        if isinstance(inner, other):
+            raise TypeError(f"flown as {fleet.terms.scheme!r}, it is no {other.__name__}")
+        return GuardedScheme(text, inner, fleet)
     except Exception as error:
         wrong = f"a scheme that can be made ({type(error).__name__}: {error})"
         raise ConfigError(f"control.scheme: got {text!r}, expected {wrong}") from error
-    return GuardedScheme(text, inner, fleet)
 
 
 def kernels(text: str) -> tuple[ModuleType, ...]:

@@ -249,11 +249,24 @@ def test_what_is_no_scheme_is_refused_before_a_flight(
     assert expected in str(said.value)
 
 
-def test_a_scheme_that_cannot_be_made_is_refused_as_its_server_begins(tmp_path: Path) -> None:
-    plug(tmp_path, CHASE.replace("super().__init__(fleet)", "raise RuntimeError('no')"))
+@pytest.mark.parametrize(
+    ("right", "wrong", "why"),
+    [
+        ("super().__init__(fleet)", "raise RuntimeError('no')", "RuntimeError: no"),
+        (
+            '"predictive")',
+            '"trajectory")',
+            "TypeError: flown as 'trajectory', it is no InputScheme",
+        ),
+    ],
+)
+def test_a_scheme_that_cannot_be_made_is_refused_as_its_server_begins(
+    right: str, wrong: str, why: str, tmp_path: Path
+) -> None:
+    plug(tmp_path, CHASE.replace(right, wrong))
     with pytest.raises(ConfigError) as said:
         fly(scenario("chase"))
-    expected = "a scheme that can be made (RuntimeError: no)"
+    expected = f"a scheme that can be made ({why})"
     assert str(said.value) == f"control.scheme: got 'chase', expected {expected}"
 
 
