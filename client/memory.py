@@ -162,7 +162,7 @@ class ClientMemory:
         """Bytes to be written, if the state differs from the last one returned or that is old.
 
         Args:
-            now: present state.
+            state: present state.
             now_ns: time now.
         """
         if self._handed is not None:

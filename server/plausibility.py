@@ -153,7 +153,7 @@ def _jumps(observed: HeardNumbers, row: int, which: int, time: float, noise_m: f
     """Whether no vehicle can get from the state of another observation to the new one in time.
 
     Args:
-        said: observations of the vehicles.
+        observed: observations of the vehicles.
         row: row of the vehicle.
         which: index of the other observation.
         time: time between the two [s].

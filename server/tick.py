@@ -97,7 +97,6 @@ class Ticker:
     """Decides for all vehicles in session, sends horizons and heartbeats, and records.
 
     Args:
-        terms: terms agreed with every vehicle.
         sessions: sessions of the vehicles.
         clock: gives the step of each vehicle.
         controller: plans and decides.

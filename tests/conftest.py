@@ -18,6 +18,8 @@ import hypothesis
 import pytest
 
 from skytether.shared.base import kernel
+from skytether.shared.scenario.registry import TABLES
+from skytether.shell import plugins
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
@@ -116,3 +118,14 @@ def documented_ports() -> Iterator[None]:
     ) as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # ends with the file, whatever becomes of the process
         yield
+
+
+@pytest.fixture
+def plugin_tables() -> Iterator[None]:
+    """Leave the tables that plug-ins extend as they were."""
+    before = [dict(table) for table in TABLES]
+    yield
+    plugins._loaded.clear()
+    for table, entries in zip(TABLES, before, strict=True):
+        table.clear()
+        table.update(entries)

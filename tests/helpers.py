@@ -16,9 +16,11 @@ from skytether.__main__ import main
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.events import Fault
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
 from skytether.shell.driver import Shell
 
 LOOPBACK: Address = ("127.0.0.1", 0)
@@ -170,3 +172,9 @@ async def driven(*shells: Shell) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def faults(flight: Record) -> list[str]:
+    """Last lines of the tracebacks that a flight reported."""
+    events = (each.event for each in flight.events)
+    return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]

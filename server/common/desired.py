@@ -273,7 +273,7 @@ def _foresee(
     """Fill in the windows of vehicles: visible states, and extrapolated ones after them.
 
     Args:
-        known: slots and stages of the desired states from k on; nothing after k + reach is used.
+        visible: slots and stages of the desired states from k on; none after k + reach is used.
         n: number of vehicles.
         ahead: d of each; shape (block,).
         outlook: visible part of the trajectory.

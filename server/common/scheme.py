@@ -182,23 +182,23 @@ class SentPlans(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """What a scheme is made for."""
+    """Flight and vehicles for which a scheme is made."""
 
     scenario: Scenario
     terms: Terms
-    """The same, as far as both ends agree on it."""
+    """Terms of the flight."""
     capacity: int
     """Largest number of vehicles."""
     block: int
-    """Largest number of them that are decided on together."""
+    """Largest number of vehicles that are planned for together."""
     clock: ClockMap
     desired: Desired
-    """Desired trajectories as far as they are known."""
+    """Desired trajectories."""
     references: Callable[[int], Reference] | None
-    """Where each vehicle of a mission wants to be, by its number."""
+    """Reference of each vehicle of a mission, by its number; None without a mission."""
     stopwatch: Stopwatch
     tell: Callable[[str], None]
-    """Told the traceback of a plug-in's first mistake in flight."""
+    """Called with the traceback of a plug-in's first error in flight."""
 
 
 class Scheme(ABC):
@@ -209,7 +209,7 @@ class Scheme(ABC):
     """
 
     properties: ClassVar[SchemeProperties]
-    """What a plug-in's scheme says of itself; ours say it in `shared.scenario.schemes`."""
+    """Properties of a plug-in's scheme; those of ours are in `shared.scenario.schemes`."""
     solve_ns = -1
     """Time that planning for the last block took [ns], or -1 where nobody measures it."""
 

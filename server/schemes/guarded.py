@@ -1,7 +1,7 @@
-"""A plug-in's scheme, whose mistakes end no flight.
+"""Wrapper of a plug-in's scheme: its errors end no flight.
 
-Where it fails for a vehicle, there is no plan for that vehicle at that step, and nothing is sent to
-it. The vehicle flies what it holds to the end; its failsafe does the rest.
+If the scheme fails for a vehicle, that vehicle gets no plan at that step. It flies the plan that it
+has to its end, and then its failsafe acts.
 """
 
 import traceback
@@ -33,14 +33,14 @@ from skytether.shared.wire.protocol import (
 
 
 class GuardedScheme(Scheme):
-    """The scheme of a plug-in, and what is to happen where it fails.
+    """Plug-in's scheme with its errors caught.
 
-    It is asked for all vehicles of a block together, and where that fails for each alone.
+    It is called for all vehicles of a block together, and if that fails, for each alone.
 
     Args:
-        name: its name, for the message.
+        name: name of the scheme, for messages.
         inner: the scheme.
-        fleet: what it is made for.
+        fleet: flight and vehicles that it is made for.
     """
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
@@ -117,7 +117,7 @@ class GuardedScheme(Scheme):
             return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
 
     def _ask(self, n: int, ask: Callable[[slice], None]) -> list[int]:
-        """Ask for n vehicles at once, and where that fails for each alone; those it failed for."""
+        """Call for n vehicles at once, and if that fails, for each alone; indices of the failed."""
         failed = []
         try:
             ask(slice(0, n))
@@ -131,10 +131,10 @@ class GuardedScheme(Scheme):
         return failed
 
     def _check(self, found: Foresight) -> None:
-        """Check that what is to be sent can be flown.
+        """Check that the plans can be flown.
 
         Raises:
-            ValueError: it cannot.
+            ValueError: with the array that is out of bounds.
         """
         told = found.told
         if not ((found.ahead >= 0) & (found.ahead <= self._ahead_max)).all():
@@ -157,14 +157,14 @@ class GuardedScheme(Scheme):
 
 
 def _cut(found: Foresight, some: slice) -> Foresight:
-    """What is foreseen of some vehicles of a block."""
+    """Predictions for some vehicles of a block; the arrays are views."""
     arrays: Iterable[NDArray[Any]] = found[:-1]
     told = Splines._make(each[some] for each in found.told)
     return Foresight._make((*(each[some] for each in arrays), told))
 
 
 def _blank(found: Foresight, figures: Figures, rows: Indices, step: Indices) -> None:
-    """Fill in what holds where a scheme says nothing else: an input of zero, from now on."""
+    """Fill in the defaults: an input of zero from the present step on."""
     for each in (found.ahead, found.committed, found.held, found.disturbance, found.horizons):
         each[:] = 0
     for each in (found.estimate, found.start, found.feedback, found.told.knots, found.told.back):

@@ -26,13 +26,13 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 FLOWN_AS = ("committed", "predictive", "trajectory", "none")
-"""Ways to fly what a scheme sends, by the names of the schemes that brought them."""
+"""Ways in which a vehicle flies the server's messages, by the names of our schemes."""
 INDEXED = ("committed", "predictive")
-"""Those in which the vehicle reads a horizon by the step it is at, and not always its first."""
+"""Ways in which the vehicle reads a horizon at the present stage, not always at its first."""
 COMMITTING = ("committed",)
-"""Those in which horizons begin with committed inputs."""
+"""Ways in which horizons begin with committed inputs."""
 ALONG_SPLINES = ("trajectory",)
-"""Those in which a spline of the desired trajectory is sent, and no inputs."""
+"""Ways in which splines of the desired trajectory are sent instead of inputs."""
 
 
 class Terms(NamedTuple):
@@ -53,7 +53,7 @@ class Terms(NamedTuple):
     u_max: tuple[float, ...]
     """Bound of the input, eq. (6), on each axis [m/s]."""
     scheme: str
-    """How what is sent is flown, one of FLOWN_AS: for a scheme of ours its name."""
+    """How the vehicle flies the messages of the server, one of FLOWN_AS."""
     feedback: bool
     """Whether horizons contain feedback."""
     exhausted: str

@@ -1,4 +1,4 @@
-"""Schemes of delay compensation: what each says of itself, for whoever needs to know.
+"""Table of the schemes of delay compensation, with the properties of each.
 
 One of ours has its code in the module of its name in `server.schemes`. One of a plug-in is a class
 of `skytether.plugin_scheme` with `properties`.
@@ -14,24 +14,24 @@ scheme = SCHEMES
 """Decorator of a scheme."""
 
 HELD = "held"
-"""What a trigger needs that looks at the inputs which are flown if nothing is sent."""
+"""Need of a trigger that reads the inputs which the vehicle flies if nothing is sent."""
 FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
 """Figures of a plan that a scheme may compute, and the columns of the record that have them."""
 
 
 class SchemeProperties(NamedTuple):
-    """Properties of a scheme, as it says them itself."""
+    """Properties of a scheme that other modules depend on."""
 
     flown_as: str = "predictive"
-    """How a vehicle flies what is sent, one of `shared.law.terms.FLOWN_AS`."""
+    """How a vehicle flies its messages, one of `shared.law.terms.FLOWN_AS`."""
     figures: tuple[str, ...] = ()
-    """Those of FIGURES that it computes."""
+    """Figures of a plan that it computes, some of FIGURES."""
     feedback: bool | None = None
     """The one value of `control.feedback` that it can be flown with; None: either."""
     observes: bool = False
-    """Whether it learns a disturbance, and so heeds `control.observer_s`."""
+    """Whether it estimates a disturbance, with the time constant `control.observer_s`."""
     missions: bool = False
-    """Whether it can be named on a mission, whose motions are flown as it sends them."""
+    """Whether a mission may name it: the motions of a mission are sent and flown likewise."""
 
     @property
     def indexed(self) -> bool:
@@ -50,19 +50,19 @@ class SchemeProperties(NamedTuple):
 
     @property
     def computes(self) -> tuple[str, ...]:
-        """What triggers may need."""
+        """Needs of triggers that it meets: its figures, and HELD."""
         return (*self.figures, HELD) if self.commits else self.figures
 
 
 @scheme
 def committed() -> SchemeProperties:
-    """Plans of inputs, which begin with the committed ones: the vehicle flies them already."""
+    """Plans of inputs that begin with the committed ones, which the vehicle already flies."""
     return SchemeProperties("committed", FIGURES, observes=True)
 
 
 @scheme
 def predictive() -> SchemeProperties:
-    """Plans of inputs from where the vehicle is by the inputs of all plans: the paper's."""
+    """The paper's: plans of inputs from a state predicted with the inputs of all plans."""
     return SchemeProperties("predictive", ("state_gap",), observes=True)
 
 

@@ -19,11 +19,11 @@ import pytest
 from helpers import until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.base import files
-from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
-from skytether.shell import plugins
 from skytether.shell.command import CommandError
 from skytether.shell.process import recorded
+
+pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 SHORT = ("--virtual", "--duration", "6", "--settle", "0")
 SCENARIO = "extends = 'demo'\nduration = 6.0\n"
@@ -97,16 +97,6 @@ def test_every_option_that_names_a_file_is_looked_at() -> None:
                 flag = field.name.replace("_", "-")
                 known = f"{command} --{flag}" in LINES or (command, field.name) in IN_PLACE
                 assert known or field.name in READ | SOCKETS, (command, field.name)
-
-
-@pytest.fixture(autouse=True)
-def _tables() -> Iterator[None]:
-    """Leave the tables of plug-ins as they were."""
-    before = dict(REFERENCES)
-    yield
-    plugins._loaded.clear()
-    REFERENCES.clear()
-    REFERENCES.update(before)
 
 
 @pytest.fixture(scope="module")

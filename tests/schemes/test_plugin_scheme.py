@@ -2,7 +2,6 @@
 
 import re
 import shlex
-from collections.abc import Iterator
 from contextlib import chdir
 from pathlib import Path
 from textwrap import dedent, indent
@@ -12,17 +11,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from helpers import packaged, refusal
+from helpers import faults, packaged, refusal
 from skytether.__main__ import main
 from skytether.server.controller import other_schemes
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import Fault
-from skytether.shared.scenario.registry import TABLES
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import plugins
 from skytether.sim.flight import fly, fly_batch
+
+pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 PAGE = (Path(__file__).parents[2] / "docs" / "schemes.md").read_text()
 (CHASE,) = re.findall(r"```python\n(import numpy.*?plugin_scheme.*?)```", PAGE, re.DOTALL)
@@ -58,17 +56,6 @@ OURS = """
     class trajectory_(Guidance):
         properties = SchemeProperties("trajectory", FIGURES[1:], feedback=True)
 """
-
-
-@pytest.fixture(autouse=True)
-def _tables() -> Iterator[None]:
-    """Leave the tables as they were."""
-    before = [dict(table) for table in TABLES]
-    yield
-    plugins._loaded.clear()
-    for table, entries in zip(TABLES, before, strict=True):
-        table.clear()
-        table.update(entries)
 
 
 def plug(folder: Path, code: str) -> None:
@@ -116,12 +103,6 @@ RIGHT = re.sub(r'@scheme.*\n|    """Sends.*\n', "", CHASE[CHASE.index("@scheme")
     "class Chase", "class Right"
 )
 """The page's scheme without a name in the table."""
-
-
-def faults(flight: Record) -> list[str]:
-    """Last lines of what was told of mistakes."""
-    events = (each.event for each in flight.events)
-    return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]
 
 
 # -- flown as ours ---------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator
 from contextlib import ExitStack, chdir
 from functools import partial
 from pathlib import Path
@@ -20,17 +19,18 @@ import numpy as np
 import pytest
 from hatchling.build import build_wheel
 
-from helpers import packaged, refusal
+from helpers import faults, packaged, refusal
 from skytether.__main__ import main
 from skytether.lab.commands.pool import _equipped
 from skytether.lab.journal import digests
-from skytether.shared.core.events import Fault
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell import plugins
 from skytether.sim.flight import fly, fly_batch
+
+pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 ROOT = Path(__file__).parents[2]
 TRIGGERS_MD, SCHEMES_MD, VEHICLES_MD, NETWORK_MD = (
@@ -59,17 +59,6 @@ class bad(Impairment):
 """
 
 
-@pytest.fixture(autouse=True)
-def _tables() -> Iterator[None]:
-    """Leave the tables as they were."""
-    before = [dict(table) for table in TABLES]
-    yield
-    plugins._loaded.clear()
-    for table, entries in zip(TABLES, before, strict=True):
-        table.clear()
-        table.update(entries)
-
-
 def plug(folder: Path, code: str, name: str = "mine.py") -> str:
     """Path of a plug-in that is imported."""
     path = folder / name
@@ -86,12 +75,6 @@ def scenario(**sections: Any) -> Scenario:
 def flown(trigger: str, **control: Any) -> Record:
     """The scenario's flight with a trigger."""
     return fly(scenario(control={"trigger": trigger} | control))
-
-
-def faults(flight: Record) -> list[str]:
-    """Last lines of what was told of mistakes."""
-    events = (each.event for each in flight.events)
-    return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]
 
 
 # -- what the documents say ------------------------------------------------------------------------
