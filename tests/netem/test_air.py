@@ -74,14 +74,6 @@ def test_what_a_law_says_of_itself_is_so(text: str) -> None:
     assert made.least_s == pytest.approx(max(0.0, law.ppf(2.0**-54)), abs=0.01)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_papers_delays_follow_a_poisson_law(seed: int) -> None:
-    slots = np.rint((delays_s("paper(0.4, 0.02, 2)", seed) - 0.4) / 0.02).astype(int)
-    counts = np.bincount(np.minimum(slots, 7), minlength=8)
-    shares = [*stats.poisson.pmf(range(7), 2), stats.poisson.sf(6, 2)]
-    assert stats.chisquare(counts, np.multiply(shares, SAMPLES)).pvalue > P_MIN
-
-
 @pytest.mark.parametrize("law", ["uniform(0, 1", "gamma(0, 0.5, 0.3", "paper(0, 0.1, 3"])
 def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
     """The autocorrelation falls to 1/e in the time that is asked for."""
