@@ -137,14 +137,15 @@ def test_a_step_is_the_matrix_equation(seed: int) -> None:
     np.testing.assert_allclose(model.step(x, u), expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("dt_s", [0.02, 0.05, 0.5])
+@pytest.mark.parametrize("dt_s", [0.01, 0.05, 0.5])
 def test_the_covariance_under_white_acceleration_is_that_of_the_integral(dt_s: float) -> None:
     """∫ e^{As} G Gᵀ e^{Aᵀs} over a step, by quadrature, on axes that differ."""
-    tau_s = np.array([0.2, 0.84, 3.0])
+    tau_s = np.array([0.05, 0.3, 0.84, 5.0])
     roots = white_acceleration(tau_s, dt_s)
-    nodes, weights = np.polynomial.legendre.leggauss(20)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
     s = 0.5 * dt_s * (nodes + 1.0)
     for root, tau in zip(roots, tau_s, strict=True):
         felt = np.array([tau * (1.0 - np.exp(-s / tau)), np.exp(-s / tau)])
         expected = 0.5 * dt_s * (weights * felt) @ felt.T
-        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6)
+        assert root[0, 1] == 0.0
+        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-8)
