@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import pytest
 
-from airborne import Air, modes
+from airborne import BOTH, Air, altered, modes
 from skytether.autopilot.flavours import FlavourName, FlightMode
-from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy
 from skytether.shared.core.aboard import (
@@ -23,9 +23,6 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import ServerHeard, ServerSilent, Welcomed
 from skytether.shared.telemetry.record import Reason
-
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
-
 
 # The clock
 
@@ -44,7 +41,7 @@ def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None
 
 def test_a_simulator_that_runs_faster_than_time_is_not_flown_and_its_speed_is_told() -> None:
     air = Air(autopilot_ppm=4e6, mavlink={"patience_s": 5.0})
-    air.run(20.0, lambda: bool(air.of(NotTakenOff)))
+    air.until(lambda: air.of(NotTakenOff), 20.0)
     (failed,) = air.of(NotTakenOff)
     assert "speed is 5" in failed.why
     assert not air.flight.armed
@@ -54,15 +51,8 @@ def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
     """The autopilot's stamps jump into the future: it brakes, and says why."""
     air = Air("px4", duration=30.0)
     air.fly()
-
-    def ahead(message: Message) -> bytes | None:
-        if message.get_type() != "LOCAL_POSITION_NED":
-            return None
-        message.time_boot_ms += 60_000
-        return Codec(1, 1).encode(message)
-
     air.run(3.0)
-    air.tap.alter = ahead
+    air.tap.alter = altered("LOCAL_POSITION_NED", time_boot_ms=lambda ms: ms + 60_000)
     air.run(2.0)
     assert ("brake", str(Reason.UNUSABLE)) in modes(air)
     (dropped,) = air.of(PositionsDropped)
@@ -102,15 +92,8 @@ def test_px4_says_why_it_is_not_armed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_altitude_of_take_off_is_above_the_ground_it_stands_on() -> None:
     """PX4's estimate of the height had drifted by 1.3 m since home was set: it climbed to 3.7 m."""
     air = Air("px4", duration=5.0)
-
-    def drifted(message: Message) -> bytes | None:
-        if message.get_type() != "HOME_POSITION":
-            return None
-        message.altitude -= 1300
-        message.z = 1.3
-        return Codec(1, 1).encode(message)
-
-    air.tap.alter = drifted
+    drifted = {"altitude": lambda mm: mm - 1300, "z": lambda _: 1.3}
+    air.tap.alter = altered("HOME_POSITION", **drifted)
     air.fly()
     assert air.flight.position()[2] == pytest.approx(2.0, abs=0.3)
 

@@ -2,12 +2,12 @@
 
 import pytest
 
+from airborne import BOTH
 from bad_line import ARM, SET_MODE, SETTLE_S, OverLine, fly
 from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.condition import Condition
 from skytether.shared.wire.protocol import Mode
 
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 OFF_M = 1.5
 """Distance from the truth below which a position was our autopilot's [m]: others are 30 m away, and
 what is a second old no more than this."""
@@ -67,7 +67,7 @@ def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
     assert not air.sent(ARM)
     assert not air.sent(SET_MODE)
     assert not air.setpoints_from_client(0)
-    assert air.client._failsafe.mode in (Mode.INIT, Mode.SYNC, Mode.READY)
+    assert air.mode in (Mode.INIT, Mode.SYNC, Mode.READY)
     assert air.client.failure is None
 
 

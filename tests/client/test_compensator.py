@@ -72,10 +72,12 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
     assert chosen(compensator, 1000, HERE).tolist() == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
 @pytest.mark.parametrize("step", range(100, 100 + H))
-def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
+def test_stage_is_the_step_since_the_horizon_was_made(step: int, exhausted: str) -> None:
     """Input u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
-    np.testing.assert_allclose(chosen(holding(100), step, HERE), INPUTS[:, step - 100], rtol=1e-7)
+    flown = chosen(holding(100, exhausted=exhausted), step, HERE)
+    np.testing.assert_allclose(flown, INPUTS[:, step - 100], rtol=1e-7)
 
 
 @pytest.mark.parametrize("step", [100 + H, 101 + H, 100_000])
@@ -90,13 +92,6 @@ def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
     compensator = Compensator(terms(exhausted=exhausted))
     compensator.offer(horizon(105), 100, 99)
     np.testing.assert_allclose(chosen(compensator, 101, HERE), INPUTS[:, 0], rtol=1e-7)
-
-
-def test_braking_begins_only_after_the_last_stage() -> None:
-    """The last input is flown for its own step in full."""
-    np.testing.assert_allclose(
-        chosen(holding(100, exhausted="brake"), 99 + H, HERE), INPUTS[:, -1], rtol=1e-7
-    )
 
 
 def test_brake_takes_the_speed_away_at_its_rate() -> None:
@@ -117,11 +112,6 @@ def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> N
     lost = np.linalg.norm(now) - np.linalg.norm(then)
     assert -1e-12 <= lost <= 0.2 + 1e-12
     assert chosen(compensator, H + 10, HERE).tolist() == [0.0, 0.0]
-
-
-def test_brake_from_a_standstill_stays() -> None:
-    compensator = holding(0, np.zeros((2, H)), exhausted="brake")
-    assert chosen(compensator, H + 3, HERE).tolist() == [0.0, 0.0]
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:

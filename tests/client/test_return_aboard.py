@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airborne import SAFE, Air
+from airborne import BOTH, SAFE, Air
 from helpers import packaged
 from skytether.autopilot.flavours import FlavourName
 from skytether.autopilot.flight import Result
@@ -17,7 +17,6 @@ from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 6.0], "wind_mps": 0.5}
 RETURNS = {"on_loss": "return", "land_after_s": 3.0}
 MODE_NAMES = {"ardupilot": "RTL", "px4": "AUTO.RTL"}
@@ -47,15 +46,14 @@ def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: Flavou
     assert [each.after for each in air.of(ModeChanged)][-3:] == ["brake", "hover", "return"]
     assert returns_s == pytest.approx(1.5 + 1.5 + 3.0, abs=1.2)
     quiet_ns = air.world.now_ns + 200_000_000
-    air.run(90.0, lambda: not air.flight.armed)
-    assert not air.flight.armed
+    air.lands(90.0)
     assert not air.setpoints(quiet_ns)
     assert np.hypot(*air.flight.position()[:2]) < 0.7
     rows = parse(air.truth.getvalue())
     places = rows["state"][rows["time_ns"] > died_ns][:, :, 0]
     assert np.abs(places[:, :2]).max() < 8.0
     assert places[:, 2].max() < 6.0
-    assert air.client._failsafe.mode is Mode.RETURN
+    assert air.mode is Mode.RETURN
 
 
 def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
@@ -63,8 +61,7 @@ def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
     air = lost("ardupilot", parameters=SAFE["ardupilot"] | LOW["ardupilot"])
     switch = air.flight.switch
     air.flight.switch = lambda number: Result.FAILED if number == 6 else switch(number)
-    air.run(30.0, lambda: air.flight.mode_name == "LAND")
-    assert air.flight.mode_name == "LAND"
+    air.until(lambda: air.flight.mode_name == "LAND", 30.0)
     assert "failed" in [each.answer for each in air.of(AutopilotRefused)]
 
 
