@@ -175,36 +175,6 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     np.testing.assert_array_equal(inputs[solved], right[solved])
 
 
-def test_a_problem_that_is_not_finite_fails_alone() -> None:
-    problem = make()
-    gradient, guess = problems(problem, 3, 1.0, seed=2)
-    alone, _ = ExactSolver(problem).solve(gradient[2:], guess[2:])
-    gradient[0, 1, 5], gradient[1, 0, 0] = np.nan, np.inf
-    inputs, solved = ExactSolver(problem).solve(gradient, guess)
-    assert solved.tolist() == [False, False, True]
-    np.testing.assert_array_equal(inputs[:2], guess[:2])
-    np.testing.assert_array_equal(inputs[2:], alone)
-
-
-def test_a_batch_equals_its_singles_on_every_run() -> None:
-    problem = make()
-    gradient, guess = problems(problem, 50, 2.0, seed=3)
-    solver = ExactSolver(problem)
-    together, _ = solver.solve(gradient, guess)
-    for n in range(50):
-        alone, _ = solver.solve(gradient[n : n + 1], guess[n : n + 1])
-        np.testing.assert_array_equal(alone[0], together[n])
-
-
-def test_the_guess_decides_nothing_but_the_time() -> None:
-    problem = make()
-    gradient, guess = problems(problem, 50, 2.0, seed=4)
-    solver = ExactSolver(problem)
-    from_guess, _ = solver.solve(gradient, guess)
-    from_zero, _ = solver.solve(gradient, np.zeros_like(guess))
-    np.testing.assert_allclose(from_guess, from_zero, rtol=0, atol=1e-12)
-
-
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
     problem = make((0.855, 0.855), (1.8, 1.8))

@@ -66,13 +66,6 @@ def give(link: Link, *, now_ns: int) -> str:
     return "".join(datagram.payload.decode() for datagram in link.give(now_ns=now_ns))
 
 
-def test_packets_leave_when_they_are_due_and_not_before() -> None:
-    """In the order of their due times, whatever that of their arrival."""
-    link = make_link()
-    take(link, make_lane(30, 10, 20), "abc", now_ns=100)
-    assert [give(link, now_ns=now) for now in (109, 110, 119, 130)] == ["", "b", "", "ca"]
-
-
 def test_packets_due_at_once_leave_in_the_order_in_which_they_came() -> None:
     """Whichever flow they are of, and however long they were under way."""
     link, near, far = make_link(), make_lane(50, 0, flow=1), make_lane(50, 40, flow=0)

@@ -81,16 +81,6 @@ def test_before_any_sample_it_is_the_guess() -> None:
     assert bound.steps.tolist() == [1, MOST, 0, 11]
 
 
-def test_it_rises_at_once_and_no_further_than_most() -> None:
-    """A delay that no horizon has room for counts as the most."""
-    assert known([9, 10, 14, 50]) == [9, 10, 14, MOST]
-
-
-def test_a_guess_too_high_is_left_step_by_step_once_it_is_known_to_be() -> None:
-    """After the 16 newest, as after a sample."""
-    assert known([9] * 22, first=14) == [14] * 15 + [13, 12, 11, 10] + [9] * 3
-
-
 def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
     """Acknowledged or not, up to the most; a delay that is not known is as good as none."""
     bound, steps = estimated(), []
