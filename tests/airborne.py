@@ -99,21 +99,17 @@ class Tap(Endpoint):
         ]
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._heard.append((now_ns, datagram.payload))
         if not self.deaf:
             self.inner.receive(datagram, now_ns=now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self.inner.wake(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         return self.inner.next_wake_ns()
 
     def outbox(self) -> list[Datagram]:
-        """See `Endpoint`."""
         sent = self.inner.outbox()
         if self.alter is not None:
             sent = [self._altered(datagram) for datagram in sent]
@@ -132,7 +128,6 @@ class Tap(Endpoint):
         return extra
 
     def events(self) -> Sequence[Event]:
-        """See `Endpoint`."""
         return self.inner.events()
 
 

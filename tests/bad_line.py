@@ -70,7 +70,6 @@ class BadLine(Endpoint):
         """Messages of the client's, but heartbeats and questions, and when [ns]."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         from_client = datagram.peer == CLIENT
         receiver = AUTOPILOT if from_client else CLIENT
         if from_client:
@@ -109,7 +108,6 @@ class BadLine(Endpoint):
         heappush(self._held, (now_ns + self._draw(LATE_NS), len(self._held), payload, receiver))
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         while self._held and self._held[0][0] <= now_ns:
             _, _, payload, receiver = heappop(self._held)
             self.send(payload, receiver)
@@ -118,7 +116,6 @@ class BadLine(Endpoint):
             self._talk(now_ns // MILLISECOND_NS)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         if not self.is_bad:
             return None
         return min([self._others_ns, *(each[0] for each in self._held[:1])])

@@ -64,7 +64,6 @@ def why(air: Air) -> tuple[str, str]:
 
 
 def test_a_flight_follows_its_reference(flown: Air) -> None:
-    """Armed, taken off, flown, landed and disarmed; the pilot's error is the model's own."""
     assert flown.client.failure is None
     assert flown.rmse() < 1.0
     assert not flown.flight.armed
@@ -72,7 +71,6 @@ def test_a_flight_follows_its_reference(flown: Air) -> None:
 
 
 def test_setpoints_are_velocities_alone_at_the_rate_of_steps(flown: Air) -> None:
-    """Neither position nor yaw is told; there are 20 a second in flight, and none after it."""
     sent = flown.setpoints()
     masks = {(each.type_mask, each.coordinate_frame) for _, each in sent}
     assert masks == {(VELOCITY_ALONE, dialect.MAV_FRAME_LOCAL_NED)}
@@ -116,7 +114,6 @@ def test_measurements_are_those_of_their_stamps(flown: Air) -> None:
 
 
 def test_the_way_into_the_air_is_the_autopilots_own(flown: Air) -> None:
-    """Commands in their order, each once: the autopilot does them at once."""
     asked = [each.command for _, each in flown.heard("COMMAND_LONG")]
     way = [command for command in asked if command in (ARM, TAKE_OFF, SET_MODE)]
     in_order = {"ArduCopter": [SET_MODE, ARM, TAKE_OFF], "PX4": [ARM, TAKE_OFF, SET_MODE]}
@@ -136,7 +133,6 @@ def test_what_the_autopilot_is_and_does_in_silence_is_told(flown: Air) -> None:
 
 
 def test_px4_is_not_told_of_a_station_where_it_acts_on_the_loss_of_one() -> None:
-    """It would not notice that another one is lost."""
     air = Air("px4", parameters={"COM_OBL_RC_ACT": 4, "NAV_DLL_ACT": 2}, armed=False)
     air.run(8.0)
     kinds = {each.type for _, each in air.heard("HEARTBEAT")}
@@ -248,7 +244,6 @@ def test_the_newer_name_of_a_parameter_will_do() -> None:
 
 
 def test_what_keeps_it_from_arming_is_told_and_tried_again() -> None:
-    """Until it can be armed: ArduCopter needs its position first."""
     air = Air("ardupilot", ready_s=8.0, mavlink={"patience_s": 20.0})
     air.flight.why_not_armed = (  # it knows its position, and does not arm for another reason
         lambda: "" if air.flight.now_ns > 10 * SECOND else "PreArm: Compass not calibrated"
@@ -260,7 +255,6 @@ def test_what_keeps_it_from_arming_is_told_and_tried_again() -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: FlavourName) -> None:
-    """One line, and nothing of it flies."""
     air = Air(flavour, mavlink={"patience_s": 3.0})
     air.flight.why_not_armed = lambda: "PreArm: Compass not calibrated"
     air.end(30.0)
@@ -307,7 +301,6 @@ def test_what_does_not_hover_or_is_another_autopilot_is_refused(kind: int, autop
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: FlavourName) -> None:
-    """For as long as that takes; then it takes off."""
     air = Air(flavour, armed=False, mavlink={"patience_s": 9.0})
     air.run(15.0)
     assert air.flies.is_ready
@@ -349,7 +342,6 @@ def in_the_air(air: Air, mode: FlightMode) -> None:
 
 @pytest.mark.parametrize("mode", [FlightMode.PILOT, FlightMode.RETURN])
 def test_a_vehicle_that_somebody_else_flies_is_left_to_him(mode: FlightMode) -> None:
-    """Its mode is not changed, and after a while a line says why it is not flown."""
     air = Air("ardupilot", mavlink={"patience_s": 1.0})
     in_the_air(air, mode)
     air.end(30.0)
@@ -369,7 +361,6 @@ def test_a_vehicle_that_somebody_has_armed_is_left_to_him() -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> None:
-    """Nothing is commanded any more, and the client ends with a line."""
     air = Air(flavour)
     air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > 0.5)
     air.take_over()
@@ -385,7 +376,6 @@ def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> Non
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_take_off_that_does_not_climb_ends_in_a_landing(flavour: FlavourName) -> None:
-    """The vehicle is told to land, and a line says what was waited for."""
     air = Air(flavour, mavlink={"patience_s": 2.0})
     air.end(60.0)
     assert why(air)[0] == "not at the altitude of take-off in 2 s"
@@ -418,7 +408,6 @@ def test_who_arms_it_while_we_are_about_to_has_it() -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> None:
-    """His mode is not changed, and no setpoint comes."""
     air = flying(flavour)
     air.take_over()
     asked = len(air.commands(SET_MODE))
@@ -582,7 +571,6 @@ def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
 
 
 def test_who_ends_on_the_ground_begins_nothing() -> None:
-    """Even where its session has just opened."""
     air = Air("ardupilot")
     air.run(20.0, lambda: air.client._session.number is not None)
     asked = len(air.commands(SET_MODE))
@@ -657,7 +645,6 @@ def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
 
 
 def test_a_late_heartbeat_does_not_end_the_climb() -> None:
-    """It was sent before the vehicle was armed."""
     air = Air("ardupilot")
     late_heartbeat(air, lambda: air.flight.armed)
     air.fly()
@@ -665,7 +652,6 @@ def test_a_late_heartbeat_does_not_end_the_climb() -> None:
 
 
 def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
-    """Lower sequence numbers are accepted after a pause, as after a reboot."""
     air = flying("ardupilot")
     (peer,) = air.autopilot._peers.values()
     air.tap.dumb = True
@@ -740,7 +726,6 @@ def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_line_of_bytes_may_come_in_any_pieces(flavour: FlavourName) -> None:
-    """Bytes over TCP and serial lines may come in pieces; the result equals that over UDP."""
     line = {"address": "tcp:127.0.0.1:5760"}
     air = Air(flavour, host="line", duration=3.0, vehicle=line)
     rng, inner, held = np.random.default_rng(2), air.tap.outbox, bytearray()
@@ -789,7 +774,6 @@ def test_a_stream_that_stops_is_asked_for_again() -> None:
 def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe(
     flavour: FlavourName,
 ) -> None:
-    """Setpoints and heartbeats stop after `vehicle.land_after_s`; its own failsafe lands it."""
     air = flying(flavour, vehicle={"land_after_s": 4.0})
     air.autopilot.script.silent = True
     silent_ns = air.world.now_ns

@@ -48,7 +48,6 @@ def test_a_simulator_that_runs_faster_than_time_is_not_flown_and_its_speed_is_to
 
 
 def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
-    """The autopilot's stamps jump into the future: it brakes, and says why."""
     air = Air("px4", duration=30.0)
     air.fly()
     air.run(3.0)
@@ -120,7 +119,6 @@ def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keep
 
 
 def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
-    """The log says too that it waits for somebody to arm it."""
     air = Air(armed=False)
     air.run(8.0)
     assert len(air.of(Welcomed)) == 1
@@ -129,7 +127,6 @@ def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
 
 
 def test_a_link_that_is_cut_on_the_ground_is_told_and_that_it_is_back() -> None:
-    """Cut for 12 s while the vehicle waits to be armed."""
     air = Air(armed=False)
     air.run(8.0)
     air.world.stop("netem")
@@ -142,7 +139,6 @@ def test_a_link_that_is_cut_on_the_ground_is_told_and_that_it_is_back() -> None:
 
 
 def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
-    """A fifth is lost each way, with half a second of delay, for two minutes."""
     ways = {"delay": "constant", "minimum_s": 0.5, "loss": 0.2}
     air = Air(armed=False, network={"uplink": ways, "downlink": ways})
     air.run(120.0)
@@ -162,7 +158,6 @@ def test_an_autopilot_that_does_not_answer_timesync_is_told_and_given_up() -> No
 
 
 def test_what_is_waited_for_is_the_autopilot_before_it_is_the_server() -> None:
-    """Nothing comes from the autopilot, and so no server is asked."""
     air = Air()
     air.tap.dumb = True
     air.run(5.0)
@@ -182,7 +177,6 @@ def test_a_line_that_is_cut_is_told_in_the_climb_and_on_the_ground(armed: bool) 
 
 
 def test_a_vehicle_found_armed_waits_for_a_person_once_it_is_disarmed() -> None:
-    """What is said last is what is true."""
     air = Air("ardupilot")
     air.run(1.5)
     air.flight.enter(5)
@@ -245,7 +239,6 @@ def heartbeats(air: Air, from_port: int) -> Callable[[], None]:
 
 
 def test_a_stream_that_is_being_set_is_not_refused() -> None:
-    """IN_PROGRESS is no refusal; DENIED is one, and named."""
     air = Air()
     codec = Codec(1, 1)
     for result in (dialect.MAV_RESULT_IN_PROGRESS, dialect.MAV_RESULT_DENIED):
@@ -256,7 +249,6 @@ def test_a_stream_that_is_being_set_is_not_refused() -> None:
 
 
 def test_texts_at_400_a_second_do_not_fill_the_log() -> None:
-    """Each is another; those that are left out are counted."""
     air = Air(armed=False)
     air.run(3.0)
     codec = Codec(1, 1)

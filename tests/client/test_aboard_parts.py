@@ -95,7 +95,6 @@ def test_a_clock_that_stood_still_is_right_from_the_next_answer_on() -> None:
 
 @pytest.mark.parametrize("rate", [0.5, 0.95, 1.05, 10.0])
 def test_a_rate_that_cannot_be_followed_is_known(rate: float) -> None:
-    """As of a simulator that runs ten times as fast as time."""
     clock, _ = timed(drift=1.0 - rate, delays=[(MS, MS)] * 12, every_ns=SECOND // 5)
     assert clock.wrong_rate == pytest.approx(rate, rel=0.01)
     followed, _ = timed(drift=DRIFT_MAX, delays=[(MS, MS)] * 12, every_ns=SECOND // 5)
@@ -115,7 +114,6 @@ def test_answers_that_nobody_asked_for_count_for_nothing() -> None:
 
 
 def test_a_clock_that_begins_anew_is_believed_after_three_answers() -> None:
-    """A reboot; one answer that is far off is none."""
     clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * 10)
     heard = []
     for k in range(1, 6):

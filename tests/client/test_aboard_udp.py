@@ -109,7 +109,6 @@ class Processes:
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 async def test_a_figure_eight_over_the_papers_network(flavour: FlavourName, tmp_path: Path) -> None:
-    """With parameters that the client sets; from the ground and back to it."""
     processes = Processes(tmp_path, flavour)
     assert await processes.run("--set-parameters") == 0
     (changed,) = processes.events(ParametersSet)

@@ -59,7 +59,6 @@ def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
-    """No command at all is given to a vehicle on the ground whose scenario is not armed."""
     air = OverLine(flavour, 1, armed=False)
     air.run(30.0)
     assert air.client._session.number is not None

@@ -104,7 +104,6 @@ def test_brake_takes_the_speed_away_at_its_rate() -> None:
 @quick
 @given(st.floats(-1.8, 1.8), st.floats(-0.9, 0.9), st.integers(0, 40))
 def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
-    """While braking, the direction of the last input stays, and its speed only falls."""
     compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
     last, now, then = (chosen(compensator, H - 1 + i, HERE) for i in (0, later, later + 1))
     assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
@@ -243,7 +242,6 @@ def test_chosen_input_is_the_caller_s_own() -> None:
 def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
     scheme: str, step: int, observed: int, reason: str | None
 ) -> None:
-    """The vehicle flies on with what it holds."""
     compensator = Compensator(terms(scheme=scheme))
     compensator.offer(horizon(95), 96, 95)
     if reason is None:
@@ -314,14 +312,12 @@ def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> Non
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
 def test_without_compensation_the_age_bound_ends_the_input(exhausted: str) -> None:
-    """The paper's scheme of no compensation, too, brakes once what it flies is too old."""
     compensator = holding(5, np.tile([[0.6], [0.8]], H), scheme="none", exhausted=exhausted)
     speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
     assert speeds == pytest.approx([1.0, 0.8, 0.6] if exhausted == "brake" else [1.0] * 3, abs=1e-6)
 
 
 def test_without_compensation_the_first_input_is_braked_along_whatever_follows_it() -> None:
-    """At 2 m/s² from 1 m/s; the inputs after it, of 0.5 m/s, are never flown."""
     inputs = np.concatenate([[[0.6], [0.8]], np.tile([[0.3], [0.4]], H - 1)], axis=1)
     compensator = holding(5, inputs, scheme="none", exhausted="brake")
     speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]

@@ -160,7 +160,6 @@ def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
 
 @pytest.mark.parametrize("feedback", [True, False])
 def test_the_server_foresees_what_is_reported(feedback: bool) -> None:
-    """Without noise, and where nothing is lost, with other gains and dead times on each axis."""
     network = {way: {"loss": 0.0, "delay": "constant"} for way in ("uplink", "downlink")}
     control = {"feedback": feedback, "trigger": "always", "observer_s": 0.0}
     _, record = flown(model=AUTOPILOT, control=control, network=network)
@@ -172,7 +171,6 @@ def test_the_server_foresees_what_is_reported(feedback: bool) -> None:
 
 
 def test_the_reported_state_is_the_true_one_a_dead_time_later() -> None:
-    """On each axis, over the paper's network; the summary holds one against the other."""
     summary, record = flown(model=AUTOPILOT | {"dead_time_s": [0.25, 0.1]})
     state, met = record.client["state"], record.client["estimate"]
     for axis, steps in enumerate((5, 2)):

@@ -3,7 +3,6 @@
 A hand makes the server's messages, at a step of 20 ms each; the vehicle is the real one.
 """
 
-import io
 from collections.abc import Callable
 from typing import Any
 
@@ -14,23 +13,23 @@ import pytest
 import skytether.client.endpoint
 import skytether.client.pilot
 import skytether.client.session
+from by_hand import SERVER, ByHand
 from helpers import packaged
 from skytether.client import failsafe
 from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
-from skytether.client.endpoint import Client
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
 from skytether.client.link import PlainLink
-from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.law import rule
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_FEEDBACK,
@@ -43,14 +42,9 @@ from skytether.shared.wire.protocol import (
     Message,
     Mode,
     Observation,
-    Refusal,
-    Welcome,
-    decode,
-    encode,
     stamp_us,
 )
 
-SERVER: Address = ("server", 0)
 STEPS_PER_S = 50
 H = 100
 D = 5
@@ -65,37 +59,16 @@ class Sealed(PlainLink):
     secure = True
 
 
-class Hand:
+class Hand(ByHand):
     """A vehicle, and a hand that plays its server: a heartbeat each 0.1 s, horizons on request."""
 
     def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
-        self.scenario = msgspec.structs.replace(scenario(**sections), armed=armed)
-        self.terms = self.scenario.terms()
-        self.sink = io.BytesIO()
-        self.flies = simulated(self.scenario, 1)
-        self.client = Client(
-            self.scenario,
-            self.flies,
-            server=SERVER,
-            vehicle=4,
-            boot_id=99,
-            link=Sealed() if secure else PlainLink(),
-            recorder=Recorder(client_columns(self.terms.axes), self.sink),
-        )
-        self.now_ns = 5 * SECOND_NS
-        self.session = 7
+        flown = msgspec.structs.replace(scenario(**sections), armed=armed)
+        super().__init__(flown, link=Sealed() if secure else None)
+        self.flies: Any
         self.events: list[Event] = []
-        self.client.wake(now_ns=self.now_ns)
-        self.client.outbox()
+        self.wake()
         self.welcome()
-
-    def say(self, message: Message) -> None:
-        """One datagram to the vehicle."""
-        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
-
-    def welcome(self, *, server_boot_id: int = 1) -> None:
-        """Open a session."""
-        self.say(Welcome(4, self.session, 99, server_boot_id, 1, Refusal.ACCEPTED, self.terms))
 
     def heartbeat(self) -> None:
         """Say that the server lives."""
@@ -130,11 +103,7 @@ class Hand:
     def fly(self, seconds: float, *, beats: bool = True, plans: bool = False) -> None:
         """Let time pass, with heartbeats or without, and with a horizon at each step or none."""
         for _ in range(round(seconds * STEPS_PER_S)):
-            due_ns = self.client.next_wake_ns()
-            assert due_ns is not None
-            self.now_ns = max(self.now_ns, due_ns)
-            self.client.wake(now_ns=self.now_ns)
-            self.out = [decode(each.payload, self.terms) for each in self.client.outbox()]
+            self.out = self.wake()
             self.said = [each for each in self.out if isinstance(each, Observation)] or self.said
             self.events += self.client.events()
             if beats and self.step % 5 == 0:
@@ -166,10 +135,6 @@ class Hand:
         self.events += self.client.events()
         told = [event for event in self.events if isinstance(event, ModeChanged)]
         return [(event.after, event.reason) for event in told]
-
-    def rows(self) -> Rows:
-        """The record so far."""
-        return parse(self.sink.getvalue())
 
 
 def scenario(**sections: Any) -> Scenario:
@@ -550,7 +515,6 @@ def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:
 
 
 def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
-    """The vehicle coasts, brakes, and says what the server said."""
     for idle, degraded, why in (
         (Idle.UNSOLVED, 0, str(Idle.UNSOLVED)),
         (Idle.PLANS, 1, "the server misses its deadlines"),
@@ -563,7 +527,6 @@ def test_a_solver_that_fails_or_a_server_that_is_degraded_is_told() -> None:
 
 
 def test_what_is_not_finite_ends_in_fault_for_good() -> None:
-    """A state or an input: zero is flown, and nothing after that."""
     for seen in (SimulatedVehicle, Compensator):
         hand = tracking()
         with pytest.MonkeyPatch.context() as mad:
@@ -603,7 +566,6 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
 
 
 def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
-    """Once it is good again the vehicle still does not know where it is, and says so."""
     hand = tracking()
     hand.flies.plant.x[:, 0] += 300.0
     hand.fly(3.0, plans=True)
@@ -632,7 +594,6 @@ def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
 
 
 def test_a_vehicle_that_holds_has_no_failsafe() -> None:
-    """The first horizon that comes is flown, and its last input for ever, whatever happens."""
     hand = Hand(vehicle={"exhausted": "hold"})
     hand.fly(0.02)
     hand.horizon()
@@ -765,7 +726,6 @@ def hindered(monkeypatch: pytest.MonkeyPatch, hand: Hand, cause: Reason | None) 
 def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Zero from the next step on, and no horizon is taken; then it hovers for a second first."""
     hand = tracking()
     hindered(monkeypatch, hand, cause)
     hand.fly(0.02)
@@ -785,7 +745,6 @@ def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(
 def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It does so with the best of links, and stays down where the cause is gone again."""
     landed: list[Mode] = []
     hand = tracking()
     monkeypatch.setattr(hand.flies, "land", lambda: landed.append(hand.client._failsafe.mode))
@@ -804,7 +763,6 @@ def test_a_vehicle_that_can_fly_no_further_brakes_and_lands(
 def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second after it is heard again, plans are flown; or after its positions can be used."""
     hand = tracking()
     hindered(monkeypatch, hand, cause)
     hand.fly(0.02)
@@ -828,7 +786,6 @@ def test_a_vehicle_whose_autopilot_stays_silent_lands(monkeypatch: pytest.Monkey
 
 
 def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None:
-    """It was lost for 9.9 s of hovering, and is good before the vehicle lands."""
     hand = tracking()
     hand.fly(1.0 + 0.52 + 9.8, beats=False)
     assert hand.mode is Mode.HOVER

@@ -69,7 +69,6 @@ def test_without_its_origin_a_vehicle_in_the_air_hovers_until_somebody_says_wher
 
 
 def test_where_nobody_says_where_the_origin_is_it_lands_where_it_is() -> None:
-    """After the patience that each step into the air has."""
     air = away("ardupilot", mavlink={"patience_s": 20.0})
     air.restart(1.0, remembers=False)
     air.end(60.0)
@@ -111,7 +110,6 @@ def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
 
 
 def test_a_client_that_finds_its_vehicle_landing_arms_nothing_even_without_a_memory() -> None:
-    """It was restarted while the failsafe lands: on disarming it does not take off again."""
     air = away("ardupilot")
     air.world.stop("client")
     air.run(40.0, lambda: air.flight.mode is FlightMode.LAND)

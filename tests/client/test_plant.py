@@ -83,7 +83,6 @@ def test_dead_time_of_whole_steps_only_shifts(steps: int) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 500_000_000), st.floats(0.5, 2.0))
 def test_dead_time_is_exact_within_a_step(dead_time_ns: int, gain: float) -> None:
-    """The result equals that of pieces that end wherever the input changes."""
     tau, w = np.array([0.81, 0.3]), np.array([0.1, 0.0])
     flown = plant(dead_time_s=dead_time_ns / 1e9, gain=gain, steady_wind_mps=w.tolist())
     x = flown.state()

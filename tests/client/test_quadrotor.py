@@ -237,7 +237,6 @@ def test_px4_stands_in_a_wind_that_drags_with_6_newtons(
 def test_turbulence_moves_it_as_documented(
     frame: Frame, gains: Gains, least_mps: float, most_mps: float
 ) -> None:
-    """In hover, in a wind of 6 m/s: docs/compare.md."""
     flown_ = quadrotor(frame, gains)
     flown_.blow((6.0,), 6.0)
     rows = response(flown_, (0.0, 0.0, 0.0), 600.0)[6000:]
@@ -387,7 +386,6 @@ def test_a_plant_in_the_plane_keeps_its_altitude() -> None:
 
 
 def test_a_quadrotor_flies_a_scenario() -> None:
-    """Over the paper's network, in turbulent wind, as it would a vehicle of first order."""
     keys = {"vehicle.kind": "quadrotor", "vehicle.turbulence_mps": 6.0, "duration": 20.0}
     calm = skytether.fly("demo", **keys)
     windy = skytether.fly("demo", **keys, **{"vehicle.steady_wind_mps": [4.0, 0.0]})

@@ -249,7 +249,6 @@ def test_the_demo_takes_a_fifth_of_the_paper_s_packets(
 
 
 def test_summary_counts_both_ways() -> None:
-    """Packets and bytes with 28 of headers each, a second of flight."""
     flown = skytether.fly("demo", duration=10, settle=4)
     s, rows = flown.summary, flown.record.netem
     assert s.packets_per_s == pytest.approx(len(rows) / s.duration_s)

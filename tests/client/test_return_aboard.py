@@ -39,7 +39,6 @@ def lost(flavour: FlavourName, **keys: Any) -> Air:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: FlavourName) -> None:
-    """By the autopilot's own mode; it lands where it was armed, and no higher than its fence."""
     air = lost(flavour, parameters=SAFE[flavour] | LOW[flavour])
     died_ns = air.world.now_ns
     returns_s = air.run(20.0, lambda: air.flight.mode_name == MODE_NAMES[flavour])
@@ -78,7 +77,6 @@ def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -> None:
-    """A metre below the fence."""
     air = Air(flavour, fence=FENCE, vehicle=RETURNS, sets=True)
     air.run(30.0, lambda: bool(air.flight.armed))
     assert air.flight.armed
@@ -88,7 +86,6 @@ def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -
 
 
 def test_vehicles_of_a_mission_land_straight_down() -> None:
-    """The proof in docs/together.md has it so: a return is refused in words."""
     table = reading.to_table(reading.load("swap"))
     table["vehicle"] |= {"on_loss": "return"}
     with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*lands straight down"):

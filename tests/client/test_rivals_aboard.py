@@ -121,7 +121,6 @@ def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
 
 @pytest.mark.parametrize("message", [velocity(), sticks(400), channels(1700)])
 def test_set_points_of_others_are_noticed_within_a_second(message: Message) -> None:
-    """Two within a second; it is told who they come from, and the vehicle brakes and lands."""
     air = tracking()
     say(air, message, 0.5)
     (told,) = air.of(SecondCommander)
@@ -132,7 +131,6 @@ def test_set_points_of_others_are_noticed_within_a_second(message: Message) -> N
 
 
 def test_a_command_to_go_somewhere_counts_at_once() -> None:
-    """It is sent once, and leads the vehicle away."""
     air = tracking()
     say(air, goto(), 0.1)
     assert modes(air)[-1] == ("brake", str(Reason.RIVAL))

@@ -111,7 +111,6 @@ def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
 
 
 def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
-    """Zones around (4, 0), where it is, and around (0, 0)."""
     made = ready()
     made.change_zones(zones.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
     way = np.stack([np.linspace(4.0, 0.0, 41), np.zeros(41)], axis=1)
@@ -200,7 +199,6 @@ def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
 
 
 def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() -> None:
-    """The motion of an earlier server may lead anywhere."""
     made = alone()
     made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
     made.observe(1, observation(100, 70, (-4.0, 0.0)))
@@ -264,7 +262,6 @@ def test_a_time_of_day_that_delays_contradict_moves_no_step() -> None:
 
 
 def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
-    """Neither its closed places nor its detour are left."""
     vehicle = VehicleMotions()
     vehicle.is_stuck(0, np.array([4.0, 0.0]), 9.0)
     vehicle.closed.append(np.zeros(2))

@@ -86,7 +86,6 @@ def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
 @pytest.mark.parametrize("horizon", [1, 2, 40, 100])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
-    """Bounded least squares of scipy, from bounds never to nearly always active."""
     problem = make(horizon=horizon)
     gradient, guess = problems(problem, 20, scale, seed=horizon)
     inputs, solved = ExactSolver(problem).solve(gradient, guess)
@@ -122,7 +121,6 @@ def test_every_answer_is_optimal_and_within_its_box(
 def test_problems_that_cycle_are_solved_all_the_same(
     request: pytest.FixtureRequest, pivots: bool, fewest: int, most: int
 ) -> None:
-    """One input at a time, and without that by DAQP; as exactly either way."""
     if not pivots:
         request.getfixturevalue("no_pivots")
     problem = make((0.4, 0.6), **ROUGH)

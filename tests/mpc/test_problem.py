@@ -124,7 +124,6 @@ def test_qp_ranks_any_two_plans_as_the_printed_cost(
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 50))
 def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
-    """ΔUᵀ 𝓗 ΔU, added up along the horizon and over the axes."""
     problem, change = make(control(H, change_weight=0.7)), situation(seed, H)[2]
     cost = 3.0
     for axis in range(2):

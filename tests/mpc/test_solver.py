@@ -47,7 +47,6 @@ def residual(gradient: Array, u: Array) -> float:
 
 
 def test_problems_of_these_tests_touch_the_box_and_leave_it(make: type[Solver]) -> None:
-    """The problems are worth solving: some inputs at a bound, some between."""
     gradient, guess = problems(0, 4)
     u, solved = make(PROBLEM).solve(gradient, guess)
     assert solved.all()
@@ -94,7 +93,6 @@ def test_bad_problem_is_not_even_tried() -> None:
 
 
 def test_nothing_bad_sticks(make: type[Solver]) -> None:
-    """After NaN the solver answers as a new one would, to the last bit."""
     gradient, guess = problems(3, 3)
     used, fresh = make(PROBLEM), make(PROBLEM)
     used.solve(np.full_like(gradient, np.nan), guess)
@@ -105,7 +103,6 @@ def test_nothing_bad_sticks(make: type[Solver]) -> None:
 
 
 def test_iteration_limit_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An unfinished iterate is not passed on: the guess comes back, marked as unsolved."""
     monkeypatch.setattr(skytether.server.mpc.osqp_solver, "ITERATIONS_MAX", 1)
     gradient, guess = problems(4, 2)
     u, solved = OsqpSolver(PROBLEM).solve(gradient, guess)

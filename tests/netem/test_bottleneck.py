@@ -45,7 +45,6 @@ def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[i
 
 
 def test_a_packet_takes_its_size_over_the_rate() -> None:
-    """Packets that come meanwhile go one after the other."""
     out, dropped = passed("rate(1000)", [(0, 100, 0), (0, 50, 0), (SECOND_NS, 100, 0)])
     assert out == {0: SECOND_NS // 10, 1: 15 * SECOND_NS // 100, 2: 11 * SECOND_NS // 10}
     assert dropped == []
@@ -77,7 +76,6 @@ def test_random_arrivals_wait_as_in_m_d_1(load: float) -> None:
 
 
 def test_fair_serves_each_flow_alike() -> None:
-    """A flow that sends ten times as much takes nothing from the other; first come, it does."""
     loud = [(number * MILLISECOND_NS, 1000, 0) for number in range(5000)]
     quiet = [(number * 20 * MILLISECOND_NS, 100, 1) for number in range(250)]
     packets = sorted(loud + quiet)
@@ -114,7 +112,6 @@ def test_codel_drops_at_the_times_of_rfc_8289() -> None:
 
 
 def test_codel_keeps_the_queue_short() -> None:
-    """A tail drop keeps the queue full; CoDel does not, and drops nothing of a short burst."""
     every_ns = SECOND_NS * 100 // 12_000
     steady = [(number * every_ns, 100, 0) for number in range(6000)]
     waits = {}
@@ -151,7 +148,6 @@ def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
 def test_every_packet_passes_once_or_is_dropped(
     packets: list[Packet], drop: str, serve: str
 ) -> None:
-    """In the order of each flow, never faster than the rate, and never while it could go."""
     packets = sorted(packets)
     out, dropped = passed(f"rate(20000, queue=6000, drop={drop}, serve={serve})", packets)
     assert sorted([*out, *dropped]) == list(range(len(packets)))
@@ -188,7 +184,6 @@ def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
 
 
 def test_a_rate_that_changes_serves_those_who_wait() -> None:
-    """Under the new one; without one they are under way at once."""
     for text, due_ms in (("rate(100000)", 40), ("constant(0)", 20)):
         link, lane = linked("rate(10000)")
         for _ in range(20):
@@ -203,7 +198,6 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
 
 
 def test_ordered_lets_nobody_overtake() -> None:
-    """Packets of one flow keep their order; without `ordered` the same packets do not."""
     for text, reordered in (("uniform(0, 0.1)", True), ("uniform(0, 0.1) & ordered", False)):
         link, lane = linked(text)
         for number in range(200):
@@ -216,7 +210,6 @@ def test_ordered_lets_nobody_overtake() -> None:
 
 
 def test_copies_and_flipped_bits() -> None:
-    """A copy comes right after its packet; exactly one bit differs."""
     link, lane = linked("duplicate(1) & corrupt(1)")
     for number in range(50):
         link.take(Datagram(bytes(20), ("a", 1)), lane, now_ns=number * MILLISECOND_NS)

@@ -59,7 +59,6 @@ def test_a_delay_without_slots_is_the_minimum_or_none(delay: Any, expected_ms: i
 
 
 def test_losses_are_independent_of_delays() -> None:
-    """The slow packets are not lost more often: a contingency test."""
     drawn = first_fates(seed=17, count=SAMPLES)
     slow = [fate.delay_ns > 440 * MILLISECOND_NS for fate in drawn]
     table = stats.contingency.crosstab(slow, [fate.lost for fate in drawn]).count
@@ -67,7 +66,6 @@ def test_losses_are_independent_of_delays() -> None:
 
 
 def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
-    """Backwards, after an idle year, before the flow began: the time alone counts."""
     fates, bursty = (Fates(replace(PAPER, burst_s=s), 1, "uplink", 0) for s in (0.0, 0.5))
     year = 365 * 86_400 * SECOND_NS // SLOT_NS
     for each in (fates, bursty):
@@ -89,7 +87,6 @@ def test_packets_of_one_slot_have_fates_of_their_own() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-9, 0.3, 40.0, 1e6])
 def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
-    """Mean and variance are those of Poisson's law, to four standard errors."""
     config = DirectionConfig(minimum_s=0.0, slot_s=1e-3, slots_mean=mean)
     slots = delays_ns(config, SAMPLES) / MILLISECOND_NS
     assert slots.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / SAMPLES) + 1e-6)
@@ -128,7 +125,6 @@ def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
 
 
 def test_in_a_burst_everything_is_lost() -> None:
-    """However many packets enter in a slot: none passes that another does not."""
     fates = Fates(replace(PAPER, loss=0.3, burst_s=0.1), 1, "uplink", 0)
     slots = [{fates.at(slot, rank).lost for rank in range(4)} for slot in range(2000)]
     assert all(len(fates_of) == 1 for fates_of in slots)
@@ -144,7 +140,6 @@ def test_certain_losses_are_certain(loss: float, share: float, burst_s: float) -
 
 
 def test_bursts_shorter_than_a_slot_are_none() -> None:
-    """Each packet is then lost by itself."""
     drawn = first_fates(replace(PAPER, loss=0.5, burst_s=1e-4))
     assert drawn == first_fates(replace(PAPER, loss=0.5))
 
@@ -168,13 +163,11 @@ def test_losses_change_no_delay(loss: float, burst_s: float) -> None:
 
 @pytest.mark.parametrize("delay", ["constant", "none"])
 def test_the_delay_model_changes_no_loss(delay: str) -> None:
-    """Loss and delay have separate random draws."""
     lost = [fate.lost for fate in first_fates(replace(PAPER, delay=delay))]
     assert lost == [fate.lost for fate in first_fates()]
 
 
 def test_a_higher_loss_rate_loses_the_same_packets_and_more() -> None:
-    """A sweep over the rate therefore compares like with like."""
     few, many = (first_fates(replace(PAPER, loss=loss)) for loss in (0.1, 0.3))
     assert all(more.lost for less, more in zip(few, many, strict=True) if less.lost)
     assert sum(fate.lost for fate in few) < sum(fate.lost for fate in many)

@@ -42,7 +42,6 @@ def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Record]:
 
 
 def test_a_change_in_flight_reaches_every_run_of_a_batch() -> None:
-    """At the same time as it would alone."""
     changes = [(1.0, {"vehicle.wind": 0.3})]
     together = [each.trace_hash() for each in fly_batch(scenario(), (1, 2), changes=changes)]
     alone = [fly(scenario(seed=seed), changes=changes).trace_hash() for seed in (1, 2)]
@@ -165,9 +164,6 @@ def test_runs_are_equal_in_another_order_and_in_a_larger_batch() -> None:
 def test_each_run_follows_the_target_of_its_own_seed(
     preview: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each run equals its flight alone; ablation: with the first run's target for all, others
-    differ.
-    """
     flown = scenario(reference={"shape": "target", "preview": preview})
     runs = assert_as_alone(flown, (3, 1, 2))
     monkeypatch.setattr(Desired, "assign", lambda self, row, _: self._number.put(row, 1))
@@ -248,7 +244,6 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
 
 
 def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
-    """Otherwise the bytes sent would depend on the other runs of the batch."""
     sizes = {
         len(encode(Heartbeat(vehicle, number, 2**31, 0, 0)))
         for vehicle in (1, COMPANY_MAX)
@@ -258,7 +253,6 @@ def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
 
 
 def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
-    """The 101st run, which no longer fits, has the same bits as when it is flown alone."""
     flown = scenario(duration=0.2)
     flights = fly_batch(flown, range(COMPANY_MAX + 1))
     assert len(flights) == COMPANY_MAX + 1
@@ -267,7 +261,6 @@ def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
 
 
 def test_a_batch_can_be_broken_off() -> None:
-    """A batch tells the time and asks whether to go on; what was flown until then is returned."""
     seconds: list[int] = []
     flown = scenario(duration=60.0)
     runs = fly_batch(flown, range(3), on_second=seconds.append, stopped=lambda: len(seconds) >= 4)

@@ -50,7 +50,6 @@ def times(start_s: float, end_s: float) -> range:
 @quick
 @given(st.integers(-(2**55), 2**55), st.integers(0, S))
 def test_equal_delays_give_the_offset_exactly(offset_ns: int, delay_ns: int) -> None:
-    """To the nanosecond, from the first observation on, whatever the clocks show."""
     clock = ClockMap(1, DT_NS)
     assert observe(clock, 5 * S, offset_ns, down_ns=delay_ns, up_ns=delay_ns) == offset_ns
     assert half_trip_ns(clock.seen, 0) == delay_ns
@@ -68,7 +67,6 @@ def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -
 
 
 def test_smallest_delay_of_each_direction_counts() -> None:
-    """The smallest delays need not belong to one round trip."""
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, HOUR, down_ns=400 * MS, up_ns=900 * MS)
     observe(clock, 1 * S, HOUR, down_ns=800 * MS, up_ns=400 * MS)
@@ -88,7 +86,6 @@ def test_small_movements_do_not_change_the_offset() -> None:
 
 
 def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
-    """One lucky packet shapes the bound for so long, and no longer."""
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, HOUR, down_ns=100 * MS, up_ns=300 * MS)
     listen(clock, times(0.5, 20), lambda _: HOUR)
@@ -100,7 +97,6 @@ def test_old_minima_are_forgotten_after_twenty_seconds() -> None:
 
 @pytest.mark.parametrize("silence_s", [20, 25, 40, 1000])
 def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
-    """Everything older is forgotten, even if not a single observation came meanwhile."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(100, 110), lambda _: 0)
     listen(clock, times(110 + silence_s, 111 + silence_s), lambda _: HOUR)
@@ -118,7 +114,6 @@ def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(jump_ns: int)
 
 
 def test_clock_may_step_at_any_moment_of_a_half_second() -> None:
-    """At worst the offset follows half a second later."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10.1), lambda _: 0)
     errors = listen(clock, times(10.1, 20), lambda _: HOUR)
@@ -144,7 +139,6 @@ def test_without_the_step_rule_the_offset_does_not_follow(
 
 @pytest.mark.parametrize("behind_ns", [0, 1, DT_NS - 1])
 def test_steps_are_counted_on_the_vehicle_s_clock(behind_ns: int) -> None:
-    """Step k begins at k Δt of the vehicle, and lasts for Δt."""
     clock, rows = ClockMap(3, DT_NS), np.array([2, 0])
     for row, began_ns in ((2, 7 * S), (0, -3 * S)):
         observe(clock, 0, -began_ns, down_ns=0, up_ns=0, row=row)
@@ -156,7 +150,6 @@ def test_steps_are_counted_on_the_vehicle_s_clock(behind_ns: int) -> None:
 @quick
 @given(st.integers(0, 300), st.integers(0, 300))
 def test_slower_network_is_no_stepped_clock(down_ms: int, up_ms: int) -> None:
-    """However much either direction slows down, the minima of before stay in force."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     slower = {"down_ns": (400 + down_ms) * MS, "up_ns": (400 + up_ms) * MS}
@@ -215,7 +208,6 @@ def test_four_packets_are_too_few_to_tell_a_stepped_clock(before_s: int) -> None
 
 
 def test_four_packets_of_before_are_too_few_as_well() -> None:
-    """The minimum of four packets may have been a bad one."""
     four, five = (range(0, count * DT_NS, DT_NS) for count in (4, 5))
     assert after_change(200 * MS, 600 * MS, before=four, since=20) == 300 * MS
     assert after_change(200 * MS, 600 * MS, before=five, since=20) == 400 * MS
@@ -229,7 +221,6 @@ def test_drifting_clock_is_followed() -> None:
 
 
 def test_forgotten_vehicle_is_measured_anew() -> None:
-    """A new life of the vehicle owes nothing to the clock of the old one."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: HOUR, down_ns=10 * MS, up_ns=10 * MS)
     clock.forget(0)
@@ -238,7 +229,6 @@ def test_forgotten_vehicle_is_measured_anew() -> None:
 
 
 def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
-    """No hysteresis against an offset of the life before."""
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, 0, down_ns=0, up_ns=0)
     clock.forget(0)

@@ -120,7 +120,6 @@ ODD: dict[str, tuple[dict[str, Any], Belief]] = {
 def test_an_odd_observation_is_not_believed_and_changes_nothing(
     changed: dict[str, Any], verdict: Belief
 ) -> None:
-    """Once or twice; the next that follows from those before is believed as ever."""
     for times in (1, 2):
         plausibility = after()
         for _ in range(times):
@@ -141,7 +140,6 @@ def elsewhere(step: int, metres: float = 100.0) -> Observation:
 
 
 def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
-    """The first two are not; from the third on it is the others that are odd."""
     plausibility = after()
     verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
     assert verdicts == [
@@ -202,7 +200,6 @@ def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
 
 
 def test_an_odd_first_observation_is_forgotten_after_three() -> None:
-    """Nothing is known that would speak against it."""
     plausibility = Plausibility(TERMS, 1)
     assert judge(plausibility, elsewhere(100)) == Belief.BELIEVED
     verdicts = [judge(plausibility, seen(step)) for step in range(101, 105)]
@@ -219,7 +216,6 @@ def test_an_odd_first_observation_is_forgotten_after_three() -> None:
 def test_whatever_a_vehicle_may_say_is_believed(
     seed: int, drift_ppm: int, jitter_ms: int, gaps: list[int]
 ) -> None:
-    """Drifting clocks, delays that vary by seconds, losses, and wind."""
     rng, plausibility, step = np.random.default_rng(seed), Plausibility(TERMS, 1), 100
     for gap in gaps:
         step += gap
@@ -265,7 +261,6 @@ def test_how_far_a_vehicle_may_have_come_grows_with_the_time_since_the_last_one(
 @quick
 @given(st.integers(0, 3), st.integers(0, 63))
 def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit: int) -> None:
-    """Within a metre or so, and two metres per second."""
     told = seen(105)
     state = told.state.copy()
     state.view(np.uint64).ravel()[number] ^= np.uint64(1 << bit)
@@ -295,7 +290,6 @@ def flipped(share: float) -> list[Record]:
             self._rng = random.Random(scenario.seed)
 
         def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-            """See `Endpoint`."""
             rng = self._rng
             if datagram.socket == 0 and rng.random() < share:
                 payload = bytearray(datagram.payload)
@@ -401,11 +395,9 @@ class Stepped(NamedTuple):
     by_ns: int
 
     def local(self, time_ns: int) -> int:
-        """See `Clock`."""
         return self.clock.local(time_ns) + self.by_ns * (time_ns >= self.at_ns)
 
     def world(self, local_ns: int) -> int:
-        """See `Clock`."""
         before_ns = self.clock.world(local_ns)
         if before_ns < self.at_ns:
             return before_ns

@@ -109,7 +109,6 @@ def live(server: Gate, vehicle: int = 1) -> int | None:
 
 
 def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
-    """INITIATION, CHALLENGE, INITIATION, RESPONSE; then messages both ways."""
     client, server = joined()
     call = called(server, client.seal(OBSERVATION))
     assert (call.payload, call.vehicle, call.moves) == (OBSERVATION, 1, True)
@@ -155,7 +154,6 @@ def test_the_forms_that_are_admitted_are_those_on_the_wire() -> None:
 
 
 def test_no_answer_is_longer_than_what_draws_it() -> None:
-    """Even the longest; and the longest HELLO fits."""
     client, server = link(), gate()
     room, head = HELLO_BYTES_MAX - 3, HELLO[:3]
     for hello in (head, head + b"\0" * room, head + b"\x80" * room, head + b"\x80\0"):
@@ -172,7 +170,6 @@ def test_no_answer_is_longer_than_what_draws_it() -> None:
 
 
 def test_a_refused_client_goes_on_with_its_attempt() -> None:
-    """A WELCOME that is not adopted, and not admitted, opens nothing."""
     client, server = link(), gate()
     challenged(client, server)
     before = client.hello(HELLO, now_ns=0)
@@ -186,7 +183,6 @@ def test_a_refused_client_goes_on_with_its_attempt() -> None:
 
 
 def test_an_attempt_has_one_ephemeral_key() -> None:
-    """Another HELLO, or 60 s, begin another attempt; the cookie stays."""
     client, server = link(), gate()
     challenged(client, server)
     first = client.hello(HELLO, now_ns=0)
@@ -236,7 +232,6 @@ def test_an_adopted_response_opens_no_channel_again() -> None:
 def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the attempt's end."""
     client, server = link(), gate()
     challenged(client, server)
     response = welcomed(client, server)
@@ -330,7 +325,6 @@ def test_the_mac_comes_before_any_costly_mathematics(monkeypatch: pytest.MonkeyP
 def test_without_the_mac_strangers_cost_mathematics_and_draw_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the MAC."""
     client, server = link(), gate()
     challenged(client, server)
     initiation = client.hello(HELLO, now_ns=0)
@@ -411,7 +405,6 @@ def test_foreign_challenges_keep_no_vehicle_from_its_own(*, foreign_first: bool)
 
 
 def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
-    """One more, and the first of them is tried again, however soon it comes."""
     client, server = link(), gate()
     hello = client.hello(HELLO, now_ns=0)
     for port in range(65):
@@ -425,7 +418,6 @@ def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
 
 
 def test_a_cookie_that_is_tried_again_is_the_newest_of_those_tried() -> None:
-    """It is forgotten after 64 others, and not as early as it would have been without."""
     client, server = link(), gate()
     hello = client.hello(HELLO, now_ns=0)
     for port in range(65):
@@ -572,7 +564,6 @@ def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
 
 
 def test_without_a_successor_a_channel_ends() -> None:
-    """After 600 s neither end opens anything."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert refusal(server, client.seal(OBSERVATION), LIFE_NS + 1) == "expired"
@@ -580,7 +571,6 @@ def test_without_a_successor_a_channel_ends() -> None:
 
 
 def test_a_hello_that_is_repeated_ends_no_flight() -> None:
-    """The live channel stays, whatever is pending, until the vehicle uses another."""
     client, server = joined()
     called(server, client.seal(OBSERVATION))
     before = live(server)
@@ -724,7 +714,6 @@ def test_a_handshake_succeeds_where_a_round_trip_takes_seven_hellos() -> None:
 
 
 def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation of their number."""
     monkeypatch.setattr(server_secure, "PENDING_MAX", 4)
     flight = Flight(1, 0.0, lambda _: 3.5)
     with pytest.raises(AssertionError, match="unknown channel"):
@@ -786,7 +775,6 @@ def test_nothing_of_a_recorded_session_is_accepted_again(peer: Address, later_ns
 
 @pytest.mark.parametrize("restarted", ["client", "server", "both"])
 def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
-    """With the same keys, while a new handshake is under way."""
     flight = recorded(2)
     if restarted != "server":
         flight.client = link(seed=5)
@@ -839,7 +827,6 @@ def test_what_does_not_begin_as_a_message_of_msgpack_travels_nowhere(*, in_hands
 
 
 def test_the_shortest_and_the_longest_response_are_read() -> None:
-    """One with a WELCOME of no bytes, and one as long as an INITIATION."""
     key, public = KEYS[1, 5], bytes(32)
     for welcome, packet_bytes in (
         (b"", RESPONSE_BYTES_MIN),

@@ -153,7 +153,6 @@ class Vehicles:
 
 
 def test_hello_is_welcomed_with_the_servers_terms() -> None:
-    """The answer echoes the vehicle's boot id and carries the server's."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open(vehicle=3, boot_id=42)
     assert (welcome.vehicle, welcome.boot_id, welcome.server_boot_id) == (3, 42, 77)
@@ -171,7 +170,6 @@ def test_a_repeated_hello_gets_the_same_session() -> None:
 
 
 def test_other_terms_open_no_session() -> None:
-    """The server says what it flies, and the operator hears what differs."""
     vehicles = Vehicles(scenario())
     other = vehicles.terms._replace(horizon=20)
     ((welcome, _),) = vehicles.say(Hello(1, 5, other))
@@ -185,7 +183,6 @@ def test_other_terms_open_no_session() -> None:
 
 
 def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
-    """One of a vehicle that has been forgotten since is told again."""
     vehicles = Vehicles(scenario())
     other = vehicles.terms._replace(horizon=20)
 
@@ -203,7 +200,6 @@ def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
 
 
 def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
-    """At once of the first; the address and reason are those of the newest."""
     gate = SecureGate(Keyring("keys", {}), entropy=stream(2, "gate").bytes)
     server = Server(scenario(), boot_id=1, entropy=stream(1, "entropy").bytes, gate=gate)
     told = []
@@ -224,7 +220,6 @@ def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
 
 
 def test_an_idle_server_asks_for_no_wake() -> None:
-    """No vehicle, no ticks; they begin with the first observation."""
     vehicles = Vehicles(scenario())
     assert vehicles.server.next_wake_ns() is None
     welcome = vehicles.open()
@@ -237,7 +232,6 @@ def test_an_idle_server_asks_for_no_wake() -> None:
 
 
 def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
-    """Stamped with k on the vehicle's grid and with the observation behind it."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 100)
@@ -284,7 +278,6 @@ def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
 
 
 def test_the_newest_observation_wins_after_reordering() -> None:
-    """An older one is counted as stale, and neither state nor address follow it."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 5)
@@ -317,7 +310,6 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
 
 
 def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
-    """Until then the old session flies on; after it, the old one is a stranger."""
     vehicles = Vehicles(scenario())
     old = vehicles.open(boot_id=5)
     vehicles.observe(old, 50)
@@ -336,7 +328,6 @@ def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None
 
 
 def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
-    """It is refused while the first is heard; both logs say so, once for each boot."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(vehicle=3, boot_id=5)
     for step in range(100):
@@ -354,7 +345,6 @@ def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing
 
 
 def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
-    """The second is refused before the first has come, and gets in if that never does."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(boot_id=5)
     assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
@@ -386,7 +376,6 @@ def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_hear
 
 
 def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
-    """It was welcomed while the old one had its row, and gets one of its own."""
     vehicles = Vehicles(scenario(), room=1)
     vehicles.observe(vehicles.open(boot_id=5), 0)
     vehicles.now_ns += SESSION_NS - SECOND_NS
@@ -400,7 +389,6 @@ def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> No
 
 
 def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
-    """Two lives of the server share no session."""
     welcome = Vehicles(scenario(), boot_id=1).open()
     vehicles = Vehicles(scenario(), boot_id=2**63)
     vehicles.observe(welcome, 3)
@@ -408,7 +396,6 @@ def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None
 
 
 def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
-    """One of another session is dropped; after its own the vehicle is a stranger."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 0)
@@ -425,7 +412,6 @@ def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
 
 
 def test_ticks_slept_through_are_counted_and_skipped() -> None:
-    """One horizon, for the step it is now; the grid does not move."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 0)
@@ -471,7 +457,6 @@ def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
 
 
 def test_a_wake_before_its_time_does_nothing() -> None:
-    """A timer that fires early must not tick twice."""
     vehicles = Vehicles(scenario())
     vehicles.observe(vehicles.open(), 0)
     due_ns = vehicles.server.next_wake_ns()
@@ -482,7 +467,6 @@ def test_a_wake_before_its_time_does_nothing() -> None:
 
 
 def test_a_silent_server_sends_heartbeats() -> None:
-    """A heartbeat keeps the session alive while no event sends a horizon."""
     vehicles = Vehicles(scenario(trigger="state_gap", epsilon=1e9))
     welcome = vehicles.open()
     sent = []
@@ -497,7 +481,6 @@ def test_a_silent_server_sends_heartbeats() -> None:
 
 
 def test_no_estimate_without_a_recent_observation() -> None:
-    """Five seconds after the last one the server plans no more, says why, and stays in touch."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.observe(welcome, 0)
@@ -523,7 +506,6 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
 
 
 def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
-    """So is the operator, once; a vehicle that is known is always welcome."""
     vehicles = Vehicles(scenario())
     for number in range(VEHICLES_MAX):
         vehicles.observe(vehicles.open(vehicle=number), 0)
@@ -552,7 +534,6 @@ def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> N
 
 
 def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
-    """Each that was told so gets its row; one that never came makes room for the next."""
     vehicles = Vehicles(scenario(), room=3)
     welcomes = [vehicles.open(vehicle=number) for number in range(3)]
     assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
@@ -649,8 +630,6 @@ def test_two_vehicles_fly_as_each_would_alone() -> None:
 
 
 def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
-    """The first of three vehicles falls silent; a fourth takes its row, and flies as if alone."""
-
     def fourth(others: tuple[int, ...]) -> list[bytes]:
         vehicles = Vehicles(scenario())
         welcomes = {number: vehicles.open(vehicle=number) for number in others}

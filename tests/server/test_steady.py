@@ -86,7 +86,6 @@ def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
 
 
 def test_a_change_is_made_at_steady_time() -> None:
-    """A change while the clock stands back happens at the latest time so far."""
     probe = Probe()
     steady = Steady(probe)
     hear(steady, [HOUR_NS])
@@ -96,7 +95,6 @@ def test_a_change_is_made_at_steady_time() -> None:
 
 @pytest.mark.parametrize("jump_ns", [-1, -HOUR_NS, JUMP_NS + 1, HOUR_NS])
 def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
-    """Every call that reads the clock notices the jump, and the wake that is due moves with it."""
     for look in ("receive", "wake", "close"):
         probe = Probe(due_ns=MIDNIGHT_NS)
         steady = Steady(probe)
@@ -112,7 +110,6 @@ def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
 
 
 def test_a_clock_that_goes_on_by_more_than_a_minute_past_its_wake_has_jumped() -> None:
-    """A minute to the nanosecond has been slept through."""
     for late_ns, shown_ns in ((60 * SECOND_NS, 60 * SECOND_NS), (60 * SECOND_NS + 1, 0)):
         probe = Probe(due_ns=0)
         hear(Steady(probe), [0, late_ns])
@@ -120,7 +117,6 @@ def test_a_clock_that_goes_on_by_more_than_a_minute_past_its_wake_has_jumped() -
 
 
 def test_every_jump_counts() -> None:
-    """An hour ahead and an hour back is where it was."""
     probe = Probe(due_ns=0)
     steady = Steady(probe)
     hear(steady, [0, HOUR_NS, HOUR_NS + 1, 1, 2])
@@ -138,7 +134,6 @@ def test_who_only_waits_for_datagrams_may_wait_for_hours() -> None:
 
 
 def test_a_wake_that_was_asked_for_late_is_no_jump() -> None:
-    """Only what goes on past the wake is."""
     probe = Probe(due_ns=HOUR_NS)
     steady = Steady(probe)
     hear(steady, [0])

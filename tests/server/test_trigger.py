@@ -121,7 +121,6 @@ def test_event_is_an_error_above_the_threshold() -> None:
 
 
 def test_threshold_is_the_tolerance_long_after() -> None:
-    """Nothing of the last event is left."""
     verdict = ask(after_event(0, 1e6), 10_000, 2.9)
     assert verdict.threshold.tolist() == [3.0]
     assert verdict.event.tolist() == [False]
@@ -144,7 +143,6 @@ def test_nothing_happens_without_an_event() -> None:
 
 
 def test_sending_anchors_the_threshold_anew() -> None:
-    """S starts at V(k_i) + ε and decays from there."""
     trigger = after_event(0, 10.0)
     tell(trigger, 40, 5.0)
     assert ask(trigger, 40, 0.0).threshold == pytest.approx([8.0])
@@ -152,7 +150,6 @@ def test_sending_anchors_the_threshold_anew() -> None:
 
 
 def test_new_life_forgets_the_events_of_the_old_one() -> None:
-    """A vehicle that starts again at step 0 owes nothing to step 5000 of before."""
     trigger = after_event(5000, 1e6)
     assert ask(trigger, 0, 0.0, fresh=True).threshold.tolist() == [3.0]
 
@@ -171,7 +168,6 @@ def test_new_life_forgets_them_also_if_its_first_horizon_was_not_sent() -> None:
 def test_faster_decay_means_a_lower_threshold(
     error: float, steps: int, rate: float, more: float
 ) -> None:
-    """Fig. 5: more λ, more events."""
     slow, fast = (
         ControlConfig(trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=decay)
         for decay in (rate, rate + more)
@@ -187,7 +183,6 @@ def test_faster_decay_means_a_lower_threshold(
 def test_more_tolerance_means_a_higher_threshold(
     error: float, steps: int, epsilon: float, more: float
 ) -> None:
-    """Fig. 5: more ε, fewer events; S rises by just as much."""
     low, high = (
         ask(
             after_event(0, error, ControlConfig(trigger="state_gap", epsilon=tolerance)),
@@ -220,7 +215,6 @@ def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] =
 
 
 def test_periodic_sends_at_the_first_step_and_every_so_many_after() -> None:
-    """The error has no effect; period 1 is every step."""
     assert events(trigger_of("periodic(4)"), 3, 16) == [3, 7, 11, 15]
     assert events(trigger_of("periodic(1)"), 0, 4) == [0, 1, 2, 3, 4]
     verdict = ask(trigger_of("periodic"), 0, 2.0, fresh=True)
@@ -357,7 +351,6 @@ def packets(trigger: Trigger, walk: list[tuple[int, bool]]) -> list[int]:
 def test_budget_is_kept_in_every_window(
     walk: list[tuple[int, bool]], rate: float, burst: float, dt: float
 ) -> None:
-    """From any packet to any other, T seconds later: at most burst + rate · T, both counted."""
     sent = packets(trigger_of(f"budget({rate!r}, {burst!r})", dt=dt), walk)
     for i, first in enumerate(sent):
         for count, last in enumerate(sent[i:], start=1):
@@ -369,7 +362,6 @@ def test_budget_is_kept_in_every_window(
 def test_budget_is_the_token_bucket_filled_step_by_step(
     walk: list[tuple[int, bool]], rate: float, burst: float
 ) -> None:
-    """Token bucket b ← min(b + g, burst) at each step by itself, b ← b - 1 when sent."""
     tokens, step, sent = burst, 0, []
     for gap, wanted in walk:
         for _ in range(gap):
@@ -383,7 +375,6 @@ def test_budget_is_the_token_bucket_filled_step_by_step(
 
 
 def test_without_the_budget_its_cap_is_broken() -> None:
-    """Ablation: the same desires, with the bucket and without."""
     walk = [(1, True)] * 100
     assert len(packets(trigger_of("always & budget(5, 2)", dt=0.05), walk)) == 26
     assert len(packets(trigger_of("always"), walk)) == 100
@@ -406,7 +397,6 @@ def test_cost_gap_fires_above_the_threshold() -> None:
 
 
 def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> None:
-    """The others have V and no threshold."""
     for text, error, threshold in (
         ("silence(1) | cost_gap(3) & state_gap(5, 1)", 0.25, 3.0),
         ("budget(1, 1) & (deviation(2) | cost_gap(3))", 0.5, 2.0),
@@ -452,7 +442,6 @@ class Listener(Trigger):
 
 @pytest.mark.parametrize("compares", [(True, True), (False, True), (True, False), (False, False)])
 def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) -> None:
-    """A side is told of the vehicles that were sent to, and of those to forget."""
     left, right = (Listener(5.0 + i, compares=compares[i]) for i in range(2))
     both = Combined(np.logical_and, left, right)
     verdict = both.test(facing(np.arange(3), figures_of(3)))

@@ -134,7 +134,6 @@ def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
 
 
 def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
-    """A function, and a constant, of another module; left alone, it comes from the disk."""
     helper = tmp_path / "helper.py"
     helper.write_text(HELPER)
     (tmp_path / "caller.py").write_text(CALLER)
@@ -162,7 +161,6 @@ def quiet(folder: Path, code: str, *argv: str) -> str:
 
 @pytest.mark.long
 def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
-    """Every command is asked, with nothing on disk: it took 80 s until the first words."""
     quiet(tmp_path, HELP, *REFUSED)
     assert not (tmp_path / "kept").exists()
 
@@ -211,7 +209,6 @@ def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Pat
 
 
 def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
-    """Neither beside the source, nor in a home: it compiles, and keeps nothing."""
     (tmp_path / "helper.py").write_text(HELPER)
     (tmp_path / "caller.py").write_text(CALLER)
     (tmp_path / "__pycache__").write_text("a file, where a folder should be")
@@ -220,7 +217,6 @@ def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path)
 
 
 def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
-    """A file that can be opened but not written keeps nothing; the kernel still compiles."""
     (tmp_path / "helper.py").write_text(HELPER)
     (tmp_path / "caller.py").write_text(CALLER)
     assert run(tmp_path, file_bytes=100) == "2.0 0"

@@ -28,7 +28,6 @@ def sampled(tau_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("dt_s", [0.001, 0.05, 1.0])
 @pytest.mark.parametrize("tau_s", [(0.81, 0.81), (0.3, 2.0), (0.05, 0.81, 7.0), (1e-4, 50.0)])
 def test_discretisation_is_the_matrix_exponential(tau_s: tuple[float, ...], dt_s: float) -> None:
-    """Each axis is sampled exactly, with its own time constant."""
     model = discretise(np.array(tau_s), dt_s)
     for axis, tau in enumerate(tau_s):
         A, B = sampled(tau, dt_s)
@@ -39,7 +38,6 @@ def test_discretisation_is_the_matrix_exponential(tau_s: tuple[float, ...], dt_s
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.sampled_from([2, 3]))
 def test_batch_steps_as_its_singles(seed: int, vehicles: int, axes: int) -> None:
-    """A vehicle flies the same alone and in a fleet, to the last bit."""
     rng = np.random.default_rng(seed)
     model = discretise(rng.uniform(0.1, 3.0, axes), 0.05)
     x, u = rng.normal(size=(vehicles, axes, 2)), rng.normal(size=(vehicles, axes))

@@ -59,7 +59,6 @@ def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None
 
 
 def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
-    """The paper's claim, over five seeds: without compensation the error is 2.5 times as large."""
     error = {}
     for name in ("paper-no-compensation", "paper-every-step"):
         flown = packaged(name, duration=33.0)
@@ -69,7 +68,6 @@ def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
 
 
 def test_the_event_trigger_saves_four_packets_in_five() -> None:
-    """For an error that grows, but stays under what no compensation costs."""
     every_step, triggered = (
         summary(flown, fly(flown)) for flown in (packaged("paper-every-step"), packaged("paper"))
     )
@@ -107,7 +105,6 @@ HORIZONS = "uplink horizons, other packets"
 
 
 def test_the_summary_counts_what_the_network_saw() -> None:
-    """Every packet once, lost ones with them."""
     flown = packaged("paper", duration=20.0)
     flight = fly(flown)
     result = summary(flown, flight)
@@ -132,7 +129,6 @@ def test_the_summary_counts_what_the_network_saw() -> None:
 
 
 def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
-    """Packets that enter at one time meet one fate, for any contender and earlier traffic."""
     met: list[dict[tuple[int, int], tuple[int, bool]]] = []
     bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
     for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
@@ -158,7 +154,6 @@ def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
 
 
 def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
-    """A record of six steps, from the second on, counted by hand."""
     flown = packaged("paper", duration=1.0, settle=0.05)
     rows = np.zeros(6, client_columns(2))
     rows["step"] = range(6)
@@ -177,7 +172,6 @@ def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
 
 @pytest.mark.parametrize("offset_s", [-3600.0, 0.5, 86000.0])
 def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
-    """The vehicle's clock may be hours off: only the round trip enters."""
     flown = packaged("paper-every-step", duration=15.0)
     plain = fly(flown)
     clocks = {"clock_offset_s": offset_s}
@@ -201,7 +195,6 @@ def test_a_server_too_slow_for_its_steps_misses_deadlines_and_says_so() -> None:
 
 
 def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
-    """3-D: the third axis holds its altitude, all axes are controlled."""
     flown = packaged(
         "paper-every-step",
         duration=20.0,
@@ -218,7 +211,6 @@ def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
 
 
 def test_two_vehicles_share_one_server() -> None:
-    """Each vehicle has its own flow, and both fly as well as one alone."""
     flown = packaged("paper-every-step", duration=20.0)
     flight = fly(flown, vehicles=2)
     for vehicle in (1, 2):
@@ -231,7 +223,6 @@ def test_two_vehicles_share_one_server() -> None:
 
 
 def test_a_network_that_loses_everything_is_no_flight() -> None:
-    """The client gives up, and says why."""
     lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
     flight = fly(packaged("paper", settle=0.0, network=lost))
     assert flight.failure == NoAnswer(vehicle=1, host="netem 1", port=0, waited_s=121.0)
@@ -239,7 +230,6 @@ def test_a_network_that_loses_everything_is_no_flight() -> None:
 
 
 def test_a_flight_keeps_what_everybody_said() -> None:
-    """In the order of time, each with its host; names and numbers are the flight's own."""
     lossless = {
         "uplink": {"delay": "none", "loss": 0.0},
         "downlink": {"delay": "none", "loss": 0.0},

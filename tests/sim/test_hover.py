@@ -64,12 +64,10 @@ class Interrupted(Server):
         return encode(Heartbeat(vehicle, session, server_us, Idle.PLANS, 0))
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if self.mute or not self.gone(now_ns):
             super().receive(datagram, now_ns=now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if not self.gone(now_ns):
             super().wake(now_ns=now_ns)
         elif self.mute:
@@ -100,7 +98,6 @@ def interrupted(
 def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The server answers, and sends heartbeats: that is no flight."""
     flight = interrupted(monkeypatch, scenario(), 0.0, mute=True)
     why = str(Reason.OLD)
     assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
@@ -112,7 +109,6 @@ def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
 def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
     monkeypatch: pytest.MonkeyPatch, *, mute: bool
 ) -> None:
-    """The server dies after a heartbeat, or sends nothing but heartbeats from then on."""
     flight = interrupted(monkeypatch, scenario(), 10.6, mute=mute)
     why = str(Reason.OLD if mute else Reason.LOST)
     assert isinstance(flight.failure, NotFlown)
@@ -137,7 +133,6 @@ def test_a_server_that_dies_within_the_last_horizon_leaves_a_flight(
 
 
 def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server is gone for six seconds and back in another life: braked, hovered, flown on."""
     flight = interrupted(monkeypatch, scenario(), 6.0, 12.0)
     assert flight.failure is None
     *changes, finished = said(flight)[-6:]

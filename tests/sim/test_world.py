@@ -51,7 +51,6 @@ def never() -> bool:
 
 
 def test_what_lies_behind_the_limit_happens_when_time_goes_on() -> None:
-    """A world that is run a second time has lost nothing."""
     world, probe = World(), Probe([10, 20])
     world.add("probe", probe)
     world.run(never, limit_ns=15)
@@ -78,7 +77,6 @@ def test_a_drifting_clock_gains_what_it_should() -> None:
 
 
 def test_hosts_wake_in_the_order_of_the_worlds_time() -> None:
-    """Each by its own clock: a clock that is ahead wakes earlier."""
     world, ahead, behind = World(), Probe([1000]), Probe([1000])
     world.add("behind", behind, clock=Clock(offset_ns=100))
     world.add("ahead", ahead, clock=Clock(offset_ns=400))
@@ -89,7 +87,6 @@ def test_hosts_wake_in_the_order_of_the_worlds_time() -> None:
 
 
 def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
-    """Socket 2 of the sender is (name, 2), as a UDP source port would tell."""
     world, receiver = World(), Probe([])
     there = world.add("there", receiver, clock=Clock(offset_ns=7))
     world.add("here", Probe([50], answer_to=there))
@@ -98,7 +95,6 @@ def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
 
 
 def test_a_datagram_to_nobody_is_lost() -> None:
-    """The sender is not told of the loss, as with UDP."""
     world = World()
     world.add("here", Probe([50], answer_to=("nobody", 0)))
     world.run(never, limit_ns=SECOND_NS)
@@ -106,7 +102,6 @@ def test_a_datagram_to_nobody_is_lost() -> None:
 
 
 def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
-    """Ties are the rule on a lattice of delays."""
     world = World()
     receiver = Probe([50])
     there = world.add("there", receiver)
@@ -134,7 +129,6 @@ def test_a_computing_host_sends_late_and_hears_at_once() -> None:
 
 
 def test_a_wake_during_computing_comes_late() -> None:
-    """A deadline can so be missed in virtual time."""
     world, busy = World(), Probe([50, 60])
     world.add("busy", busy, compute_ns=30)
     world.run(never, limit_ns=SECOND_NS)
@@ -142,7 +136,6 @@ def test_a_wake_during_computing_comes_late() -> None:
 
 
 def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
-    """Hosts are not woken in the order of asking, which depends on who else is there."""
     world, first, second = World(), Probe([70, 90]), Probe([90])
     there = world.add("there", Probe([]))
     for name, probe in (("first", first), ("second", second)):
@@ -155,7 +148,6 @@ def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
 
 
 def test_a_host_is_not_woken_before_its_start() -> None:
-    """However long it has been wanting it."""
     world, probe = World(), Probe([0])
     world.add("host", probe, clock=Clock(offset_ns=1000), start_ns=40)
     world.run(never, limit_ns=SECOND_NS)
@@ -163,8 +155,6 @@ def test_a_host_is_not_woken_before_its_start() -> None:
 
 
 def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
-    """After the wake with which it finished, before anything else happens."""
-
     class Finite(Probe):
         @property
         def finished(self) -> bool:
@@ -178,8 +168,6 @@ def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
 
 
 def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
-    """In the world's time, whatever the host's own clock shows."""
-
     class Talker(Probe):
         def wake(self, *, now_ns: int) -> None:
             """Say something."""
@@ -227,7 +215,6 @@ def at(world: World, time_ns: int, action: Callable[..., None], *args: Any, **na
 def test_a_changed_clock_goes_on_from_the_time_it_shows(
     offset_ns: int, drift_ppb: int, time_ns: int, step_ns: int, other_ppb: int
 ) -> None:
-    """A step is seen at once, a rate only from then on."""
     clock = Clock(offset_ns, drift_ppb)
     changed = clock.changed(time_ns, step_ns=step_ns, drift_ppb=other_ppb)
     assert changed.local(time_ns) == clock.local(time_ns) + step_ns
@@ -236,7 +223,6 @@ def test_a_changed_clock_goes_on_from_the_time_it_shows(
 
 
 def test_actions_come_first_at_their_instant_and_in_the_order_they_were_asked_for() -> None:
-    """Before what arrives then, and what wakes."""
     world, probe, order = World(), Probe([50]), []
     world.add("host", probe)
     for number in (1, 2):
@@ -246,7 +232,6 @@ def test_actions_come_first_at_their_instant_and_in_the_order_they_were_asked_fo
 
 
 def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
-    """Not what it was woken for, nor what it was still computing; its next life begins anew."""
     world, first, second, hearer = World(), Probe([50, 60]), Probe([0, 95]), Probe([])
     there = world.add("there", hearer)
     first.answer_to = second.answer_to = there
@@ -261,7 +246,6 @@ def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
 
 
 def test_a_host_at_work_can_be_restarted_at_once() -> None:
-    """The new life does not finish the work of the old one."""
     world, second = World(), Probe([0])
     world.add("here", Probe([50]), compute_ns=1000)
     at(world, 60, world.restart, "here", second)
@@ -284,7 +268,6 @@ def test_the_end_of_a_later_life_is_told() -> None:
 
 
 def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
-    """In the order in which they came, and as many as there is room for."""
     world, probe = World(), Probe([50, 200])
     there = world.add("there", probe)
     world.add("here", Probe([20, 60, 70, 80], answer_to=there))
@@ -300,7 +283,6 @@ def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
 
 
 def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() -> None:
-    """Hosts are like processes: a stopped one can be killed, a dead one cannot be stopped."""
     world, old, new = World(), Probe([50]), Probe([60])
     world.add("host", old)
     for time_ns, action in ((10, world.freeze), (20, world.stop), (30, world.freeze)):
@@ -313,7 +295,6 @@ def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() ->
 
 @pytest.mark.parametrize("step_ns", [1000, -1000])
 def test_a_timer_counts_on_where_the_clock_is_set(step_ns: int) -> None:
-    """Later requests use the clock as it is then."""
     world, probe = World(), Probe([50, 60 + step_ns])
     world.add("host", probe)
     at(world, 30, world.set_clock, "host", step_ns=step_ns)
@@ -323,7 +304,6 @@ def test_a_timer_counts_on_where_the_clock_is_set(step_ns: int) -> None:
 
 
 def test_a_timer_counts_on_while_its_host_is_frozen() -> None:
-    """It has ended when the host goes on, whatever its clock shows by then."""
     world, probe = World(), Probe([50])
     world.add("host", probe)
     at(world, 30, world.freeze, "host")
