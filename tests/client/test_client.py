@@ -220,16 +220,6 @@ def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> No
     assert (first.heard, second.heard, third.heard) == (1, 2, 2)
 
 
-def test_the_vehicle_hovers_until_its_first_horizon() -> None:
-    server = flying()
-    for step in range(5):
-        (said,) = server.wake()
-        assert isinstance(said, Observation)
-        assert said.step == step
-    assert np.abs(server.rows()["input"]).max() == 0.0
-    assert np.ptp(server.rows()["state"], axis=0).max() == 0.0
-
-
 def test_an_input_is_flown_from_the_step_after_it_came() -> None:
     """Applied at the next step, felt in the state one step later."""
     server = flying()

@@ -196,16 +196,12 @@ def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
     assert compensator.since == 110
 
 
-def test_horizon_from_the_future_is_refused() -> None:
+def test_a_horizon_is_from_the_future_where_it_is_more_than_h_steps_ahead() -> None:
     compensator = holding(100)
     with pytest.raises(ProtocolError, match=r"^from the future$"):
         compensator.offer(horizon(111 + H, INPUTS + 0.2), 110, 109)
     assert (compensator.in_force, compensator.stale) == (100, 0)
     np.testing.assert_allclose(chosen(compensator, 103, HERE), INPUTS[:, 3], rtol=1e-7)
-
-
-def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
-    compensator = holding(100)
     compensator.offer(horizon(110 + H), 110, 109)
     assert compensator.in_force == 110 + H
 

@@ -101,12 +101,6 @@ def test_a_packet_leaves_as_it_came() -> None:
     assert link.give(now_ns=5) == [datagram]
 
 
-def test_a_packet_leaves_once() -> None:
-    link = make_link()
-    take(link, make_lane(5), "a")
-    assert [give(link, now_ns=5), give(link, now_ns=5)] == ["a", ""]
-
-
 def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
     link = make_link()
     assert link.next_due_ns() is None

@@ -500,12 +500,6 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
             assert passed == [number for number in range(40) if not drawn[number]]
 
 
-def test_what_is_sent_is_handed_out_once() -> None:
-    proxy = make_proxy()
-    hear(proxy, b"?", ALICE)
-    assert [len(proxy.outbox()), len(proxy.outbox())] == [1, 0]
-
-
 def test_the_figures_name_every_statistic() -> None:
     proxy, ms = make_proxy(uplink=DirectionConfig(loss=1.0), downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)

@@ -103,22 +103,20 @@ def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
     assert clock.offset_ns(ROW).tolist() == [HOUR]
 
 
+@pytest.mark.parametrize(("at_s", "most"), [(10.0, 20), (10.1, 30)])
 @pytest.mark.parametrize("jump_ns", [HOUR, -HOUR, 100 * MS, -100 * MS])
-def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(jump_ns: int) -> None:
-    """A step of either clock counts once three half seconds in a row know nothing older."""
-    clock = ClockMap(1, DT_NS)
-    assert set(listen(clock, times(0, 10), lambda _: 0)) == {0}
-    errors = listen(clock, times(10, 30), lambda _: jump_ns)
-    assert 0 not in errors[:20]
-    assert set(errors[20:]) == {0}
+def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(
+    jump_ns: int, at_s: float, most: int
+) -> None:
+    """A step of either clock counts once three half seconds in a row know nothing older.
 
-
-def test_clock_may_step_at_any_moment_of_a_half_second() -> None:
+    Within a half second it may come half a second later.
+    """
     clock = ClockMap(1, DT_NS)
-    listen(clock, times(0, 10.1), lambda _: 0)
-    errors = listen(clock, times(10.1, 20), lambda _: HOUR)
+    assert set(listen(clock, times(0, at_s), lambda _: 0)) == {0}
+    errors = listen(clock, times(at_s, 30), lambda _: jump_ns)
     assert 0 not in errors[:20]
-    assert set(errors[30:]) == {0}
+    assert set(errors[most:]) == {0}
 
 
 @pytest.mark.parametrize("jump_ns", [HOUR, -HOUR])
@@ -199,18 +197,22 @@ def test_the_step_of_a_clock_is_found_of_a_quiet_vehicle(every: int) -> None:
     assert set(errors[30 * 2 // every * 2 :]) == {0}
 
 
-@pytest.mark.parametrize("before_s", [10, 30])
-def test_four_packets_are_too_few_to_tell_a_stepped_clock(before_s: int) -> None:
-    """Five are enough, also where the ring has come round."""
-    before = times(0, before_s)
-    assert after_change(200 * MS, 600 * MS, before=before, since=4) == 300 * MS
-    assert after_change(200 * MS, 600 * MS, before=before, since=5) == 400 * MS
+FEW = ((4, 300), (5, 400))
+"""Number of packets, and the bound that they leave [ms]."""
 
 
-def test_four_packets_of_before_are_too_few_as_well() -> None:
-    four, five = (range(0, count * DT_NS, DT_NS) for count in (4, 5))
-    assert after_change(200 * MS, 600 * MS, before=four, since=20) == 300 * MS
-    assert after_change(200 * MS, 600 * MS, before=five, since=20) == 400 * MS
+@pytest.mark.parametrize(
+    ("before", "since", "bound_ms"),
+    [
+        *((times(0, before_s), since, ms) for before_s in (10, 30) for since, ms in FEW),
+        *((range(0, count * DT_NS, DT_NS), 20, ms) for count, ms in FEW),
+    ],
+)
+def test_four_packets_are_too_few_to_tell_a_stepped_clock(
+    before: range, since: int, bound_ms: int
+) -> None:
+    """Of before or since: the minimum of four may be a bad one. Also where the ring comes round."""
+    assert after_change(200 * MS, 600 * MS, before=before, since=since) == bound_ms * MS
 
 
 def test_drifting_clock_is_followed() -> None:
@@ -220,19 +222,13 @@ def test_drifting_clock_is_followed() -> None:
     assert max(np.abs(errors)) <= DT_NS // 2 + 2 * MS + 1
 
 
-def test_forgotten_vehicle_is_measured_anew() -> None:
+@pytest.mark.parametrize("offset_ns", [-HOUR, HOUR + 10 * MS])
+def test_forgotten_vehicle_is_measured_anew(offset_ns: int) -> None:
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: HOUR, down_ns=10 * MS, up_ns=10 * MS)
     clock.forget(0)
-    assert observe(clock, 10 * S, -HOUR, down_ns=300 * MS, up_ns=300 * MS) == -HOUR
+    assert observe(clock, 10 * S, offset_ns, down_ns=300 * MS, up_ns=300 * MS) == offset_ns
     assert half_trip_ns(clock.seen, 0) == 300 * MS
-
-
-def test_forgotten_vehicle_adopts_even_a_near_offset() -> None:
-    clock = ClockMap(1, DT_NS)
-    observe(clock, 0, 0, down_ns=0, up_ns=0)
-    clock.forget(0)
-    assert observe(clock, S, 10 * MS, down_ns=0, up_ns=0) == 10 * MS
 
 
 def test_vehicles_have_clocks_of_their_own() -> None:

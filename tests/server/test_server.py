@@ -139,17 +139,36 @@ class Vehicles:
             silence=40,
         )
 
-    def tick(self) -> list[tuple[Message, Address]]:
-        """Time passes until the next tick; what is sent at it."""
+    @property
+    def due_ns(self) -> int:
+        """Time of the next tick."""
         due_ns = self.server.next_wake_ns()
         assert due_ns is not None
-        self.now_ns = max(self.now_ns, due_ns)
+        return due_ns
+
+    def tick(self) -> list[tuple[Message, Address]]:
+        """Time passes until the next tick; what is sent at it."""
+        self.now_ns = max(self.now_ns, self.due_ns)
         self.server.wake(now_ns=self.now_ns)
         return self.answers()
+
+    def planned(self) -> tuple[Horizon, Address]:
+        """The only message of the next tick, a horizon, and to whom it is sent."""
+        ((horizon, peer),) = self.tick()
+        assert isinstance(horizon, Horizon)
+        return horizon, peer
 
     def rows(self) -> Rows:
         """The record so far."""
         return parse(self.sink.getvalue())
+
+
+def live(step: int = 0, **more: Any) -> tuple[Vehicles, Welcome]:
+    """A server with one vehicle, which has been observed once, and its WELCOME."""
+    vehicles = Vehicles(scenario(), **more)
+    welcome = vehicles.open()
+    vehicles.observe(welcome, step)
+    return vehicles, welcome
 
 
 def test_hello_is_welcomed_with_the_servers_terms() -> None:
@@ -225,34 +244,26 @@ def test_an_idle_server_asks_for_no_wake() -> None:
     welcome = vehicles.open()
     assert vehicles.server.next_wake_ns() is None
     vehicles.observe(welcome, 0)
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
-    assert due_ns % vehicles.dt_ns == 0
-    assert 0 < due_ns - vehicles.now_ns <= vehicles.dt_ns
+    assert vehicles.due_ns % vehicles.dt_ns == 0
+    assert 0 < vehicles.due_ns - vehicles.now_ns <= vehicles.dt_ns
 
 
 def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 100)
-    ((horizon, peer),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    vehicles, welcome = live(100)
+    horizon, peer = vehicles.planned()
     assert peer == HERE
     assert (horizon.vehicle, horizon.session) == (1, welcome.session)
     # 30 ms have passed since the start of step 100, a step is 50 ms.
     assert horizon.step == 100
     assert horizon.age == 0
-    ((later, _),) = vehicles.tick()
-    assert isinstance(later, Horizon)
+    later, _ = vehicles.planned()
     assert (later.step, later.age) == (101, 1)
 
 
 @pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
 def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
     """However often stamps have begun anew since: it makes a round trip of less than nothing."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     vehicles.observe(welcome, 1)
     later = round(minutes * 60 * SECOND_NS) // vehicles.dt_ns
     vehicles.observe(welcome, later)
@@ -278,9 +289,7 @@ def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
 
 
 def test_the_newest_observation_wins_after_reordering() -> None:
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 5)
+    vehicles, welcome = live(5)
     vehicles.observe(welcome, 4, state=((9.0, 0.0), (9.0, 0.0)), sender=("old", 2))
     ((_, peer),) = vehicles.tick()
     assert peer == HERE
@@ -294,9 +303,7 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
 
     Until it says HELLO there it is answered at home as well, for somebody may send on copies.
     """
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     assert [peer for _, peer in vehicles.tick()] == [HERE]
     vehicles.observe(welcome, 1, sender=("elsewhere", 9))
     (there, at), (here, home) = vehicles.tick()
@@ -310,18 +317,14 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
 
 
 def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
-    vehicles = Vehicles(scenario())
-    old = vehicles.open(boot_id=5)
-    vehicles.observe(old, 50)
+    vehicles, old = live(50)
     vehicles.now_ns += SILENCE_NS + 1
     new = vehicles.open(boot_id=6)
     assert new.session != old.session
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert horizon.session == old.session
     vehicles.observe(new, 0)
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert (horizon.session, horizon.step) == (new.session, 0)
     vehicles.observe(old, 51)
     assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
@@ -335,8 +338,7 @@ def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing
         if step % 20 == 0:
             refused = vehicles.ask(vehicle=3, boot_id=6, sender=("other", 2))
             assert (refused.refusal, refused.session, refused.boot_id) == (Refusal.TAKEN, 0, 6)
-        ((horizon, peer),) = vehicles.tick()
-        assert isinstance(horizon, Horizon)
+        horizon, peer = vehicles.planned()
         assert (horizon.session, peer) == (first.session, HERE)
     taken = NumberTaken(vehicle=3, host="other", port=2, holder="vehicle:1")
     opened = SessionOpened(vehicle=3, host="vehicle", port=1)
@@ -349,8 +351,7 @@ def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
     first = vehicles.open(boot_id=5)
     assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
     vehicles.observe(first, 0)
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert horizon.session == first.session
     vehicles = Vehicles(scenario())
     vehicles.open(boot_id=5)
@@ -361,23 +362,19 @@ def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
 
 def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
     """The network was away, not the vehicle: who was welcomed meanwhile is told when it asks."""
-    vehicles = Vehicles(scenario())
-    first = vehicles.open(boot_id=5)
-    vehicles.observe(first, 0)
+    vehicles, first = live()
     vehicles.now_ns += SILENCE_NS + 1
     second = vehicles.open(boot_id=6, sender=("other", 2))
     vehicles.observe(first, 61)
     vehicles.observe(second, 0, sender=("other", 2))
     assert vehicles.server.dropped[Drop.TAKEN] == 1
     assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
-    ((horizon, peer),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, peer = vehicles.planned()
     assert (horizon.session, peer) == (first.session, HERE)
 
 
 def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
-    vehicles = Vehicles(scenario(), room=1)
-    vehicles.observe(vehicles.open(boot_id=5), 0)
+    vehicles, _ = live(room=1)
     vehicles.now_ns += SESSION_NS - SECOND_NS
     new = vehicles.open(boot_id=6)
     vehicles.now_ns += 2 * SECOND_NS
@@ -396,9 +393,7 @@ def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None
 
 
 def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     vehicles.server.events()
     assert vehicles.say(Close(1, welcome.session + 1)) == []
     assert vehicles.say(Close(2, welcome.session)) == []
@@ -412,12 +407,9 @@ def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
 
 
 def test_ticks_slept_through_are_counted_and_skipped() -> None:
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, _ = live()
     vehicles.tick()
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
+    due_ns = vehicles.due_ns
     vehicles.now_ns = due_ns + 3 * vehicles.dt_ns + 1
     vehicles.server.wake(now_ns=vehicles.now_ns)
     ((horizon, _),) = vehicles.answers()
@@ -457,10 +449,8 @@ def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
 
 
 def test_a_wake_before_its_time_does_nothing() -> None:
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
+    vehicles, _ = live()
+    due_ns = vehicles.due_ns
     vehicles.server.wake(now_ns=due_ns - 1)
     assert vehicles.answers() == []
     assert vehicles.server.next_wake_ns() == due_ns
@@ -481,9 +471,7 @@ def test_a_silent_server_sends_heartbeats() -> None:
 
 
 def test_no_estimate_without_a_recent_observation() -> None:
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     said = [[message for message, _ in vehicles.tick()] for _ in range(122)]
     assert [[type(message) for message in each] for each in said[:101]] == [[Horizon]] * 101
     ((heartbeat,),) = (each for each in said[101:] if each)
@@ -497,8 +485,7 @@ def test_no_estimate_without_a_recent_observation() -> None:
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
+    vehicles, _ = live()
     vehicles.now_ns += SESSION_NS + vehicles.dt_ns
     vehicles.server.wake(now_ns=vehicles.now_ns)
     assert vehicles.server.next_wake_ns() is None
@@ -680,8 +667,7 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
 
 
 def test_figures_tell_what_was_counted() -> None:
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
+    vehicles, _ = live()
     vehicles.tick()
     figures = vehicles.server.figures()
     assert (figures["vehicles"], figures["missed"]) == (1, 0)

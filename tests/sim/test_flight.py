@@ -72,13 +72,8 @@ def test_the_event_trigger_saves_four_packets_in_five() -> None:
         summary(flown, fly(flown)) for flown in (packaged("paper-every-step"), packaged("paper"))
     )
     assert every_step.event_ratio == 1.0
-    assert triggered.event_ratio is not None
     assert triggered.event_ratio < 0.2
-    assert triggered.uplink_packets is not None
-    assert every_step.uplink_packets is not None
     assert triggered.uplink_packets < 0.25 * every_step.uplink_packets
-    assert triggered.rmse_xy is not None
-    assert every_step.rmse_xy is not None
     assert every_step.rmse_xy < triggered.rmse_xy < 2.5 * every_step.rmse_xy
 
 
@@ -116,7 +111,6 @@ def test_the_summary_counts_what_the_network_saw() -> None:
     assert result.downlink_packets == len(down) >= 390
     assert result.downlink_bytes == down["bytes"].sum()
     assert result.uplink_packets == len(up)
-    assert result.event_ratio is not None
     assert result.event_ratio * len(flight.server) == pytest.approx(flight.server["event"].sum())
     assert result.uplink_horizons == flight.server["event"].sum()
     horizons = summary_rows(result)[[name for name, _ in summary_rows(result)].index(HORIZONS)][1]
@@ -149,7 +143,6 @@ def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
     """At least 0.8 s of delay, at most 0.25 s of waiting and jitter at the median."""
     flown = packaged("paper-every-step", duration=20.0)
     result = summary(flown, fly(flown))
-    assert result.age_ms_p50 is not None
     assert 850 <= result.age_ms_p50 <= 1050
 
 
@@ -205,7 +198,6 @@ def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
     flight = fly(flown)
     result = summary(flown, flight)
     assert flight.client["state"].shape == (400, 3, 2)
-    assert result.rmse_z is not None
     assert result.rmse_z < 0.2
     assert flight.client["state"][-1, 2, 0] == pytest.approx(5.0, abs=0.05)
 
@@ -217,7 +209,6 @@ def test_two_vehicles_share_one_server() -> None:
         rows = flight.client[flight.client["vehicle"] == vehicle]
         result = summarise(flown, "test", rows, flight.server, flight.netem)
         assert result.steps == 400
-        assert result.rmse_xy is not None
         assert result.rmse_xy < 0.4
     assert set(flight.netem["flow"]) == {0, 1}
 
@@ -261,8 +252,6 @@ def test_wind_and_gusts_push_but_do_not_break() -> None:
         vehicle={"wind": 0.3, "gust_mps2": 0.5, "gust_every_s": 5.0},
     )
     calm_m, windy_m = (summary(flown, fly(flown)).rmse_xy for flown in (calm, windy))
-    assert calm_m is not None
-    assert windy_m is not None
     assert calm_m < windy_m < 2.0
 
 

@@ -45,17 +45,23 @@ class Probe(Endpoint):
         return self.wakes_ns[0] if self.wakes_ns else None
 
 
-def never() -> bool:
-    """Until nothing is left to happen."""
-    return False
+def run(world: World, limit_ns: int = SECOND_NS) -> None:
+    """Let everything happen, up to a time."""
+    world.run(lambda: False, limit_ns=limit_ns)
+
+
+def hosted(*wakes_ns: int, **keys: Any) -> tuple[World, Probe]:
+    """A world with one host, and what happens to that."""
+    world, probe = World(), Probe(list(wakes_ns))
+    world.add("host", probe, **keys)
+    return world, probe
 
 
 def test_what_lies_behind_the_limit_happens_when_time_goes_on() -> None:
-    world, probe = World(), Probe([10, 20])
-    world.add("probe", probe)
-    world.run(never, limit_ns=15)
+    world, probe = hosted(10, 20)
+    run(world, 15)
     assert probe.log == [("wake", 10)]
-    world.run(never, limit_ns=25)
+    run(world, 25)
     assert probe.log == [("wake", 10), ("wake", 20)]
 
 
@@ -90,14 +96,14 @@ def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
     world, receiver = World(), Probe([])
     there = world.add("there", receiver, clock=Clock(offset_ns=7))
     world.add("here", Probe([50], answer_to=there))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert receiver.log == [("hi from here 2", 57)]
 
 
 def test_a_datagram_to_nobody_is_lost() -> None:
     world = World()
     world.add("here", Probe([50], answer_to=("nobody", 0)))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert world.now_ns == 50
 
 
@@ -106,14 +112,14 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
     receiver = Probe([50])
     there = world.add("there", receiver)
     world.add("here", Probe([50], answer_to=there))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     # Both wake at 50; the sender was asked second, but what it sends still comes at 50.
     assert receiver.log == [("wake", 50), ("hi from here 2", 50)]
     later = Probe([50, 60])
     world = World()
     there = world.add("there", later)
     world.add("here", Probe([60], answer_to=there), clock=Clock())
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert later.log[0] == ("wake", 50)
 
 
@@ -123,7 +129,7 @@ def test_a_computing_host_sends_late_and_hears_at_once() -> None:
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)
     busy.answer_to, other.answer_to = other_address, busy_address
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert other.log == [("wake", 60), ("hi from busy 2", 80)]
     assert busy.log == [("wake", 50), ("hi from other 2", 60)]
 
@@ -131,7 +137,7 @@ def test_a_computing_host_sends_late_and_hears_at_once() -> None:
 def test_a_wake_during_computing_comes_late() -> None:
     world, busy = World(), Probe([50, 60])
     world.add("busy", busy, compute_ns=30)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert busy.log == [("wake", 50), ("wake", 80)]
 
 
@@ -148,9 +154,8 @@ def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
 
 
 def test_a_host_is_not_woken_before_its_start() -> None:
-    world, probe = World(), Probe([0])
-    world.add("host", probe, clock=Clock(offset_ns=1000), start_ns=40)
-    world.run(never, limit_ns=SECOND_NS)
+    world, probe = hosted(0, clock=Clock(offset_ns=1000), start_ns=40)
+    run(world)
     assert probe.log == [("wake", 1040)]
 
 
@@ -163,7 +168,7 @@ def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
 
     world, probe, told_ns = World(), Finite([50, 60, 70]), []
     world.add("host", probe, on_finished=lambda: told_ns.append(world.now_ns))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert told_ns == [60]
 
 
@@ -188,7 +193,7 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
             clock=Clock(offset_ns),
             on_finished=lambda name=name: told.append(f"{name} has finished"),
         )
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert told == [
         (50, "one", Flying(vehicle=1)),
         (60, "two", Flying(vehicle=1)),
@@ -200,9 +205,8 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
 
 @pytest.mark.parametrize("limit_ns", [49, 50])
 def test_time_stops_at_its_limit(limit_ns: int) -> None:
-    world, probe = World(), Probe([50])
-    world.add("host", probe)
-    world.run(never, limit_ns=limit_ns)
+    world, probe = hosted(50)
+    run(world, limit_ns)
     assert len(probe.log) == (limit_ns == 50)
 
 
@@ -227,7 +231,7 @@ def test_actions_come_first_at_their_instant_and_in_the_order_they_were_asked_fo
     world.add("host", probe)
     for number in (1, 2):
         at(world, 50, lambda number=number: order.append((number, len(probe.log))))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert order == [(1, 0), (2, 0)]
 
 
@@ -239,7 +243,7 @@ def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
     world.add("caller", Probe([70, 90], answer_to=here))
     at(world, 62, world.stop, "here")
     at(world, 80, world.restart, "here", second)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert first.log == [("wake", 50), ("wake", 60)]
     assert second.log == [("wake", 80), ("hi from caller 2", 90), ("wake", 95)]
     assert hearer.log == [("hi from here 2", 55), ("hi from here 2", 85), ("hi from here 2", 100)]
@@ -249,7 +253,7 @@ def test_a_host_at_work_can_be_restarted_at_once() -> None:
     world, second = World(), Probe([0])
     world.add("here", Probe([50]), compute_ns=1000)
     at(world, 60, world.restart, "here", second)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert second.log == [("wake", 60)]
 
 
@@ -263,7 +267,7 @@ def test_the_end_of_a_later_life_is_told() -> None:
     world, told_ns = World(), []
     world.add("host", Finite([90]), on_finished=lambda: told_ns.append(world.now_ns))
     at(world, 50, world.restart, "host", Finite([0, 70]))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert told_ns == [70]
 
 
@@ -277,7 +281,7 @@ def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
         at(world, 45, world.freeze, "there")
         at(world, 100, world.thaw, "there")
         at(world, 110, world.thaw, "there")
-        world.run(never, limit_ns=SECOND_NS)
+        run(world)
     hi = "hi from here 2"
     assert probe.log == [(hi, 20), (hi, 100), (hi, 100), ("wake", 100), ("wake", 200)]
 
@@ -289,36 +293,33 @@ def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() ->
         at(world, time_ns, action, "host")
     at(world, 40, world.thaw, "host")
     at(world, 55, world.restart, "host", new)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert (old.log, new.log) == ([], [("wake", 60)])
 
 
 @pytest.mark.parametrize("step_ns", [1000, -1000])
 def test_a_timer_counts_on_where_the_clock_is_set(step_ns: int) -> None:
-    world, probe = World(), Probe([50, 60 + step_ns])
-    world.add("host", probe)
+    world, probe = hosted(50, 60 + step_ns)
     at(world, 30, world.set_clock, "host", step_ns=step_ns)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert probe.log == [("wake", 50 + step_ns), ("wake", 60 + step_ns)]
     assert world.now_ns == 60
 
 
 def test_a_timer_counts_on_while_its_host_is_frozen() -> None:
-    world, probe = World(), Probe([50])
-    world.add("host", probe)
+    world, probe = hosted(50)
     at(world, 30, world.freeze, "host")
     at(world, 40, world.set_clock, "host", step_ns=-1000)
     at(world, 100, world.thaw, "host")
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert probe.log == [("wake", -900)]
 
 
 def test_another_rate_holds_from_now_on() -> None:
     """A clock that runs twice as fast from 50 on has shown 300 at 175."""
-    world, probe = World(), Probe([100, 300])
-    world.add("host", probe)
+    world, probe = hosted(100, 300)
     at(world, 50, world.set_clock, "host", drift_ppb=1_000_000_000)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert (probe.log, world.now_ns) == ([("wake", 150), ("wake", 300)], 175)
 
 
@@ -327,5 +328,5 @@ def test_a_host_can_be_given_more_to_compute() -> None:
     there = world.add("there", hearer)
     world.add("here", Probe([50, 60], answer_to=there))
     at(world, 55, world.set_compute, "here", 30)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert hearer.log == [("hi from here 2", 50), ("hi from here 2", 90)]
