@@ -273,6 +273,13 @@ class Air:
         """Let time pass until its motors are disarmed; returns how much [s]."""
         return self.until(lambda: not self.flight.armed, seconds)
 
+    def close(self, seconds: float = 0.5) -> int:
+        """End the client as a signal does; returns how often it asks for a mode from then on."""
+        before = len(self.commands(SET_MODE))
+        self.world.act("client", self.client.close)
+        self.run(seconds)
+        return len(self.commands(SET_MODE)) - before
+
     def quiet(self, seconds: float) -> None:
         """Let time pass, in which the client must send no setpoint."""
         since_ns = self.world.now_ns

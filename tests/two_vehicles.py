@@ -38,12 +38,34 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
 
-def alone() -> MissionPlanner:
+class Decision(MissionPlanner):
+    """Decision for two vehicles, and what it is made by."""
+
+    def __init__(self, flown: Scenario, state: MissionState) -> None:
+        super().__init__(flown, flown.terms(), 2, state)
+        self.state, self.vehicles = state, state.vehicles
+
+    def hear(self, row: int, step: int, in_force: int, x: float, speed: float = 0.0) -> None:
+        """An observation of a vehicle on the x axis [m, m/s]."""
+        said = observation(step, in_force, (x, 0.0))
+        said.state[0, 1] = speed
+        self.observe(row, said)
+
+    def align(self, step: int) -> None:
+        """Let it be this step of both."""
+        self.state.align(np.arange(2), np.array([step, step]))
+
+    def decide(self, step: int) -> None:
+        """Plan for both at this step."""
+        self.plan(np.arange(2), np.array([step, step]), None)  # type: ignore[arg-type]
+
+
+def alone() -> Decision:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
     state = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
-    return MissionPlanner(flown, flown.terms(), 2, state)
+    return Decision(flown, state)
 
 
 def exact(vehicles: int) -> ClockMap:
@@ -54,20 +76,20 @@ def exact(vehicles: int) -> ClockMap:
     return clock
 
 
-def ready() -> MissionPlanner:
+def ready() -> Decision:
     """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
     made = alone()
     for row, x in ((0, 4.0), (1, -4.0)):
-        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-        made._state.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
-        made.observe(row, observation(101, 90, (x, 0.0)))
+        made.hear(row, 100, NO_HORIZON, x)
+        made.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
+        made.hear(row, 101, 90, x)
     return made
 
 
-def planned(made: MissionPlanner) -> Motion:
+def planned(made: Decision) -> Motion:
     """Motion that is decided for the first vehicle at step 101."""
-    made.plan(np.arange(2), np.array([101, 101]), None)  # type: ignore[arg-type]
-    motion = made._state.vehicles[0].next
+    made.decide(101)
+    motion = made.vehicles[0].next
     assert motion is not None
     return motion
 

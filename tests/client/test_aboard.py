@@ -183,7 +183,6 @@ def test_an_unsafe_parameter_is_a_line_and_nothing_is_armed(
     assert not air.heard("PARAM_SET")
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_parameters_are_set_and_read_back_where_that_is_allowed(flavour: FlavourName) -> None:
     air = Air(flavour, parameters={}, sets=True)
     lost: list[bytes] = []
@@ -253,7 +252,6 @@ def test_what_keeps_it_from_arming_is_told_and_tried_again() -> None:
     assert next(each.text for each in air.of(AutopilotText)) == "PreArm: Compass not calibrated"
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: FlavourName) -> None:
     air = Air(flavour, mavlink={"patience_s": 3.0})
     air.flight.why_not_armed = lambda: "PreArm: Compass not calibrated"
@@ -262,7 +260,6 @@ def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: Flavou
     assert not air.setpoints()
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_an_autopilot_that_ends_in_a_climb_is_told_to_be_silent(flavour: FlavourName) -> None:
     """The altitude that was heard last is no reason: nobody knows whether it still holds."""
     air = Air(flavour, mavlink={"patience_s": 12.0})
@@ -299,7 +296,6 @@ def test_what_does_not_hover_or_is_another_autopilot_is_refused(kind: int, autop
     assert not air.heard("COMMAND_LONG")
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: FlavourName) -> None:
     air = Air(flavour, armed=False, mavlink={"patience_s": 9.0})
     air.run(15.0)
@@ -359,7 +355,6 @@ def test_a_vehicle_that_somebody_has_armed_is_left_to_him() -> None:
     assert not air.commands(SET_MODE)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> None:
     air = Air(flavour)
     air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > 0.5)
@@ -368,13 +363,10 @@ def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> Non
     air.end(10.0)
     assert "taken over" in why(air)[1]
     assert len(air.commands(SET_MODE)) == asked
-    air.world.act("client", air.client.close)
-    air.run(0.5)
-    assert len(air.commands(SET_MODE)) == asked
+    assert air.close() == 0
     assert air.flight.mode is FlightMode.PILOT
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_take_off_that_does_not_climb_ends_in_a_landing(flavour: FlavourName) -> None:
     air = Air(flavour, mavlink={"patience_s": 2.0})
     air.end(60.0)
@@ -406,7 +398,6 @@ def test_who_arms_it_while_we_are_about_to_has_it() -> None:
     assert len(air.commands(SET_MODE)) == asked
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> None:
     air = flying(flavour)
     air.take_over()
@@ -432,7 +423,6 @@ def test_a_vehicle_that_is_given_back_hovers_and_flies_on() -> None:
     assert air.mode in (Mode.HOVER, Mode.TRACK)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_disarmed_vehicle_is_never_flown_again(flavour: FlavourName) -> None:
     air = flying(flavour)
     air.flight.disarm(force=True)
@@ -483,7 +473,6 @@ def test_a_low_battery_is_not_taken_off_with() -> None:
     assert not air.commands(ARM)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None:
     """Its estimate is lost, it lands by itself: we say what it says, and command nothing."""
     air = flying(flavour)
@@ -496,7 +485,6 @@ def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None
     )
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName) -> None:
     """BRAKE, then the autopilot's landing: flags alone say that it is lost."""
     air = flying(flavour)
@@ -507,7 +495,6 @@ def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName
     assert air.flight.mode is FlightMode.LAND
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> None:
     """After mavlink.silence_s; setpoints go on, of zero in the end; then it flies on."""
     air = flying(flavour)
@@ -557,7 +544,6 @@ def test_a_pilot_that_does_not_call_is_not_repeated_for_long() -> None:
     assert air.heard("HEARTBEAT", died_ns + SECOND)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
     """On Ctrl-C or SIGTERM; on the ground nothing is said, and nothing begins."""
     air = flying(flavour)
@@ -573,10 +559,7 @@ def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
 def test_who_ends_on_the_ground_begins_nothing() -> None:
     air = Air("ardupilot")
     air.run(20.0, lambda: air.client._session.number is not None)
-    asked = len(air.commands(SET_MODE))
-    air.world.act("client", air.client.close)
-    air.run(5.0)
-    assert len(air.commands(SET_MODE)) == asked
+    assert air.close(5.0) == 0
     assert not air.flight.armed
 
 
@@ -584,10 +567,7 @@ def test_who_ends_while_a_pilot_flies_says_nothing() -> None:
     air = flying("ardupilot")
     air.take_over()
     air.run(1.0)
-    asked = len(air.commands(SET_MODE))
-    air.world.act("client", air.client.close)
-    air.run(0.5)
-    assert len(air.commands(SET_MODE)) == asked
+    assert air.close() == 0
     assert air.flight.mode is FlightMode.PILOT
 
 
@@ -697,7 +677,6 @@ def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
     assert np.abs(error).max() < 0.3
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None:
     """A fifth of what either says is lost, a tenth comes doubled, a tenth cut off."""
     air = Air(flavour, duration=5.0)
@@ -724,7 +703,6 @@ def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None
     assert air.figures()["dropped"]["doubled"] > 10
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_line_of_bytes_may_come_in_any_pieces(flavour: FlavourName) -> None:
     line = {"address": "tcp:127.0.0.1:5760"}
     air = Air(flavour, host="line", duration=3.0, vehicle=line)
@@ -770,7 +748,6 @@ def test_a_stream_that_stops_is_asked_for_again() -> None:
     assert air.mode in (Mode.HOVER, Mode.TRACK)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe(
     flavour: FlavourName,
 ) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from airborne import BOTH, Air, altered, modes
+from airborne import Air, altered, modes
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
@@ -64,7 +64,6 @@ def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
 # Flights after another
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> None:
     """After a landing PX4 is in OFFBOARD, in which it is not armed without set-points."""
     air = Air(flavour, duration=5.0)

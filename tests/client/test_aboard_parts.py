@@ -42,7 +42,7 @@ def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
     return round((local_ns - offset_ns) * (1.0 - drift))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.floats(-DRIFT_MAX, DRIFT_MAX),
     st.lists(
@@ -138,7 +138,7 @@ def messages() -> st.SearchStrategy[bytes]:
     return st.builds(frame, numbers, st.binary(max_size=255), st.sampled_from([1, 1, 2]))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.tuples(st.binary(max_size=80) | messages(), st.integers(0, 2 * SECOND)), max_size=12
@@ -171,7 +171,7 @@ def test_any_bytes_raise_nothing_and_arm_nothing(
 
 
 @given(st.lists(st.binary(max_size=300), max_size=30))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
     flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
     for piece in pieces:

@@ -2,7 +2,6 @@
 
 import pytest
 
-from airborne import BOTH
 from bad_line import ARM, SET_MODE, SETTLE_S, OverLine, fly
 from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.condition import Condition
@@ -51,13 +50,11 @@ def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
     """`python tests/bad_line.py --minutes 60` flies for an hour."""
     compare(flavour, 2, 180.0)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
     air = OverLine(flavour, 1, armed=False)
     air.run(30.0)

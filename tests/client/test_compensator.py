@@ -14,7 +14,7 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, Trajectory
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])

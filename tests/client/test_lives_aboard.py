@@ -4,7 +4,7 @@ from math import dist
 
 import pytest
 
-from airborne import ARM, BOTH, Air, scenario
+from airborne import ARM, Air, scenario
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
@@ -38,7 +38,6 @@ def farthest_m(air: Air, seconds: float) -> float:
     return most
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: FlavourName) -> None:
     """Figure and fence stay where they were: the origin outlives the process."""
     air = away(flavour)
@@ -88,7 +87,6 @@ def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
     assert not air.client._pilot.next_ns
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize("down_s", [0.5, 30.0])
 def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     flavour: FlavourName, down_s: float

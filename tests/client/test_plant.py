@@ -80,7 +80,7 @@ def test_dead_time_of_whole_steps_only_shifts(steps: int) -> None:
     np.testing.assert_array_equal(late[steps : steps + len(prompt)], prompt)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 500_000_000), st.floats(0.5, 2.0))
 def test_dead_time_is_exact_within_a_step(dead_time_ns: int, gain: float) -> None:
     tau, w = np.array([0.81, 0.3]), np.array([0.1, 0.0])

@@ -253,7 +253,7 @@ def test_no_integral_grows_without_end(frame: Frame, gains: Gains) -> None:
     assert np.abs(flown_._quad.integral).max() == gains.integral_max
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.integers(0, 30 * MS), min_size=1, max_size=12))
 def test_time_may_pass_in_any_pieces(pieces: list[int]) -> None:
     whole, parts = quadrotor(), quadrotor()
@@ -301,7 +301,7 @@ def mixed(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1
     mix(frame, thrust, torque, rotor_max, command)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.floats(0.0, 60.0), st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.floats(100.0, 1100.0))
 def test_no_rotor_is_asked_for_more_than_it_has(
     thrust: float, torque: tuple[float, ...], rotor_max: float

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airborne import BOTH, SAFE, Air
+from airborne import SAFE, Air
 from helpers import packaged
 from skytether.autopilot.flavours import FlavourName
 from skytether.autopilot.flight import Result
@@ -37,7 +37,6 @@ def lost(flavour: FlavourName, **keys: Any) -> Air:
     return air
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: FlavourName) -> None:
     air = lost(flavour, parameters=SAFE[flavour] | LOW[flavour])
     died_ns = air.world.now_ns
@@ -64,7 +63,6 @@ def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
     assert "failed" in [each.answer for each in air.of(AutopilotRefused)]
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None:
     """Nothing is armed: by default ArduCopter returns at 15 m, and PX4 at 60 m."""
     air = Air(flavour, fence=FENCE, vehicle=RETURNS)
@@ -75,7 +73,6 @@ def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None
     assert "fence.high_m" in str(air.client.failure)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -> None:
     air = Air(flavour, fence=FENCE, vehicle=RETURNS, sets=True)
     air.run(30.0, lambda: bool(air.flight.armed))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airborne import BOTH, SECOND, Air, flying, modes
+from airborne import SECOND, Air, flying, modes
 from bench.autopilots import MODELS
 from skytether.autopilot.faults import COMMANDED
 from skytether.autopilot.flavours import FlavourName
@@ -57,7 +57,6 @@ def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> Non
 # By what the vehicle does
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
     flavour: FlavourName,
 ) -> None:
@@ -93,7 +92,6 @@ def unlike(flavour: FlavourName, slower: float, stronger: float) -> dict[str, An
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize("weather", WEATHER)
 @pytest.mark.parametrize("wrong", [(1.0, 1.0), (1.3, 0.8), (0.7, 1.2)])
 def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
@@ -172,7 +170,6 @@ def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
     assert air.mode is Mode.TRACK
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away(flavour: FlavourName) -> None:
     """The line shows nobody: the vehicle moves, though it was told to stand."""
     air = tracking(flavour, mavlink={"second_commander": "yield"})

@@ -316,7 +316,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
-    made, vehicle = alone()._state, VehicleMotions()
+    made, vehicle = alone().state, VehicleMotions()
     made.vehicles[0] = vehicle
     assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
     first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
@@ -336,7 +336,7 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
     """Its steps are smaller, so time would never tell; one that goes on tells by its motion."""
-    made, place = alone()._state, np.array([4.0, 0.0])
+    made, place = alone().state, np.array([4.0, 0.0])
     for in_force, left in ((NO_HORIZON, 0), (900, 1)):
         vehicle = made.vehicles[0] = VehicleMotions()
         vehicle.in_force = SentMotion(900, resting(900, place))
@@ -358,13 +358,13 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     """
     made, flown = alone(), scenario(2)
     for row, x in ((0, 4.0), (1, -4.0)):
-        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-    made._state.align(np.arange(2), np.array([100, 100]))
-    made._state.vehicles[1].outside_m = 0.1
-    made._state.update_possible()
+        made.hear(row, 100, NO_HORIZON, x)
+    made.align(100)
+    made.vehicles[1].outside_m = 0.1
+    made.state.update_possible()
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
-    planned = made._state.possible_motion(0, near)
+    planned = made.state.possible_motion(0, near)
     assert made._conflicts(0, near, planned).tolist() == [False, is_hit, False]
 
 
@@ -372,26 +372,26 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
 def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
     """Though it may fly straight: it is still passing somebody. Bit by bit it turns back."""
     made = ready()
-    made._state.vehicles[0].turned_rad = turned
+    made.vehicles[0].turned_rad = turned
     end = planned(made).position[-1]
     assert end[0] < 3.0  # on its way from x = 4 m to -4 m
     assert (end[1] > 0.5) == (turned > 0.0)
-    assert made._state.vehicles[0].turned_rad == max(0.0, turned - waypoints.TURN_BACK)
+    assert made.vehicles[0].turned_rad == max(0.0, turned - waypoints.TURN_BACK)
 
 
 @pytest.mark.parametrize(("until", "yields"), [(0, True), (-1, False)])
 def test_a_vehicle_yields_up_to_its_last_step(until: int, yields: bool) -> None:
     made = ready()
     place = np.array([4.0, 3.0])
-    made._state.vehicles[0].yielding = yielding.Yielding(place, asker=1, until=until)
+    made.vehicles[0].yielding = yielding.Yielding(place, asker=1, until=until)
     end = planned(made).position[-1]
-    assert (made._state.vehicles[0].yielding is not None) == yields
+    assert (made.vehicles[0].yielding is not None) == yields
     assert (end[1] > 0.5, end[0] < 3.5) == (yields, not yields)
 
 
 def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
     made = ready()
-    vehicle, last = made._state.vehicles[0], 90 + made._resend_after
+    vehicle, last = made.vehicles[0], 90 + made._resend_after
     assert made._may_plan(0, vehicle, last)
     assert vehicle.next is None
     assert not made._may_plan(0, vehicle, last + 1)
@@ -400,20 +400,19 @@ def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
 
 def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
     made = alone()
-    made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
-    made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._state.vehicles[0].in_force = SentMotion(90, resting(100, np.array([4.0, 0.0])))
+    made.hear(0, 100, NO_HORIZON, 4.0)
+    made.hear(1, 100, 70, -4.0)
+    made.vehicles[0].in_force = SentMotion(90, resting(100, np.array([4.0, 0.0])))
     over = 70 + LONGEST  # the last step of the longest motion
     for step, seen, plans in (
         (111, 111, False),
         (over + 1, over, False),
         (over + 11, over + 1, True),
     ):
-        made.observe(0, observation(step, 90, (4.0, 0.0)))
-        made.observe(1, observation(seen, 70, (-4.0, 0.0)))
-        rows, steps = np.arange(2), np.array([step, step])
-        made.plan(rows, steps, None)  # type: ignore[arg-type]
-        assert (made._state.vehicles[0].next is not None) == plans
+        made.hear(0, step, 90, 4.0)
+        made.hear(1, seen, 70, -4.0)
+        made.decide(step)
+        assert (made.vehicles[0].next is not None) == plans
 
 
 def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
@@ -491,8 +490,8 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
         made, x = alone(), -4.0
         for step in steps:
             x += 0.5
-            made.observe(1, observation(step, 70, (x, 0.0)))
-            vehicle = made._state.vehicles[1]
+            made.hear(1, step, 70, x)
+            vehicle = made.vehicles[1]
             rests_x = x if step != steps[-1] else x - 0.5
             assert vehicle.in_force.motion.position[-1].tolist() == [rests_x, 0.0]
             assert vehicle.is_foreign == (step <= until)
@@ -500,7 +499,7 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
 
 def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
     """It comes to rest v (τ + v / 2b) further on than where it was seen."""
-    made, terms = alone()._state, scenario(2).terms()
+    made, terms = alone().state, scenario(2).terms()
     made.absent.clear()
     moving = observation(100, NO_HORIZON, (4.0, 0.0))
     moving.state[0, 1] = 0.5
@@ -511,7 +510,7 @@ def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
 
 def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
     """A motion that was sent and may still be taken leads away from where it is."""
-    made = alone()._state
+    made = alone().state
     made.vehicles[1] = vehicle = VehicleMotions()
     vehicle.in_force = SentMotion(-100, resting(-100, np.array([1.0, 0.0])))
     assert len(made.resting_places(0)) == 1
@@ -1101,10 +1100,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
         ("goal(1, 0)", "mission.goals: got 'goal(1, 0)', expected goal(vehicle, x, y)"),
         ("place(1, 0, 0)", "mission.goals: got 'place(1, 0, 0)', expected goal(vehicle, x, y)"),
         ("goal(1, nan, 0)", "mission.goals: got 'goal(1, nan, 0)', expected a place within"),
-        (
-            "goal(1, 7, 7) & goal(2, 7, 7.5)",
-            "got goal(2, 7, 7.5), expected a place 0.93 m from the goal of vehicle 1",
-        ),
+        ("goal(1, 7, 7) & goal(2, 7, 7.5)", "got goal(2, 7, 7.5), expected a place 0.93 m from"),
         ("goal(1, 3.2, 0)", "expected a place 0.93 m from the goal of vehicle 2"),
         ("goal(1, 1.1, 0)", "expected a place 0.23 m from box(-1, 1, -1, 1)"),
     ],
@@ -1181,15 +1177,10 @@ def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "key", "value", "said"),
     [
-        ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0, and at most 1.5 s"),
-        (
-            "mission",
-            "height_m",
-            0.4,
-            "mission.height_m: got 0.4, expected 0, or at least mission.separation_m (0.5)",
-        ),
+        ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0"),
+        ("mission", "height_m", 0.4, "expected 0, or at least mission.separation_m (0.5)"),
         ("link", "join_s", 2.0, "link.join_s: got 2.0, expected more than 0, and at most 1.5 s"),
-        ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s on a mission"),
+        ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s"),
         ("control", "trigger", "always", "control.trigger: got 'always', expected 'expected_gap'"),
         ("vehicle", "exhausted", "hold", "vehicle.exhausted: got 'hold', expected 'brake'"),
     ],

@@ -57,7 +57,7 @@ def least_m(
     return float(min(nearest))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**31), st.integers(0, 60), errors, errors, st.integers(2, 3))
 def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
     seed: int, begin: int, mine: StepError, its: StepError, axes: int
@@ -77,7 +77,7 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
         assert is_hit <= (least < keep_m + 0.06)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 2**31), errors)
 def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     seed: int, error: StepError
@@ -104,7 +104,7 @@ def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     assert not hit[0]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**31), errors, errors)
 def test_half_planes_are_in_front_of_all_that_another_may_be_at_a_time(
     seed: int, mine: StepError, its: StepError
@@ -214,7 +214,7 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
 # -- what is known of a clock ----------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.integers(0, 2**31),
     st.integers(-(10**15), 10**15),

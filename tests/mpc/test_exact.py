@@ -98,7 +98,7 @@ def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
             np.testing.assert_allclose(inputs[n, axis], reference, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 10**6),
     scale=st.sampled_from([0.1, 1.0, 3.0, 30.0]),

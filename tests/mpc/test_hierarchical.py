@@ -307,7 +307,7 @@ def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> floa
     return float(cost + (weights.changes[LATER] * (inputs - told) ** 2).sum())
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, H), st.integers(0, H))
 def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
     """V of (16), the cost of flying on above that of the plan, and how far that leads from it."""

@@ -30,7 +30,7 @@ from skytether.server.mpc.problem import (
 from skytether.shared.law.model import Array, discretise
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 
 TAU_S = (0.81, 0.3)
 TWO_TAUS = discretise(TAU_S, 0.05)

@@ -13,7 +13,7 @@ from skytether.server.mpc.solver import Solver, SolverFailed
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 
 H = 20
 SCENARIO = Scenario(

@@ -185,10 +185,7 @@ def test_changes_and_recordings(
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (
-            ["--uplink", "los(1)"],
-            "netem: demo and the command line: network.uplink: got 'los(1)', expected",
-        ),
+        (["--uplink", "los(1)"], "network.uplink: got 'los(1)'"),
         (["--downlink", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
         (["--downlink", "trace(none.csv)"], "none.csv: cannot be read: No such file or directory"),
     ],

@@ -122,7 +122,7 @@ phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, ma
 """None leaves them to the seeds; the others make everything fall on the same instants."""
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.one_of(scenarios, committing, guided), companies, phases_ms)
 def test_a_run_in_a_batch_equals_the_same_run_alone(
     changes: dict[str, Any], seeds: list[int], phases: list[int] | None

@@ -55,7 +55,7 @@ class Crowd:
         return sent
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(st.integers(40, 400), min_size=1, max_size=12),
     st.floats(200.0, 20_000.0),

@@ -12,7 +12,7 @@ from skytether.server.common.clock import ECHOES, ClockMap, half_trip_ns, shorte
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 
 DT_NS = 50 * MS
 HOUR = 3600 * S

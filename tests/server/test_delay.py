@@ -20,7 +20,7 @@ from skytether.server.schemes.delay_bound import (
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario.schema import DirectionConfig
 
-quick = settings(max_examples=100, deadline=None)
+quick = settings(max_examples=100)
 
 MOST = 39
 

@@ -62,7 +62,7 @@ def truth(start: int, sample: Reference | None = None) -> Array:
     return (sample or SCENARIO.make_reference())((start + np.arange(H + 1)) * DT_S)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.lists(st.integers(0, 9 * PAGE), min_size=1, max_size=4), min_size=1, max_size=5))
 def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> None:
     desired = make()
@@ -160,7 +160,7 @@ def test_the_reference_is_computed_once_for_a_page_of_steps(
 # -- preview -----------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     shape=st.sampled_from(["circle", "square", "target"]),
     preview=st.sampled_from(["none", 0.3, 1.0, 2.0]),

@@ -30,7 +30,7 @@ from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_
 from skytether.sim.flight import fly, fly_batch
 from skytether.sim.world import Clock
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 
 TERMS = reading.load("demo-committed").terms()
 DT_NS, H = TERMS.dt_ns, TERMS.horizon

@@ -26,7 +26,7 @@ from skytether.shared.scenario.triggers import (
     make_trigger,
 )
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 
 CONTROL = ControlConfig(
     scheme="committed",
@@ -339,7 +339,7 @@ def packets(trigger: Trigger, walk: list[tuple[int, bool]]) -> list[int]:
     return sent
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(gaps, st.floats(0.01, 60.0), st.floats(1.0, 20.0), st.sampled_from([0.02, 0.05, 1.0]))
 def test_budget_is_kept_in_every_window(
     walk: list[tuple[int, bool]], rate: float, burst: float, dt: float

@@ -96,7 +96,7 @@ COUNTERS = st.one_of(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(COUNTERS, max_size=60))
 def test_the_window_is_a_set_of_the_newest_counters(counters: list[int]) -> None:
     agree(counters)

@@ -13,7 +13,7 @@ from skytether.server.common.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 time_constants = st.floats(0.02, 50.0)
 steps_s = st.floats(0.001, 1.0)
 

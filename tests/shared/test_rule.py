@@ -32,7 +32,7 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation
 
-quick = settings(max_examples=200, deadline=None)
+quick = settings(max_examples=200)
 
 # -- in plain numbers ----------------------------------------------------------------------------
 
