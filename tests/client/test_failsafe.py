@@ -66,7 +66,6 @@ class Hand(ByHand):
     def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
         flown = msgspec.structs.replace(scenario(**sections), armed=armed)
         super().__init__(flown, link=Sealed() if secure else None)
-        self.flies: Any
         self.events: list[Event] = []
         self.wake()
         self.welcome()

@@ -45,6 +45,15 @@ class Probe(Endpoint):
         return self.wakes_ns[0] if self.wakes_ns else None
 
 
+class Finite(Probe):
+    """Ends with its last wake."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has been woken as often as it was to be."""
+        return not self.wakes_ns
+
+
 def run(world: World, limit_ns: int = SECOND_NS) -> None:
     """Let everything happen, up to a time."""
     world.run(lambda: False, limit_ns=limit_ns)
@@ -160,29 +169,19 @@ def test_a_host_is_not_woken_before_its_start() -> None:
 
 
 def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
-    class Finite(Probe):
-        @property
-        def finished(self) -> bool:
-            """After the second of three wakes."""
-            return len(self.wakes_ns) < 2
-
-    world, probe, told_ns = World(), Finite([50, 60, 70]), []
-    world.add("host", probe, on_finished=lambda: told_ns.append(world.now_ns))
+    world, told_ns = World(), []
+    world.add("host", Finite([50, 60]), on_finished=lambda: told_ns.append(world.now_ns))
+    world.add("other", Probe([60, 70]))
     run(world)
     assert told_ns == [60]
 
 
 def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
-    class Talker(Probe):
+    class Talker(Finite):
         def wake(self, *, now_ns: int) -> None:
             """Say something."""
             super().wake(now_ns=now_ns)
             self._events.append(Flying(vehicle=len(self.log)))
-
-        @property
-        def finished(self) -> bool:
-            """After the last wake."""
-            return not self.wakes_ns
 
     told: list[tuple[int, str, Event] | str] = []
     world = World(on_event=lambda *event: told.append(event))
@@ -258,12 +257,6 @@ def test_a_host_at_work_can_be_restarted_at_once() -> None:
 
 
 def test_the_end_of_a_later_life_is_told() -> None:
-    class Finite(Probe):
-        @property
-        def finished(self) -> bool:
-            """After the last wake."""
-            return not self.wakes_ns
-
     world, told_ns = World(), []
     world.add("host", Finite([90]), on_finished=lambda: told_ns.append(world.now_ns))
     at(world, 50, world.restart, "host", Finite([0, 70]))
