@@ -201,9 +201,7 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
-    """Observations contain the arrival time minus the message's stamp, for the server's clock
-    map.
-    """
+    """The arrival time minus the message's stamp, for the server's map of the clocks."""
     server = flying()
     epoch_ns = server.now_ns
     (first,) = server.wake()

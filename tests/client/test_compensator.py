@@ -325,9 +325,7 @@ def test_without_compensation_the_first_input_is_braked_along_whatever_follows_i
 def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
     scheme: str, d: int
 ) -> None:
-    """The limit is a quarter of the horizon, here two steps; the paper's scheme commits to
-    nothing.
-    """
+    """After a quarter of the horizon, two steps here; the paper's scheme commits to nothing."""
     inputs = np.concatenate([np.zeros((2, d)), INPUTS], axis=1)
     in_time, late = Compensator(terms(scheme=scheme)), Compensator(terms(scheme=scheme))
     in_time.offer(horizon(100, inputs), 102 + d, 99)

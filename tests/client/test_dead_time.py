@@ -137,9 +137,7 @@ def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
 
 @pytest.mark.parametrize("scheme", ["committed", "predictive", "trajectory"])
 def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
-    """Error over a perfect network; ablation: the same vehicle with a model without dead time is
-    off.
-    """
+    """Ablation: the same vehicle with a model without dead time is off."""
     splines = scheme == "trajectory"
     control = {"scheme": scheme, "trigger": "cost_gap | silence(1)" if splines else "always"}
     control |= {"cost_gap": 0.01, "input_weight": 0.05}

@@ -628,9 +628,7 @@ def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
 
 
 def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
-    """The prescribed input is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it
-    stays.
-    """
+    """What is told is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it stays."""
     loose = [0.0, 0.0], [9.0, 9.0], 9.0
     flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
     assert flown == pytest.approx([0.5, 2.0])

@@ -75,9 +75,7 @@ def held_back(scheme: str, seed: int) -> Record:
 def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
     scheme: str, seed: int
 ) -> None:
-    """The fence holds for all schemes, also for a regulator aboard that would remove the
-    correction.
-    """
+    """Of all schemes, also with a regulator aboard that would take the correction away."""
     record = held_back(scheme, seed)
     assert record.client["state"][:, 0, 0].max() <= 1.0
     assert record.client["state"][:, 0, 0].min() < -1.0

@@ -285,9 +285,7 @@ def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
 
 
 def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> None:
-    """The filter uses positions alone, at 5 Hz; ablation: without w in the filter an offset
-    remains.
-    """
+    """By positions alone, at 5 Hz; ablation: without w in the filter an offset remains."""
     vehicle = {"wind": 0.02, "steady_wind_mps": [0.3, -0.2], "gain": 0.8}
     flown = scenario(sensor=POSITIONS, vehicle=vehicle)
     plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
@@ -421,9 +419,7 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
 
 
 def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
-    """Eq. (1) moves it to the step exactly; a measurement at the step itself is used unchanged, to
-    the last bit.
-    """
+    """By eq. (1), exactly; one at the step itself is used unchanged, to the last bit."""
     flown, u = scenario(), np.array([1.0, -0.5])
     tau, position, velocity = flown.tau_s, [1.0, 2.0], [0.3, 0.4]
     known = Navigation(flown)
@@ -465,9 +461,7 @@ class Restless(Vehicle):
 def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Measurements with their own timestamps give the same flight; ablation: stamps are ignored,
-    and measurements are taken as if made at the step.
-    """
+    """Ablation: where stamps are ignored, what was measured before is taken for the present."""
     monkeypatch.setitem(VEHICLES, "restless", Entry(Restless, (), ""))
     flown = scenario(duration=20.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
     flown = msgspec.structs.replace(
@@ -483,9 +477,7 @@ def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
 
 
 def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
-    """Motion before the flight, under another controller, is not taken for a disturbance: here the
-    vehicle has climbed for a second.
-    """
+    """Motion before it is not taken for a disturbance: here it has climbed for a second."""
     flown = scenario("autopilot")
     measured = [
         Measurement(n * SECOND_NS // 50, [0.0, 0.0, 4.0 + n / 50], [0.0, 0.0, 2.0 - n / 25])

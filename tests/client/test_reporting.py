@@ -163,10 +163,7 @@ def waited_s(flight: Record) -> float:
 
 
 def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where half of its packets are lost; without the repetition it waits for its next report.
-
-    Each flight reports every 4 s.
-    """
+    """Also where half of its packets are lost; without repetition it waits for its next report."""
     keys = QUIET | {"vehicle.report": "periodic(80)", "network.downlink.loss": 0.5, "duration": 20}
     soon = [waited_s(fly(skytether.load("target", seed=seed, **keys))) for seed in range(5)]
     monkeypatch.setattr(reporting, "RETRY_STEPS", 10**6)

@@ -75,9 +75,7 @@ def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
 
 
 def test_packets_of_one_slot_have_fates_of_their_own() -> None:
-    """CLOSE is sent three times at once, because one may be lost: a binomial test of their
-    losses.
-    """
+    """CLOSE is sent three times at once, because one may be lost: a binomial test."""
     fates = Fates(PAPER, 17, "uplink", 0)
     triples = [[fates.at(slot, rank) for rank in range(3)] for slot in range(SAMPLES)]
     all_lost = sum(all(fate.lost for fate in triple) for triple in triples)

@@ -113,9 +113,7 @@ def test_a_client_too_many_is_refused() -> None:
 
 
 def test_a_place_is_earned_for_a_while_and_then_goes_to_a_new_client() -> None:
-    """The flow's socket then carries the new client's answers, and the old client comes back where
-    somebody else has not earned a place.
-    """
+    """The old client comes back where somebody else has not earned a place."""
     proxy = make_proxy(flows=2)
     fly(proxy, ALICE, at=0)
     fly(proxy, BOB, at=1)
@@ -257,9 +255,7 @@ SIEGES = [
 def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
     hosts: list[str], ports: int, rate_hz: int
 ) -> None:
-    """Neither a vehicle that flies, nor one that comes, nor one whose port changes; from one host
-    or many, or behind the same address as the vehicles.
-    """
+    """Neither a vehicle that flies, nor one that comes, nor one whose port changes."""
     siege = Siege(make_proxy(flows=128), hosts, ports, rate_hz)
     siege.run(3, ALICE)
     siege.run(15)  # all places are taken
