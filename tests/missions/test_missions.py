@@ -352,10 +352,7 @@ def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> Non
 
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
 def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) -> None:
-    """D = separation_m + 2 tube_m.
-
-    From one that was outside its tube the distance is as much larger.
-    """
+    """D = separation_m + 2 tube_m, and as much larger from one that was outside its tube."""
     made, flown = alone(), scenario(2)
     for row, x in ((0, 4.0), (1, -4.0)):
         made.hear(row, 100, NO_HORIZON, x)

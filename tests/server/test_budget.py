@@ -122,9 +122,7 @@ def longest_wait_s() -> float:
 
 
 def test_nobody_starves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle that was sent nothing for WAIT_S goes first; ablation: without the bound it
-    starves.
-    """
+    """After WAIT_S without a packet it goes first; ablation: without the bound it starves."""
     assert longest_wait_s() <= WAIT_S + 3 * DT_S
     monkeypatch.setattr(budgets, "WAIT_S", np.inf)
     assert longest_wait_s() == pytest.approx(400 * DT_S)
@@ -271,9 +269,7 @@ def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
 
 @pytest.mark.long
 def test_random_loss_costs_no_budget() -> None:
-    """Half of the packets are lost and nobody queues: the error is that of thresholds; a rate cut
-    by losses, as a queue's would be, is far worse.
-    """
+    """The error is that of thresholds; a rate that losses cut, as a queue does, is far worse."""
     lossy = "paper(0.4, 0.02, 2) & loss(0.5)"
     _, threshold_m = flown({}, 8, lossy)
     _, budget_m = flown(AUTO, 8, lossy)

@@ -422,9 +422,7 @@ def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
 
 
 def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Errors are 1 cm at 50 moves a second; ablation: the difference of two moves alone is
-    useless.
-    """
+    """By 1 cm at 50 moves a second; ablation: the difference of two moves alone is useless."""
 
     def spread() -> float:
         rng, moved, velocities = np.random.default_rng(1), point(), []
