@@ -13,7 +13,6 @@ from skytether.client import vehicles
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import AutopilotRefused, ParametersUnsafe
 from skytether.shared.core.events import ModeChanged
-from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
@@ -83,10 +82,8 @@ def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -
 
 
 def test_vehicles_of_a_mission_land_straight_down() -> None:
-    table = reading.to_table(reading.load("swap"))
-    table["vehicle"] |= {"on_loss": "return"}
     with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*lands straight down"):
-        reading.check(table, "swap")
+        packaged("swap", vehicle={"on_loss": "return"})
 
 
 def test_only_a_vehicle_that_can_return_is_told_to() -> None:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import packaged
 from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
 from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
@@ -397,10 +398,8 @@ def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
 
 def mission(name: str, shape: str = "", duration: float = 30.0) -> Scenario:
     """A mission that comes with Skytether."""
-    table = reading.to_table(reading.load(name)) | {"duration": duration, "seed": 1}
-    if shape:
-        table["reference"]["shape"] = shape
-    return reading.check(table, name)
+    reference = {"shape": shape} if shape else {}
+    return packaged(name, duration=duration, seed=1, reference=reference)
 
 
 SWAP = mission("swap", "swap(8)", 20.0)

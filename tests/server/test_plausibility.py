@@ -304,6 +304,7 @@ def flipped(share: float) -> list[Record]:
 
 
 SEEDS = range(1, 7)
+LOSSLESS = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
 
 
 def rmse(flights: list[Record]) -> float:
@@ -342,9 +343,7 @@ def oddly(
         send(self, message)
 
     monkeypatch.setattr(ServerSession, "send", lie)
-    control = reading.to_table(reading.load("demo-committed"))["control"] | {"feedback": feedback}
-    network = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
-    return fly(scenario(control=control, network=network))
+    return fly(scenario(control={"feedback": feedback}, network=LOSSLESS))
 
 
 @pytest.mark.parametrize("number", [0, 300])
@@ -419,8 +418,7 @@ def test_a_server_whose_clock_steps_goes_on_planning(
         return Stepped(made, 15 * S, by_ns) if next(ours) else made
 
     monkeypatch.setattr(skytether.sim.flight, "Clock", clock)
-    flown = scenario(network={"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}})
-    flight = fly(flown)
+    flight = fly(scenario(network=LOSSLESS))
     assert flight.failure is None
     covered = flight.client["covered"]
     assert covered[600:].all()
@@ -437,9 +435,7 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
             self.x[:, 0] += 300.0
 
     monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
-    flight = fly(
-        reading.check(reading.to_table(reading.load("demo-committed")) | {"duration": 40.0}, "test")
-    )
+    flight = fly(packaged("demo-committed", duration=40.0))
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import refusal
+from helpers import packaged, refusal
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
@@ -305,10 +305,8 @@ def test_goals_that_cannot_be_reached(text: str, goals: str, said: str, tmp_path
 
 
 def test_zones_are_of_missions_alone() -> None:
-    table = reading.to_table(reading.load("target"))
-    table["mission"]["zones"] = BOX
     with pytest.raises(ConfigError, match=r"mission\.zones: .*expected none without a mission"):
-        reading.check(table, "target")
+        packaged("target", mission={"zones": BOX})
 
 
 def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
