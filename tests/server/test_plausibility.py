@@ -139,56 +139,46 @@ def elsewhere(step: int, metres: float = 100.0) -> Observation:
     return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
 
-def test_three_in_a_row_that_agree_are_believed_and_begin_anew() -> None:
+B, J = Belief.BELIEVED, Belief.JUMP
+HEARD: dict[str, list[tuple[Observation, Belief]]] = {
+    "three that agree begin anew": [
+        *((elsewhere(step), J) for step in range(105, 104 + REPEATS)),
+        (elsewhere(104 + REPEATS), Belief.ANEW),
+        (elsewhere(108), B),
+        (seen(110), J),
+    ],
+    "any number that do not agree": [
+        *((elsewhere(105 + n, 100.0 * (n + 1)), J) for n in range(20)),
+        (seen(125), B),
+    ],
+    "two among believed ones are not in a row": [
+        each
+        for step in range(105, 205, 3)
+        for each in ((elsewhere(step), J), (elsewhere(step + 1), J), (seen(step + 2), B))
+    ],
+    "one that follows from neither begins the row anew": [
+        *((elsewhere(step), J) for step in (105, 106)),
+        (elsewhere(107, -100.0), J),
+        *((elsewhere(step), J) for step in (108, 109)),
+        (elsewhere(110), Belief.ANEW),
+    ],
+    "a late one tells of the clocks alone": [
+        (seen(90), B),
+        (seen(105), B),
+        (seen(90, {"backward_us": stamp_us(BACKWARD_NS - S)}), Belief.CLOCK),
+        (seen(104, {"in_force": -1, "state": moved(50.0)}), B),
+        (seen(106), B),
+    ],
+}
+"""Observations after those up to step 104, and the verdict on each."""
+
+
+@pytest.mark.parametrize("heard", HEARD.values(), ids=HEARD)
+def test_a_row_of_observations_is_judged_by_those_before(
+    heard: list[tuple[Observation, Belief]],
+) -> None:
     plausibility = after()
-    verdicts = [judge(plausibility, elsewhere(step)) for step in range(105, 110)]
-    assert verdicts == [
-        *[Belief.JUMP] * (REPEATS - 1),
-        Belief.ANEW,
-        Belief.BELIEVED,
-        Belief.BELIEVED,
-    ]
-    assert judge(plausibility, seen(110)) == Belief.JUMP
-
-
-def test_three_that_do_not_agree_are_not_believed() -> None:
-    plausibility = after()
-    for n, step in enumerate(range(105, 125)):
-        assert judge(plausibility, elsewhere(step, 100.0 * (n + 1))) == Belief.JUMP
-    assert judge(plausibility, seen(125)) == Belief.BELIEVED
-
-
-def test_two_among_believed_ones_are_not_in_a_row() -> None:
-    plausibility = after()
-    for step in range(105, 205, 3):
-        assert judge(plausibility, elsewhere(step)) == Belief.JUMP
-        assert judge(plausibility, elsewhere(step + 1)) == Belief.JUMP
-        assert judge(plausibility, seen(step + 2)) == Belief.BELIEVED
-
-
-def test_an_odd_one_among_those_that_agree_begins_the_row_anew() -> None:
-    """One that follows neither from what is believed nor from what is doubted."""
-    plausibility = after()
-    told = [
-        elsewhere(105),
-        elsewhere(106),
-        elsewhere(107, -100.0),
-        elsewhere(108),
-        elsewhere(109),
-    ]
-    assert all(judge(plausibility, each) > Belief.BELIEVED for each in told)
-    assert judge(plausibility, elsewhere(110)) == Belief.ANEW
-
-
-def test_a_late_observation_tells_of_the_clocks_alone() -> None:
-    """Its horizon and its state are of before; what is held against the next is the newest."""
-    plausibility = after()
-    assert judge(plausibility, seen(90)) == Belief.BELIEVED
-    assert judge(plausibility, seen(105)) == Belief.BELIEVED
-    early = seen(90, {"backward_us": stamp_us(BACKWARD_NS - S)})
-    assert judge(plausibility, early) == Belief.CLOCK
-    assert judge(plausibility, seen(104, {"in_force": -1, "state": moved(50.0)})) == Belief.BELIEVED
-    assert judge(plausibility, seen(106)) == Belief.BELIEVED
+    assert [judge(plausibility, told) for told, _ in heard] == [verdict for _, verdict in heard]
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:

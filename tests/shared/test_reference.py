@@ -121,21 +121,15 @@ def test_square_keeps_to_its_edge_at_one_speed(t: float) -> None:
     assert np.linalg.norm(v) == pytest.approx(1.0)
 
 
-def test_waypoints_are_passed_at_constant_speed() -> None:
+def test_waypoints_are_passed_at_constant_speed_from_rest_to_rest() -> None:
     desired = reference.waypoints(ROUTE, 2.0)
+    assert sample(desired, -1.0) == ([0.0, 0.0], [0.0, 0.0])
     assert sample(desired, 0.0) == ([0.0, 0.0], pytest.approx([1.2, 1.6]))
     assert sample(desired, 1.25) == (pytest.approx([1.5, 2.0]), pytest.approx([1.2, 1.6]))
     assert sample(desired, 3.0) == (pytest.approx([3.0, 5.0]), [0.0, 2.0])
     assert sample(desired, 4.5) == (pytest.approx([1.0, 6.0]), [-2.0, 0.0])
-
-
-@pytest.mark.parametrize("t", [5.5, 5.6, 1000.0])
-def test_waypoints_end_at_rest(t: float) -> None:
-    assert sample(reference.waypoints(ROUTE, 2.0), t) == ([-1.0, 6.0], [0.0, 0.0])
-
-
-def test_waypoints_begin_at_rest() -> None:
-    assert sample(reference.waypoints(ROUTE, 2.0), -1.0) == ([0.0, 0.0], [0.0, 0.0])
+    for t in (5.5, 5.6, 1000.0):
+        assert sample(desired, t) == ([-1.0, 6.0], [0.0, 0.0])
 
 
 def test_looped_waypoints_fly_home_and_on() -> None:
