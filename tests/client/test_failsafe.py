@@ -614,26 +614,24 @@ def test_the_last_clamp_bounds_value_and_change(
     assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, told=wanted) == flown
 
 
-def test_the_last_clamp_keeps_braking_from_speeding_up() -> None:
-    """Along the way that was chosen; what is over by rounding alone stays as it is."""
-
-    def slowed(wanted: list[float], speed_max: float) -> list[float] | None:
-        """Input without feedback, after slowing down."""
-        at_rest, loose = [0.0, 0.0], [9.0, 9.0]
-        return clamped(wanted, at_rest, loose, 9.0, told=wanted, speed_max=speed_max)
-
-    assert slowed([3.0, 4.0], 2.5) == pytest.approx([1.5, 2.0])
-    assert slowed([3.0, 4.0], 5.0 - 1e-12) == [3.0, 4.0]
-    assert slowed([3.0, 4.0], 0.0) == [0.0, 0.0]
-
-
-def test_the_last_clamp_lets_feedback_through_while_braking() -> None:
-    """What is told is slowed from 5 to 2.5 m/s; the 1 m/s of feedback on top of it stays."""
+@pytest.mark.parametrize(
+    ("wanted", "told", "speed_max", "flown"),
+    [
+        ([3.0, 4.0], [3.0, 4.0], 2.5, [1.5, 2.0]),
+        ([3.0, 4.0], [3.0, 4.0], 5.0 - 1e-12, [3.0, 4.0]),
+        ([3.0, 4.0], [3.0, 4.0], 0.0, [0.0, 0.0]),
+        ([2.0, 4.0], [3.0, 4.0], 2.5, [0.5, 2.0]),
+        ([2.0, 4.0], [0.0, 0.0], 0.0, [2.0, 4.0]),
+        ([2.0, 4.0], [np.nan, 0.0], 0.0, None),
+    ],
+    ids=["along its way", "over by rounding", "to rest", "with feedback", "feedback alone", "nan"],
+)
+def test_the_last_clamp_keeps_braking_from_speeding_up_but_for_feedback(
+    wanted: list[float], told: list[float], speed_max: float, flown: list[float] | None
+) -> None:
     loose = [0.0, 0.0], [9.0, 9.0], 9.0
-    flown = clamped([2.0, 4.0], *loose, told=[3.0, 4.0], speed_max=2.5)
-    assert flown == pytest.approx([0.5, 2.0])
-    assert clamped([2.0, 4.0], *loose, told=[0.0, 0.0], speed_max=0.0) == [2.0, 4.0]
-    assert clamped([2.0, 4.0], *loose, told=[np.nan, 0.0], speed_max=0.0) is None
+    found = clamped(wanted, *loose, told=told, speed_max=speed_max)
+    assert found == (flown and pytest.approx(flown))
 
 
 @pytest.mark.parametrize("clamps", [True, False])
