@@ -74,7 +74,7 @@ class Hand(ByHand):
         """Say that the server lives."""
         self.say(Heartbeat(4, self.session, 1, Idle.PLANS, 0))
 
-    def horizon(
+    def plan(
         self,
         made_for: int | None = None,
         *,
@@ -109,7 +109,7 @@ class Hand(ByHand):
             if beats and self.step % 5 == 0:
                 self.heartbeat()
             if plans:
-                self.horizon()
+                self.plan()
 
     said: list[Observation]
     out: list[Message]
@@ -175,7 +175,7 @@ def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> No
     assert (hand.mode, hand.takes, hand.speed) == (Mode.HOVER, False, 0.0)
     hand.fly(1.0)
     assert (hand.mode, hand.takes) == (Mode.HOVER, True)
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 
@@ -191,7 +191,7 @@ def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
     assert hand.client.dropped[Drop.NOT_TAKEN] == 49
     hand.fly(0.04)
     assert (hand.mode, hand.takes) == (Mode.READY, True)
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
     modes = [(Mode(mode), Reason(reason)) for mode, reason in zip(*modes_of(hand), strict=True)]
@@ -234,7 +234,7 @@ def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
     """The server reckoned that it would stand still."""
     hand = Hand()
     hand.fly(1.2)
-    hand.horizon(observed=30)
+    hand.plan(observed=30)
     hand.fly(0.02)
     assert hand.mode is Mode.READY
     assert hand.client.dropped[Drop.NOT_TAKEN] == 1
@@ -256,7 +256,7 @@ def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
     told = hand.changes
     hand.fly(1.1)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
     assert hand.changes == told
@@ -274,7 +274,7 @@ def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() ->
         ("brake", str(Reason.OLD)),
         ("hover", str(Reason.OLD)),
     ]
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 
@@ -284,7 +284,7 @@ def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> Non
     wind = [0.4, -0.3]
     hand = Hand(control={"feedback": True}, vehicle={"steady_wind_mps": wind})
     hand.fly(1.2)
-    hand.horizon(gain=(8.0, 2.0))
+    hand.plan(gain=(8.0, 2.0))
     hand.fly((D + H) / STEPS_PER_S + 0.1)
     assert hand.mode is Mode.BRAKE
     hand.fly(0.4)
@@ -303,7 +303,7 @@ def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
     """A compensator that tells full speed again after the last input is kept from it."""
     hand = Hand(control={"feedback": True})
     hand.fly(1.2)
-    hand.horizon(gain=(0.0, 0.0))
+    hand.plan(gain=(0.0, 0.0))
     hand.fly((D + H) / STEPS_PER_S + 0.3)
     braked = hand.speed
     assert (hand.mode, 0.2 < braked < 0.8) == (Mode.BRAKE, True)
@@ -365,7 +365,7 @@ def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
     hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
     begun = hand.step
     while hand.mode is not Mode.BRAKE:
-        hand.horizon(hand.step - D - 76)
+        hand.plan(hand.step - D - 76)
         hand.fly(0.02)
         assert hand.step <= begun + 30
     assert hand.step == begun + 26
@@ -377,11 +377,11 @@ def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
     hand = tracking()
     hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
     for _ in range(5):
-        hand.horizon(hand.step - D - 76)
+        hand.plan(hand.step - D - 76)
         hand.fly(0.1)
-        hand.horizon(hand.step - D - 76)
+        hand.plan(hand.step - D - 76)
         hand.fly(0.3)
-        hand.horizon(hand.step - D - 74)
+        hand.plan(hand.step - D - 74)
         hand.fly(0.02)
     assert ("brake", str(Reason.LATE)) not in hand.changes
 
@@ -444,9 +444,9 @@ def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
     hand = tracking()
     for n in range(10):
         if n % 2:
-            hand.horizon(hand.step + H + 10 + n)
+            hand.plan(hand.step + H + 10 + n)
         else:
-            hand.horizon(hand.step + 1, observed=hand.step + 2)
+            hand.plan(hand.step + 1, observed=hand.step + 2)
     hand.fly(0.02, plans=True)
     assert (hand.mode, hand.takes) == (Mode.BRAKE, False)
     assert any(isinstance(each, Hello) for each in hand.out)
@@ -487,7 +487,7 @@ def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon()
     hand.fly(0.02)
     assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, True, NO_HORIZON)
     assert hand.changes[-1] == ("brake", str(Reason.STALLED))
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
 
@@ -581,7 +581,7 @@ def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
 def test_a_vehicle_that_holds_has_no_failsafe() -> None:
     hand = Hand(vehicle={"exhausted": "hold"})
     hand.fly(0.02)
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
     hand.fly((D + H) / STEPS_PER_S + 0.1)
@@ -714,7 +714,7 @@ def test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back(cause:
     hand.fly(0.9, plans=True)
     assert (hand.mode, hand.takes) == (Mode.HOVER, False)
     hand.fly(0.2, plans=True)
-    hand.horizon()
+    hand.plan()
     hand.fly(0.02)
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 

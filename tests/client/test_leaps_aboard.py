@@ -13,7 +13,6 @@ from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0], "wind_mps": 0.5}
-AFTER_LEAP = "vehicle.after_leap"
 
 
 def leapt() -> Air:
