@@ -59,6 +59,17 @@ def test_an_event_has_a_text_and_survives_its_line_of_json(
 
 
 @pytest.mark.parametrize(
+    "line",
+    [
+        *(b"Traceback (most recent call last):", b"\xff", b"[" * 100_000),
+        b'{"process": "client", "time_ns": 5, "event": {"type": "OfAnotherVersion"}}',
+    ],
+)
+def test_a_line_that_is_none_of_the_logs_is_no_event(line: bytes) -> None:
+    assert line_of(line) is None
+
+
+@pytest.mark.parametrize(
     ("host", "text"),
     [
         ("127.0.0.1", "127.0.0.1:5"),
