@@ -11,18 +11,20 @@ import numpy as np
 
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import parse as parse_fault
-from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.client.memory import SavedState, recall
 from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
+from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse
+from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
 
 SAFE: dict[FlavourName, dict[str, float]] = {
@@ -30,6 +32,10 @@ SAFE: dict[FlavourName, dict[str, float]] = {
     "px4": {"COM_OBL_RC_ACT": 4},
 }
 """Parameters with which a vehicle is flown."""
+BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
+ARM, TAKE_OFF, SET_MODE = 400, 22, 176
+"""Numbers of commands."""
+SECOND = 1_000_000_000
 OFFSET_NS = 86_400_000_000_000
 FIGURE = {
     "shape": "figure-eight",
@@ -124,6 +130,19 @@ class Tap(Endpoint):
         return self.inner.events()
 
 
+def altered(kind: str, **fields: Callable[[Any], Any]) -> Callable[[Message], bytes | None]:
+    """A `Tap.alter` that makes other values of fields of a kind of message."""
+
+    def alter(message: Message) -> bytes | None:
+        if message.get_type() != kind:
+            return None
+        for name, change in fields.items():
+            setattr(message, name, change(getattr(message, name)))
+        return Codec(1, 1).encode(message)
+
+    return alter
+
+
 class Air:
     """A flight.
 
@@ -183,7 +202,7 @@ class Air:
         self.world.add("server", server, clock=Clock(OFFSET_NS))
 
     def _client(self, life: int, before: SavedState | None) -> Client:
-        return Client(
+        client = Client(
             self.scenario,
             self.flies,
             server=("netem", 0),
@@ -193,6 +212,8 @@ class Air:
             keeps=True,
             before=before,
         )
+        self._running = Running(client, self.scenario)
+        return client
 
     def restart(self, down_s: float = 1.0, *, remembers: bool = True, **table: Any) -> None:
         """Let the client's process die, and start again after a while.
@@ -231,13 +252,50 @@ class Air:
         self.world.run(lambda: bool(over) or until(), limit_ns=until_ns)
         return (self.world.now_ns - began_ns) / 1e9
 
+    def until(self, so: Callable[[], object], seconds: float) -> float:
+        """Let time pass until something is so, which it must be by then; returns how much [s]."""
+        passed_s = self.run(seconds, lambda: bool(so()))
+        assert so(), self.said("client")[-5:]
+        return passed_s
+
     def fly(self, seconds: float = 60.0) -> None:
-        self.run(seconds, lambda: bool(self.client._pilot.step))
-        assert self.client._pilot.step, [str(event) for _, _, event in self.events]
+        """Let time pass until the pilot flies."""
+        self.until(lambda: self.client._pilot.step, seconds)
 
     def end(self, seconds: float = 120.0) -> None:
-        self.run(seconds, lambda: self.client.finished)
-        assert self.client.finished, self.said("client")[-5:]
+        """Let time pass until the client has ended."""
+        self.until(lambda: self.client.finished, seconds)
+
+    def lands(self, seconds: float = 30.0) -> float:
+        """Let time pass until its motors are disarmed; returns how much [s]."""
+        return self.until(lambda: not self.flight.armed, seconds)
+
+    def close(self, seconds: float = 0.5) -> int:
+        """End the client as a signal does; returns how often it asks for a mode from then on."""
+        before = len(self.commands(SET_MODE))
+        self.world.act("client", self.client.close)
+        self.run(seconds)
+        return len(self.commands(SET_MODE)) - before
+
+    def quiet(self, seconds: float) -> None:
+        """Let time pass, in which the client must send no setpoint."""
+        since_ns = self.world.now_ns
+        self.run(seconds)
+        assert not self.setpoints(since_ns)
+
+    def change(self, **values: object) -> None:
+        """Set keys of the client, as an operator does; `vehicle__report` is `vehicle.report`."""
+        keys = {name.replace("__", "."): value for name, value in values.items()}
+        self.world.act("client", lambda now_ns: self._running.change(keys, now_ns=now_ns))
+
+    def take_over(self) -> None:
+        """Let a pilot have the vehicle."""
+        self.flight.act(FlightMode.PILOT, "Pilot has taken over")
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the failsafe."""
+        return self.client._failsafe.mode
 
     def rows(self) -> Rows:
         return parse(self._sink.getvalue())
@@ -274,6 +332,16 @@ class Air:
     def json(self) -> list[dict[str, Any]]:
         told = [event for _, name, event in self.events if name == "client"]
         return [msgspec.json.decode(msgspec.json.encode(event)) for event in told]
+
+
+def flying(flavour: FlavourName, *faults: str, seconds: float = 1.0, **table: Any) -> Air:
+    """A vehicle in the air that has followed a plan for some seconds."""
+    air = Air(flavour, faults=faults, **{"duration": 60.0} | table)
+    air.fly()
+    air.until(lambda: air.mode is Mode.TRACK, 5.0)
+    air.run(seconds)
+    assert air.mode is Mode.TRACK
+    return air
 
 
 def modes(air: Air) -> list[tuple[str, str]]:

@@ -1,5 +1,6 @@
-"""Missions of a few vehicles, and two that swap places, for tests of what is planned for them."""
+"""Missions of a few vehicles, what came of them, and two that swap places and are planned for."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,14 @@ from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import SentMotion
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.motion import Motion, resting
+from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.mission import swap
+from skytether.shared.scenario.mission import Mission, swap
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Observation
+from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.summary import least_separation
+from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation
 
 DT_S = 0.05
 
@@ -35,7 +39,29 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
 
-def alone() -> MissionPlanner:
+class Decision(MissionPlanner):
+    """Decision for two vehicles, and what it is made by."""
+
+    def __init__(self, fleet: Fleet, state: MissionState) -> None:
+        super().__init__(fleet, state)
+        self.state, self.vehicles = state, state.vehicles
+
+    def hear(self, row: int, step: int, in_force: int, x: float, speed: float = 0.0) -> None:
+        """An observation of a vehicle on the x axis [m, m/s]."""
+        said = observation(step, in_force, (x, 0.0))
+        said.state[0, 1] = speed
+        self.observe(row, said)
+
+    def align(self, step: int) -> None:
+        """Let it be this step of both."""
+        self.state.align(np.arange(2), np.array([step, step]))
+
+    def decide(self, step: int) -> None:
+        """Plan for both at this step."""
+        self.plan(np.arange(2), np.array([step, step]), None)  # type: ignore[arg-type]
+
+
+def alone() -> Decision:
     """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
@@ -43,7 +69,7 @@ def alone() -> MissionPlanner:
     state = MissionState(flown, terms, 2, 2, goals.of, lambda row: row + 1, clock)
     desired = Desired(flown, terms, 2, 2, goals.of)
     fleet = Fleet(flown, terms, 2, 2, clock, desired, goals.of, Stopwatch(), print)
-    return MissionPlanner(fleet, state)
+    return Decision(fleet, state)
 
 
 def exact(vehicles: int) -> ClockMap:
@@ -54,19 +80,84 @@ def exact(vehicles: int) -> ClockMap:
     return clock
 
 
-def ready() -> MissionPlanner:
+def ready() -> Decision:
     """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
     made = alone()
     for row, x in ((0, 4.0), (1, -4.0)):
-        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-        made._state.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
-        made.observe(row, observation(101, 90, (x, 0.0)))
+        made.hear(row, 100, NO_HORIZON, x)
+        made.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
+        made.hear(row, 101, 90, x)
     return made
 
 
-def planned(made: MissionPlanner) -> Motion:
+def planned(made: Decision) -> Motion:
     """Motion that is decided for the first vehicle at step 101."""
-    made.plan(np.arange(2), np.array([101, 101]), None)  # type: ignore[arg-type]
-    motion = made._state.vehicles[0].next
+    made.decide(101)
+    motion = made.vehicles[0].next
     assert motion is not None
     return motion
+
+
+def with_goals(
+    folder: Path, rows: str, scenario: Scenario | str = "swap", **mission: Any
+) -> dict[str, Any]:
+    """Table of a scenario with other goals, which are put into a folder.
+
+    Args:
+        folder: where their file comes to lie.
+        rows: its lines: vehicle, time [s], and place [m]; of three numbers in space.
+        scenario: all else, or the name of a scenario that comes with Skytether.
+        mission: keys of the section that are others.
+    """
+    table = reading.to_table(reading.load(scenario) if isinstance(scenario, str) else scenario)
+    table["model"]["axes"] = rows.partition("\n")[0].count(",") - 1
+    file = folder / "goals.csv"
+    file.write_text(f"vehicle,t,x,y{',z' * (table['model']['axes'] - 2)}\n{rows}")
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table["mission"] |= mission
+    return table
+
+
+def each_of(flown: Record) -> list[Rows]:
+    """Rows of each vehicle."""
+    numbers = np.unique(flown.client["vehicle"])
+    return [flown.client[flown.client["vehicle"] == number] for number in numbers]
+
+
+def separation_m(flown: Record, height_scale: float = 1.0) -> float:
+    """Smallest distance between two vehicles [m]."""
+    told = flown.figures["client"]["by_vehicle"]
+    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
+    least = least_separation(each_of(flown), began_s, DT_S, height_scale)
+    assert least is not None
+    return least
+
+
+def left_m(flown: Record, scenario: Scenario) -> list[float]:
+    """Distance of each vehicle from its last goal at the end [m]."""
+    goals = scenario.make_reference()
+    assert isinstance(goals, Mission)
+    return [
+        float(np.linalg.norm(rows["state"][-1, :, 0] - goals.of(number)(np.array(1e3))[:, 0]))
+        for rows in each_of(flown)
+        for number in [int(rows["vehicle"][0])]
+    ]
+
+
+def clear_m(flown: Record, kept: Zones) -> float:
+    """Smallest distance of a vehicle from a zone, from its first motion on [m]."""
+    least = np.inf
+    for rows in each_of(flown):
+        begins = int(np.argmax(rows["mode"] == Mode.TRACK))
+        least = min(least, kept.clearance(rows["state"][begins:, :, 0]).min())
+    return float(least)
+
+
+def drawn(rng: np.random.Generator, axes: int = 2, knots: int = 0) -> Motion:
+    """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
+    T, knots = SPACING * DT_S, knots or int(rng.integers(1, 17))
+    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, axes)), axis=0)
+    velocity[-1] = 0.0
+    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
+    position = rng.uniform(-4.0, 4.0, axes) + np.vstack([np.zeros((1, axes)), moved])
+    return Motion(int(rng.integers(10)) * SPACING, position, velocity)

@@ -42,7 +42,7 @@ def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
     return round((local_ns - offset_ns) * (1.0 - drift))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.floats(-DRIFT_MAX, DRIFT_MAX),
     st.lists(
@@ -95,7 +95,6 @@ def test_a_clock_that_stood_still_is_right_from_the_next_answer_on() -> None:
 
 @pytest.mark.parametrize("rate", [0.5, 0.95, 1.05, 10.0])
 def test_a_rate_that_cannot_be_followed_is_known(rate: float) -> None:
-    """As of a simulator that runs ten times as fast as time."""
     clock, _ = timed(drift=1.0 - rate, delays=[(MS, MS)] * 12, every_ns=SECOND // 5)
     assert clock.wrong_rate == pytest.approx(rate, rel=0.01)
     followed, _ = timed(drift=DRIFT_MAX, delays=[(MS, MS)] * 12, every_ns=SECOND // 5)
@@ -115,7 +114,6 @@ def test_answers_that_nobody_asked_for_count_for_nothing() -> None:
 
 
 def test_a_clock_that_begins_anew_is_believed_after_three_answers() -> None:
-    """A reboot; one answer that is far off is none."""
     clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * 10)
     heard = []
     for k in range(1, 6):
@@ -140,7 +138,7 @@ def messages() -> st.SearchStrategy[bytes]:
     return st.builds(frame, numbers, st.binary(max_size=255), st.sampled_from([1, 1, 2]))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.tuples(st.binary(max_size=80) | messages(), st.integers(0, 2 * SECOND)), max_size=12
@@ -173,10 +171,9 @@ def test_any_bytes_raise_nothing_and_arm_nothing(
 
 
 @given(st.lists(st.binary(max_size=300), max_size=30))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
     flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
-    assert flies.port is not None
     for piece in pieces:
         flies.port.receive(Datagram(piece, ("line", 0), 1), now_ns=SECOND)
     assert flies.port.outbox() == []

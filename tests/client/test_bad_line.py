@@ -7,7 +7,6 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.condition import Condition
 from skytether.shared.wire.protocol import Mode
 
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 OFF_M = 1.5
 """Distance from the truth below which a position was our autopilot's [m]: others are 30 m away, and
 what is a second old no more than this."""
@@ -51,15 +50,12 @@ def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
     """`python tests/bad_line.py --minutes 60` flies for an hour."""
     compare(flavour, 2, 180.0)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
-    """No command at all is given to a vehicle on the ground whose scenario is not armed."""
     air = OverLine(flavour, 1, armed=False)
     air.run(30.0)
     assert air.client._session.number is not None
@@ -67,7 +63,7 @@ def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
     assert not air.sent(ARM)
     assert not air.sent(SET_MODE)
     assert not air.setpoints_from_client(0)
-    assert air.client._failsafe.mode in (Mode.INIT, Mode.SYNC, Mode.READY)
+    assert air.mode in (Mode.INIT, Mode.SYNC, Mode.READY)
     assert air.client.failure is None
 
 

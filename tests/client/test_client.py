@@ -1,17 +1,16 @@
 """The client as an endpoint: session, steps on its own grid, and flying on alone."""
 
-import io
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+from by_hand import ByHand
 from helpers import packaged
-from skytether.client.endpoint import Client
 from skytether.client.link import HELLO_NS
-from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import (
     Finished,
     Flying,
@@ -23,26 +22,22 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Reason, Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Close,
     Heartbeat,
     Hello,
-    Horizon,
     Idle,
     Message,
     Observation,
     Refusal,
-    Terms,
     Welcome,
-    decode,
     encode,
     stamp_us,
 )
 
-SERVER: Address = ("server", 0)
 OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its session is open")
 """Event of a vehicle that holds its last input for ever: it accepts a horizon at once."""
 
@@ -52,71 +47,16 @@ def scenario(**changes: Any) -> Scenario:
     return packaged("paper-every-step", {"duration": 10.0}, changes)
 
 
-class Server:
-    """A client, and a server that says to it exactly what a test wants it to."""
-
-    def __init__(self, flown: Scenario) -> None:
-        self.terms = flown.terms()
-        self.dt_ns = flown.dt_ns
-        self.sink = io.BytesIO()
-        self.client = Client(
-            flown,
-            simulated(flown, 1),
-            server=SERVER,
-            vehicle=4,
-            boot_id=99,
-            recorder=Recorder(client_columns(flown.model.axes), self.sink),
-        )
-        self.now_ns = 5 * SECOND_NS
-        self.session = 7
-
-    def wake(self) -> list[Message]:
-        """Time passes until the client wants to be woken; what it then says."""
-        due_ns = self.client.next_wake_ns()
-        assert due_ns is not None
-        self.now_ns = max(self.now_ns, due_ns)
-        self.client.wake(now_ns=self.now_ns)
-        said = self.client.outbox()
-        assert {datagram.peer for datagram in said} <= {SERVER}
-        return [decode(datagram.payload, self.terms) for datagram in said]
-
-    def say(self, message: Message) -> None:
-        """One datagram to the client."""
-        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
-
-    def welcome(
-        self,
-        *,
-        boot_id: int = 99,
-        server_boot_id: int = 1,
-        refusal: int = Refusal.ACCEPTED,
-        terms: Terms | None = None,
-    ) -> None:
-        """Open a session, or refuse it."""
-        session, terms = self.session if refusal == Refusal.ACCEPTED else 0, terms or self.terms
-        self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
-
-    def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
-        """A horizon of one constant input, planned from a step that is its own unless told."""
-        age = 0 if observed is None else step - observed
-        inputs = np.full((self.terms.axes, self.terms.horizon), value, np.float32)
-        self.say(Horizon(4, self.session, step, 5678, age, inputs))
-
-    def rows(self) -> Rows:
-        """The record so far."""
-        return parse(self.sink.getvalue())
-
-
-def flying(**changes: Any) -> Server:
+def flying(**changes: Any) -> ByHand:
     """A server that has just welcomed its client."""
-    server = Server(scenario(**changes))
+    server = ByHand(scenario(**changes))
     assert [type(message) for message in server.wake()] == [Hello]
     server.welcome()
     return server
 
 
 def test_hello_is_repeated_until_somebody_answers() -> None:
-    server = Server(scenario())
+    server = ByHand(scenario())
     said = []
     for second in range(4):
         assert server.client.next_wake_ns() == (0 if second == 0 else server.now_ns + HELLO_NS)
@@ -126,7 +66,7 @@ def test_hello_is_repeated_until_somebody_answers() -> None:
 
 def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
     """After `link.connect_s`, before it has flown at all; after 5 s it says that it goes on."""
-    server = Server(scenario(link={"connect_s": 15.0}))
+    server = ByHand(scenario(link={"connect_s": 15.0}))
     for _ in range(30):
         if server.client.finished:
             break
@@ -139,7 +79,7 @@ def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
 
 
 def test_another_scenario_at_the_server_ends_the_client_with_the_difference() -> None:
-    server = Server(scenario())
+    server = ByHand(scenario())
     server.wake()
     server.welcome(terms=server.terms._replace(dt_ns=20_000_000))
     assert server.client.finished
@@ -158,7 +98,7 @@ def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason
     refusal: int, reason: Literal["full", "taken"]
 ) -> None:
     """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
-    server, hellos = Server(scenario(link={"connect_s": 15.0})), 0
+    server, hellos = ByHand(scenario(link={"connect_s": 15.0})), 0
     while not server.client.finished:
         hellos += len(server.wake())
         server.welcome(refusal=refusal)
@@ -180,7 +120,7 @@ def test_a_vehicle_that_hears_its_server_says_no_hello_again() -> None:
 
 
 def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
-    server = Server(scenario())
+    server = ByHand(scenario())
     for refusal in (Refusal.FULL, Refusal.TAKEN, Refusal.ACCEPTED):
         server.wake()
         server.welcome(refusal=refusal)
@@ -261,9 +201,7 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
-    """Observations contain the arrival time minus the message's stamp, for the server's clock
-    map.
-    """
+    """The arrival time minus the message's stamp, for the server's map of the clocks."""
     server = flying()
     epoch_ns = server.now_ns
     (first,) = server.wake()
@@ -278,16 +216,6 @@ def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> No
     assert first.backward_us == stamp_us(-1000)  # of 1234 ns, rounded up
     assert second.backward_us == stamp_us(heard_ns - epoch_ns - 4_321_000) == third.backward_us
     assert (first.heard, second.heard, third.heard) == (1, 2, 2)
-
-
-def test_the_vehicle_hovers_until_its_first_horizon() -> None:
-    server = flying()
-    for step in range(5):
-        (said,) = server.wake()
-        assert isinstance(said, Observation)
-        assert said.step == step
-    assert np.abs(server.rows()["input"]).max() == 0.0
-    assert np.ptp(server.rows()["state"], axis=0).max() == 0.0
 
 
 def test_an_input_is_flown_from_the_step_after_it_came() -> None:
@@ -308,7 +236,7 @@ def test_an_input_is_flown_from_the_step_after_it_came() -> None:
 
 def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> None:
     """The observation of step 0 is stamped 0 then; without a horizon the age is -1."""
-    server = Server(scenario())
+    server = ByHand(scenario())
     server.now_ns = 0
     server.wake()
     server.welcome()
@@ -323,7 +251,6 @@ def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> 
 def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Without a known true state, as on a real vehicle, the estimate is recorded in its place."""
     monkeypatch.setattr(SimulatedVehicle, "truth", lambda _: None)
     server = flying()
     said = [message for _ in range(3) for message in server.wake()]
@@ -379,7 +306,7 @@ def test_a_restarted_server_is_flown_with_in_its_new_session() -> None:
 
 
 def test_an_answer_to_another_life_is_dropped() -> None:
-    server = Server(scenario())
+    server = ByHand(scenario())
     server.wake()
     server.welcome(boot_id=98)
     assert server.client.dropped == {Drop.FOR_ANOTHER_LIFE: 1}
@@ -399,7 +326,6 @@ def test_the_flight_ends_after_its_duration() -> None:
 
 
 def test_an_exhausted_horizon_brakes_or_holds() -> None:
-    """The scenario decides: the paper's flies on for ever, others brake to a hover."""
     speeds = {}
     for exhausted in ("hold", "brake"):
         server = flying(vehicle={"exhausted": exhausted})
@@ -417,7 +343,7 @@ def test_an_exhausted_horizon_brakes_or_holds() -> None:
 
 
 def test_only_the_servers_address_is_heard() -> None:
-    server = Server(scenario())
+    server = ByHand(scenario())
     server.wake()
     welcome = Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, server.terms)
     server.client.receive(Datagram(encode(welcome), ("elsewhere", 1)), now_ns=0)

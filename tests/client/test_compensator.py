@@ -14,7 +14,7 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, Trajectory
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=60)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
@@ -72,31 +72,20 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
     assert chosen(compensator, 1000, HERE).tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("step", range(100, 100 + H))
-def test_stage_is_the_step_since_the_horizon_was_made(step: int) -> None:
-    """Input u(k|k_h): a packet under way for five steps is entered at its fifth stage."""
-    np.testing.assert_allclose(chosen(holding(100), step, HERE), INPUTS[:, step - 100], rtol=1e-7)
+@pytest.mark.parametrize("exhausted", ["hold", "brake"])
+@pytest.mark.parametrize("stage", range(-4, H))
+def test_stage_is_the_step_since_the_horizon_was_made(stage: int, exhausted: str) -> None:
+    """Input u(k|k_h); where the server's idea of the step is ahead, the first is the nearest."""
+    compensator = Compensator(terms(exhausted=exhausted))
+    compensator.offer(horizon(100), 95, 94)
+    flown = chosen(compensator, 100 + stage, HERE)
+    np.testing.assert_allclose(flown, INPUTS[:, max(stage, 0)], rtol=1e-7)
 
 
 @pytest.mark.parametrize("step", [100 + H, 101 + H, 100_000])
 def test_held_horizon_flies_its_last_input_for_ever(step: int) -> None:
     """E10: the paper's min(k, k_h + H - 1)."""
     np.testing.assert_allclose(chosen(holding(100), step, HERE), INPUTS[:, -1], rtol=1e-7)
-
-
-@pytest.mark.parametrize("exhausted", ["hold", "brake"])
-def test_horizon_for_a_later_step_begins_at_once(exhausted: str) -> None:
-    """The server's idea of the step may be ahead: its first input is the nearest there is."""
-    compensator = Compensator(terms(exhausted=exhausted))
-    compensator.offer(horizon(105), 100, 99)
-    np.testing.assert_allclose(chosen(compensator, 101, HERE), INPUTS[:, 0], rtol=1e-7)
-
-
-def test_braking_begins_only_after_the_last_stage() -> None:
-    """The last input is flown for its own step in full."""
-    np.testing.assert_allclose(
-        chosen(holding(100, exhausted="brake"), 99 + H, HERE), INPUTS[:, -1], rtol=1e-7
-    )
 
 
 def test_brake_takes_the_speed_away_at_its_rate() -> None:
@@ -109,7 +98,6 @@ def test_brake_takes_the_speed_away_at_its_rate() -> None:
 @quick
 @given(st.floats(-1.8, 1.8), st.floats(-0.9, 0.9), st.integers(0, 40))
 def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> None:
-    """While braking, the direction of the last input stays, and its speed only falls."""
     compensator = holding(0, np.tile([[x], [y]], H), exhausted="brake")
     last, now, then = (chosen(compensator, H - 1 + i, HERE) for i in (0, later, later + 1))
     assert last[0] * now[1] == pytest.approx(last[1] * now[0], abs=1e-12)
@@ -117,11 +105,6 @@ def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> N
     lost = np.linalg.norm(now) - np.linalg.norm(then)
     assert -1e-12 <= lost <= 0.2 + 1e-12
     assert chosen(compensator, H + 10, HERE).tolist() == [0.0, 0.0]
-
-
-def test_brake_from_a_standstill_stays() -> None:
-    compensator = holding(0, np.zeros((2, H)), exhausted="brake")
-    assert chosen(compensator, H + 3, HERE).tolist() == [0.0, 0.0]
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:
@@ -207,16 +190,12 @@ def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
     assert compensator.since == 110
 
 
-def test_horizon_from_the_future_is_refused() -> None:
+def test_a_horizon_is_from_the_future_where_it_is_more_than_h_steps_ahead() -> None:
     compensator = holding(100)
     with pytest.raises(ProtocolError, match=r"^from the future$"):
         compensator.offer(horizon(111 + H, INPUTS + 0.2), 110, 109)
     assert (compensator.in_force, compensator.stale) == (100, 0)
     np.testing.assert_allclose(chosen(compensator, 103, HERE), INPUTS[:, 3], rtol=1e-7)
-
-
-def test_horizon_of_just_h_steps_ahead_is_taken() -> None:
-    compensator = holding(100)
     compensator.offer(horizon(110 + H), 110, 109)
     assert compensator.in_force == 110 + H
 
@@ -253,7 +232,6 @@ def test_chosen_input_is_the_caller_s_own() -> None:
 def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
     scheme: str, step: int, observed: int, reason: str | None
 ) -> None:
-    """The vehicle flies on with what it holds."""
     compensator = Compensator(terms(scheme=scheme))
     compensator.offer(horizon(95), 96, 95)
     if reason is None:
@@ -323,19 +301,15 @@ def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> Non
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
-def test_without_compensation_the_age_bound_ends_the_input(exhausted: str) -> None:
-    """The paper's scheme of no compensation, too, brakes once what it flies is too old."""
-    compensator = holding(5, np.tile([[0.6], [0.8]], H), scheme="none", exhausted=exhausted)
+@pytest.mark.parametrize("after", [1.0, 0.5])
+def test_without_compensation_the_age_bound_ends_the_first_input(
+    exhausted: str, after: float
+) -> None:
+    """It is held, or braked along at 2 m/s² from 1 m/s, whatever inputs follow it."""
+    inputs = np.tile([[0.6], [0.8]], H) * np.append(1.0, np.full(H - 1, after))
+    compensator = holding(5, inputs, scheme="none", exhausted=exhausted)
     speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
     assert speeds == pytest.approx([1.0, 0.8, 0.6] if exhausted == "brake" else [1.0] * 3, abs=1e-6)
-
-
-def test_without_compensation_the_first_input_is_braked_along_whatever_follows_it() -> None:
-    """At 2 m/s² from 1 m/s; the inputs after it, of 0.5 m/s, are never flown."""
-    inputs = np.concatenate([[[0.6], [0.8]], np.tile([[0.3], [0.4]], H - 1)], axis=1)
-    compensator = holding(5, inputs, scheme="none", exhausted="brake")
-    speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
-    assert speeds == pytest.approx([1.0, 0.8, 0.6], abs=1e-6)
 
 
 @pytest.mark.parametrize("scheme", ["predictive", "committed"])
@@ -343,9 +317,7 @@ def test_without_compensation_the_first_input_is_braked_along_whatever_follows_i
 def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
     scheme: str, d: int
 ) -> None:
-    """The limit is a quarter of the horizon, here two steps; the paper's scheme commits to
-    nothing.
-    """
+    """After a quarter of the horizon, two steps here; the paper's scheme commits to nothing."""
     inputs = np.concatenate([np.zeros((2, d)), INPUTS], axis=1)
     in_time, late = Compensator(terms(scheme=scheme)), Compensator(terms(scheme=scheme))
     in_time.offer(horizon(100, inputs), 102 + d, 99)

@@ -75,9 +75,7 @@ def held_back(scheme: str, seed: int) -> Record:
 def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
     scheme: str, seed: int
 ) -> None:
-    """The fence holds for all schemes, also for a regulator aboard that would remove the
-    correction.
-    """
+    """Of all schemes, also with a regulator aboard that would take the correction away."""
     record = held_back(scheme, seed)
     assert record.client["state"][:, 0, 0].max() <= 1.0
     assert record.client["state"][:, 0, 0].min() < -1.0
@@ -114,16 +112,10 @@ def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
     ("fence", "said"),
     [
         ({"radius_m": 2.0}, r"fence.radius_m.*got 2.*more, for the trajectory asks"),
-        (
-            {"low_m": [-9.0, -9.0], "high_m": [1.5, 9.0]},
-            r"fence.high_m.*higher, for the trajectory",
-        ),
+        ({"low_m": [-9.0, -9.0], "high_m": [1.5, 9.0]}, r"fence.high_m.*higher"),
         ({"low_m": [0.0, -9.0]}, r"fence.low_m.*lower, for the trajectory asks"),
         ({"speed_mps": 0.1, "wind_mps": 0.05}, r"fence.speed_mps.*more, for the trajectory asks"),
-        (
-            {"low_m": [1.0, 1.0], "high_m": [2.0, 2.0]},
-            r"fence.high_m.*more than .* above fence.low_m",
-        ),
+        ({"low_m": [1.0, 1.0], "high_m": [2.0, 2.0]}, r"fence.high_m.*above fence.low_m"),
         ({"radius_m": 0.5}, r"fence.radius_m.*more than"),
         ({"speed_mps": 0.5}, r"fence.wind_mps.*less than 0.5, the vehicle's speed"),
         ({"low_m": [1.0]}, r"fence.low_m.*2 numbers"),

@@ -5,28 +5,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airborne import Air
+from airborne import Air, flying
 from skytether.autopilot.faults import LEAP
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.change import Running
 from skytether.shared.core.events import ModeChanged, StateLeapt
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0], "wind_mps": 0.5}
-AFTER_LEAP = "vehicle.after_leap"
 
 
-def leapt(**table: Any) -> tuple[Air, Running]:
-    """A vehicle in flight whose reported position has just leapt by 12 m, and its keys."""
+def leapt() -> Air:
+    """A vehicle in flight whose reported position has just leapt by 12 m."""
     slow = {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [1.5]}
-    air = Air("ardupilot", duration=90.0, fence=FENCE, model=slow, **table)
-    air.fly()
-    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
-    air.run(2.0)
+    air = flying("ardupilot", seconds=2.0, duration=90.0, fence=FENCE, model=slow)
     air.flight.displaced = LEAP
     air.run(2.0, lambda: bool(air.of(StateLeapt)))
-    return air, Running(air.client, air.scenario)
+    return air
 
 
 def place(air: Air) -> Any:
@@ -34,20 +29,14 @@ def place(air: Air) -> Any:
     return np.array(air.flight.position()[:2])
 
 
-def change(air: Air, running: Running, **values: Any) -> None:
-    """Change keys of the client now; a name has two underscores for its dot."""
-    keys = {key.replace("__", "."): value for key, value in values.items()}
-    running.change(keys, now_ns=air.world.now_ns)
-
-
 def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
     """The fence is 8 m wide and the leap 12 m: the vehicle brakes where it is, and hovers."""
-    air, _ = leapt()
+    air = leapt()
     began = place(air)
     (told,) = air.of(StateLeapt)
     assert told.by_m == pytest.approx(LEAP, abs=0.1)
     air.run(6.0)
-    assert air.client._failsafe.mode is Mode.HOVER
+    assert air.mode is Mode.HOVER
     # Braking from 1.5 m/s at 2 m/s², and what dead time and inertia add.
     assert np.linalg.norm(place(air) - began) < 2.0
     hovered = place(air)
@@ -57,10 +46,10 @@ def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
 
 @pytest.mark.parametrize("armed", [True, False])
 def test_without_a_choice_it_lands(*, armed: bool) -> None:
-    air, running = leapt()
+    air = leapt()
     if not armed:
-        change(air, running, armed=False)
-    lands_s = air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
+        air.change(armed=False)
+    lands_s = air.run(30.0, lambda: air.mode is Mode.LAND)
     assert lands_s == pytest.approx(1.0 + 10.0 + 1.0, abs=1.0)
     last = air.of(ModeChanged)[-1]
     assert (last.after, last.reason) == ("land", str(Reason.LEAPT))
@@ -68,26 +57,24 @@ def test_without_a_choice_it_lands(*, armed: bool) -> None:
 
 def test_arming_again_is_no_choice() -> None:
     """It is refused in words; nothing is flown, and the vehicle lands."""
-    air, running = leapt()
-    change(air, running, armed=False)
+    air = leapt()
+    air.change(armed=False)
     air.run(3.0)
     with pytest.raises(ConfigError, match=r"armed: .*leapt by \(-12.*vehicle.after_leap"):
-        change(air, running, armed=True)
-    air.run(30.0, lambda: air.client._failsafe.mode is Mode.LAND)
-    assert air.client._failsafe.mode is Mode.LAND
+        air.change(armed=True)
+    air.until(lambda: air.mode is Mode.LAND, 30.0)
 
 
 @pytest.mark.parametrize("choice", ["old", "new"])
 def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
     """In the old one where it was; in the new one figure and fence have moved by the leap."""
-    air, running = leapt()
-    change(air, running, armed=False)
+    air = leapt()
+    air.change(armed=False)
     air.run(3.0)
-    change(air, running, armed=True, vehicle__after_leap=choice)
-    air.run(5.0, lambda: air.client._failsafe.mode is Mode.TRACK)
-    assert air.client._failsafe.mode is Mode.TRACK
+    air.change(armed=True, vehicle__after_leap=choice)
+    air.until(lambda: air.mode is Mode.TRACK, 5.0)
     air.run(16.0)
-    assert air.client._failsafe.mode is Mode.TRACK
+    assert air.mode is Mode.TRACK
     estimate = air.rows()["estimate"][-1, :2, 0]
     moved = (0.0, 0.0) if choice == "old" else LEAP[:2]
     np.testing.assert_allclose(estimate, place(air) + moved, atol=0.2)
@@ -97,42 +84,41 @@ def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
 
 
 def test_one_that_stays_hovers_on() -> None:
-    air, running = leapt()
-    change(air, running, vehicle__after_leap="stay")
+    air = leapt()
+    air.change(vehicle__after_leap="stay")
     air.run(20.0)
-    assert air.client._failsafe.mode is Mode.HOVER
-    change(air, running, vehicle__after_leap="old")
+    assert air.mode is Mode.HOVER
+    air.change(vehicle__after_leap="old")
     air.run(3.0)
-    assert air.client._failsafe.mode is Mode.TRACK
+    assert air.mode is Mode.TRACK
 
 
 def test_the_next_leap_asks_again() -> None:
-    air, running = leapt()
+    air = leapt()
     air.run(2.0)
-    change(air, running, vehicle__after_leap="old")
+    air.change(vehicle__after_leap="old")
     air.run(3.0)
-    assert air.client._failsafe.mode is Mode.TRACK
+    assert air.mode is Mode.TRACK
     air.flight.displaced = (0.0, 0.0, 0.0)
     air.run(2.0)
     assert [each.by_m[0] for each in air.of(StateLeapt)] == pytest.approx([-12.0, 12.0], abs=0.1)
-    assert air.client._failsafe.mode is Mode.HOVER
+    assert air.mode is Mode.HOVER
 
 
 def test_nothing_is_chosen_before_a_leap() -> None:
     """Neither in flight nor in a file: it would be chosen without knowing the leap."""
     air = Air("ardupilot")
-    running = Running(air.client, air.scenario)
     with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*before its position has leapt"):
-        change(air, running, vehicle__after_leap="old")
+        air.change(vehicle__after_leap="old")
     with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*chosen in flight"):
         Air("ardupilot", vehicle={"after_leap": "old"})
 
 
 def test_the_chosen_frame_is_that_of_the_origin() -> None:
     """Whoever keeps the origin over a restart keeps the choice with it."""
-    air, running = leapt()
-    change(air, running, vehicle__after_leap="old")
+    air = leapt()
+    air.change(vehicle__after_leap="old")
     assert air.flies.port.positions.origin == pytest.approx(LEAP, abs=0.1)
-    again, running = leapt()
-    change(again, running, vehicle__after_leap="new")
+    again = leapt()
+    again.change(vehicle__after_leap="new")
     assert again.flies.port.positions.origin == pytest.approx((0.0, 0.0, 0.0), abs=0.05)

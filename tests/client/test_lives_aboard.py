@@ -4,16 +4,13 @@ from math import dist
 
 import pytest
 
-from airborne import Air, scenario
+from airborne import ARM, Air, scenario
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
-from skytether.shared.core.change import Running
 from skytether.shared.core.events import Flying
 from skytether.shared.wire.protocol import Mode
 
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
-ARM, SET_MODE = 400, 176
 NORTH_M, EAST_M = 20.0, -12.0
 
 
@@ -41,21 +38,13 @@ def farthest_m(air: Air, seconds: float) -> float:
     return most
 
 
-def say(air: Air, **values: object) -> None:
-    """Say something to the client, as an operator does."""
-    running = Running(air.client, air.scenario)
-    keys = {name.replace("__", "."): value for name, value in values.items()}
-    air.world.act("client", lambda now_ns: running.change(keys, now_ns=now_ns))
-
-
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: FlavourName) -> None:
     """Figure and fence stay where they were: the origin outlives the process."""
     air = away(flavour)
     air.restart(0.3)
     assert farthest_m(air, 12.0) < 3.5
     assert air.client._pilot.step > 300, "steps go on counting"
-    assert air.client._failsafe.mode is Mode.TRACK
+    assert air.mode is Mode.TRACK
     assert not air.of(OriginAwaited)
     assert len(air.commands(ARM)) == 1
 
@@ -71,15 +60,14 @@ def test_without_its_origin_a_vehicle_in_the_air_hovers_until_somebody_says_wher
     assert not air.client._pilot.step
     (awaited,) = air.of(OriginAwaited)
     assert dist(awaited.place[:2], (x, y)) < 1.0
-    say(air, mavlink__origin=[NORTH_M, EAST_M])
+    air.change(mavlink__origin=[NORTH_M, EAST_M])
     air.fly(5.0)
     assert farthest_m(air, 12.0) < 3.5
     with pytest.raises(ConfigError, match=r"the origin is known"):
-        say(air, mavlink__origin=[0.0, 0.0])
+        air.change(mavlink__origin=[0.0, 0.0])
 
 
 def test_where_nobody_says_where_the_origin_is_it_lands_where_it_is() -> None:
-    """After the patience that each step into the air has."""
     air = away("ardupilot", mavlink={"patience_s": 20.0})
     air.restart(1.0, remembers=False)
     air.end(60.0)
@@ -99,7 +87,6 @@ def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
     assert not air.client._pilot.next_ns
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize("down_s", [0.5, 30.0])
 def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     flavour: FlavourName, down_s: float
@@ -107,8 +94,7 @@ def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     """A process that starts is no person: it waits for one, and then takes off."""
     air = away(flavour)
     air.world.stop("client")
-    air.run(40.0, lambda: not air.flight.armed)
-    assert not air.flight.armed, "the autopilot's own failsafe has landed it"
+    air.lands(40.0)
     arms = len(air.commands(ARM))
     air.restart(down_s)
     air.run(20.0)
@@ -116,19 +102,17 @@ def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     assert not air.flight.armed
     (awaited,) = air.of(ArmingAwaited)
     assert awaited.why == "an earlier run of its client has armed it"
-    say(air, armed=True)
+    air.change(armed=True)
     air.fly(30.0)
     assert len(air.commands(ARM)) > arms
 
 
 def test_a_client_that_finds_its_vehicle_landing_arms_nothing_even_without_a_memory() -> None:
-    """It was restarted while the failsafe lands: on disarming it does not take off again."""
     air = away("ardupilot")
     air.world.stop("client")
     air.run(40.0, lambda: air.flight.mode is FlightMode.LAND)
     air.restart(0.5, remembers=False)
-    air.run(60.0, lambda: not air.flight.armed)
-    assert not air.flight.armed
+    air.lands(60.0)
     air.run(10.0)
     assert len(air.commands(ARM)) == 1
     assert air.of(ArmingAwaited)
@@ -139,7 +123,7 @@ def test_a_word_counts_on_the_ground_alone() -> None:
     air = away("ardupilot")
     air.restart(0.3)
     air.run(3.0)
-    say(air, armed=True)
+    air.change(armed=True)
     air.world.stop("client")
     air.run(40.0, lambda: not air.flight.armed)
     air.restart(1.0)

@@ -73,7 +73,6 @@ def test_without_its_memory_two_vehicles_come_nearer_than_asked_for() -> None:
 
 
 def test_what_is_kept_comes_back_as_it_was_by_whichever_clock_it_was_written() -> None:
-    """Times are kept relative to that of writing."""
     for written_ns in (0, NOW_NS, 10**6 * NOW_NS):
         found = SavedState.decode(KEPT.after(written_ns).encode(written_ns), NOW_NS, axes=2)
         assert found == KEPT.after(NOW_NS)
@@ -124,7 +123,6 @@ def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused_or_are_something_kept(content: bytes) -> None:
-    """No other exception comes out of them."""
     with contextlib.suppress(ValueError):
         assert isinstance(SavedState.decode(content, 0, axes=2), SavedState)
 
@@ -145,7 +143,6 @@ def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
 
 
 def test_a_disk_that_fails_keeps_a_vehicle_silent_only_until_the_file_on_it_is_too_old() -> None:
-    """From then on no next life would follow it."""
     memory = ClientMemory(TERMS, 1, KEPT)
     assert memory.boot_id == KEPT.boot_id
     newer = msgspec.structs.replace(KEPT, motion=None)

@@ -163,10 +163,7 @@ def waited_s(flight: Record) -> float:
 
 
 def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where half of its packets are lost; without the repetition it waits for its next report.
-
-    Each flight reports every 4 s.
-    """
+    """Also where half of its packets are lost; without repetition it waits for its next report."""
     keys = QUIET | {"vehicle.report": "periodic(80)", "network.downlink.loss": 0.5, "duration": 20}
     soon = [waited_s(fly(skytether.load("target", seed=seed, **keys))) for seed in range(5)]
     monkeypatch.setattr(reporting, "RETRY_STEPS", 10**6)
@@ -249,7 +246,6 @@ def test_the_demo_takes_a_fifth_of_the_paper_s_packets(
 
 
 def test_summary_counts_both_ways() -> None:
-    """Packets and bytes with 28 of headers each, a second of flight."""
     flown = skytether.fly("demo", duration=10, settle=4)
     s, rows = flown.summary, flown.record.netem
     assert s.packets_per_s == pytest.approx(len(rows) / s.duration_s)

@@ -13,11 +13,9 @@ from skytether.client import vehicles
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import AutopilotRefused, ParametersUnsafe
 from skytether.shared.core.events import ModeChanged
-from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
-BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 6.0], "wind_mps": 0.5}
 RETURNS = {"on_loss": "return", "land_after_s": 3.0}
 MODE_NAMES = {"ardupilot": "RTL", "px4": "AUTO.RTL"}
@@ -38,24 +36,21 @@ def lost(flavour: FlavourName, **keys: Any) -> Air:
     return air
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: FlavourName) -> None:
-    """By the autopilot's own mode; it lands where it was armed, and no higher than its fence."""
     air = lost(flavour, parameters=SAFE[flavour] | LOW[flavour])
     died_ns = air.world.now_ns
     returns_s = air.run(20.0, lambda: air.flight.mode_name == MODE_NAMES[flavour])
     assert [each.after for each in air.of(ModeChanged)][-3:] == ["brake", "hover", "return"]
     assert returns_s == pytest.approx(1.5 + 1.5 + 3.0, abs=1.2)
     quiet_ns = air.world.now_ns + 200_000_000
-    air.run(90.0, lambda: not air.flight.armed)
-    assert not air.flight.armed
+    air.lands(90.0)
     assert not air.setpoints(quiet_ns)
     assert np.hypot(*air.flight.position()[:2]) < 0.7
     rows = parse(air.truth.getvalue())
     places = rows["state"][rows["time_ns"] > died_ns][:, :, 0]
     assert np.abs(places[:, :2]).max() < 8.0
     assert places[:, 2].max() < 6.0
-    assert air.client._failsafe.mode is Mode.RETURN
+    assert air.mode is Mode.RETURN
 
 
 def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
@@ -63,12 +58,10 @@ def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
     air = lost("ardupilot", parameters=SAFE["ardupilot"] | LOW["ardupilot"])
     switch = air.flight.switch
     air.flight.switch = lambda number: Result.FAILED if number == 6 else switch(number)
-    air.run(30.0, lambda: air.flight.mode_name == "LAND")
-    assert air.flight.mode_name == "LAND"
+    air.until(lambda: air.flight.mode_name == "LAND", 30.0)
     assert "failed" in [each.answer for each in air.of(AutopilotRefused)]
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None:
     """Nothing is armed: by default ArduCopter returns at 15 m, and PX4 at 60 m."""
     air = Air(flavour, fence=FENCE, vehicle=RETURNS)
@@ -79,9 +72,7 @@ def test_a_return_higher_than_the_fence_is_refused(flavour: FlavourName) -> None
     assert "fence.high_m" in str(air.client.failure)
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -> None:
-    """A metre below the fence."""
     air = Air(flavour, fence=FENCE, vehicle=RETURNS, sets=True)
     air.run(30.0, lambda: bool(air.flight.armed))
     assert air.flight.armed
@@ -91,11 +82,8 @@ def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -
 
 
 def test_vehicles_of_a_mission_land_straight_down() -> None:
-    """The proof in docs/together.md has it so: a return is refused in words."""
-    table = reading.to_table(reading.load("swap"))
-    table["vehicle"] |= {"on_loss": "return"}
     with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*lands straight down"):
-        reading.check(table, "swap")
+        packaged("swap", vehicle={"on_loss": "return"})
 
 
 def test_only_a_vehicle_that_can_return_is_told_to() -> None:

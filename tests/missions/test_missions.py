@@ -16,6 +16,7 @@ from scipy import sparse
 
 from bench import missions
 from bench.missions import MortalServer, PublishedOptions
+from helpers import packaged, refusal
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
@@ -42,42 +43,32 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.scenario import reading, zones
-from skytether.shared.scenario.mission import Mission, swap
+from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
-from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation, Trajectory
 from skytether.sim import flight
-from two_vehicles import DT_S, alone, exact, observation, planned, ready, scenario
+from two_vehicles import (
+    DT_S,
+    alone,
+    clear_m,
+    drawn,
+    each_of,
+    exact,
+    left_m,
+    observation,
+    planned,
+    ready,
+    scenario,
+    separation_m,
+    with_goals,
+)
 
 LOST = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
-
-
-def each_of(flown: Record) -> list[Rows]:
-    """Rows of each vehicle."""
-    numbers = np.unique(flown.client["vehicle"])
-    return [flown.client[flown.client["vehicle"] == number] for number in numbers]
-
-
-def separation_m(flown: Record, height_scale: float = 1.0) -> float:
-    """Smallest distance between two vehicles [m]."""
-    told = flown.figures["client"]["by_vehicle"]
-    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
-    least = least_separation(each_of(flown), began_s, DT_S, height_scale)
-    assert least is not None
-    return least
-
-
-def left_m(flown: Record, vehicles: int) -> list[float]:
-    """Distance of each vehicle from its goal at the end [m]."""
-    goals = swap(vehicles, 4.0, 2)
-    return [
-        float(np.linalg.norm(rows["state"][-1, :, 0] - goals.of(number)(np.array(1e3))[:, 0]))
-        for number, rows in enumerate(each_of(flown), start=1)
-    ]
 
 
 # -- motions and their QP -------------------------------------------------------------------------
@@ -85,7 +76,6 @@ def left_m(flown: Record, vehicles: int) -> list[float]:
 
 @given(st.integers(1, 15), st.integers(0, 2**31), st.integers(-5, 200))
 def test_a_motion_is_the_spline_that_is_sent(knots: int, seed: int, step: int) -> None:
-    """Aboard the cubic through its knots is that very motion, and rests behind the last."""
     rng = np.random.default_rng(seed)
     velocity = np.vstack([rng.uniform(-1, 1, (knots - 1, 1)), np.zeros((1, 1))])
     T = SPACING * DT_S
@@ -112,7 +102,6 @@ def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
     least[:equal] = rows[:equal] @ inside
     columns = np.ascontiguousarray(rows.T)
     found = DualActiveSet(hessian).solve(linear, columns, least, equal)
-    assert found is not None
     assert (rows @ found - least).min() > -1e-8
     assert np.abs(rows[:equal] @ found - least[:equal]).max() < 1e-8
     most = np.full(m, np.inf)
@@ -175,7 +164,6 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
 def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
     name: str, velocity: list[float], goal: list[float], speed_mps: float
 ) -> None:
-    """The QP of all axes at once has the same knots."""
     terms = reading.load(name).terms()
     axes, plan = terms.axes, TrajectoryQP(terms, 0.6, speed_mps)
     p, v = np.array([[0.3, -2.0, 1.0][:axes]]), np.array([velocity[:axes]])
@@ -193,25 +181,15 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 # -- distances of motions --------------------------------------------------------------------------
 
 
-def drawn(rng: np.random.Generator, knots: int, axes: int = 2) -> Motion:
-    """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
-    T = SPACING * DT_S
-    velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, axes)), axis=0)
-    velocity[-1] = 0.0
-    moved = np.cumsum(0.5 * T * (velocity[1:] + velocity[:-1]), axis=0)
-    position = rng.uniform(-4.0, 4.0, axes) + np.vstack([np.zeros((1, axes)), moved])
-    return Motion(int(rng.integers(10)) * SPACING, position, velocity)
-
-
 @given(st.integers(0, 2**31), st.integers(0, 60))
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
     """Also those that boxes around them tell apart; near already, one need only come no nearer."""
     rng = np.random.default_rng(seed)
     scale, keep_m, off_m = np.array([1.0, 0.7]), 1.5, 0.02
-    motion, base, *others = (drawn(rng, int(rng.integers(1, 17))) for _ in range(12))
+    motion, base, *others = (drawn(rng) for _ in range(12))
     flown = PossibleMotions(scale, DT_S)
     for row, other in enumerate(others):
-        flown.replace(row, [PossibleMotion(drawn(rng, 5))])  # which is replaced by others
+        flown.replace(row, [PossibleMotion(drawn(rng, knots=5))])  # which is replaced by others
         flown.replace(row, [PossibleMotion(other)] * 2, 0.1 * row)
     flown.replace(3, [])
 
@@ -257,7 +235,6 @@ def test_a_motion_that_lands_has_a_box_down_to_the_ground() -> None:
 
 @pytest.mark.parametrize(("begin", "end"), [(0, 20), (3, 20), (0, 21), (20, 20), (30, 20)])
 def test_no_piece_begins_after_a_motion_has_come_to_rest(begin: int, end: int) -> None:
-    """The pieces follow each other, and the last one reaches its end; at rest there is one."""
     steps = pieces_of(begin, end)
     assert steps[0] == begin
     assert steps[-1] >= end
@@ -269,9 +246,8 @@ def test_no_piece_begins_after_a_motion_has_come_to_rest(begin: int, end: int) -
 def test_vehicles_that_may_land_come_too_near_below_their_motions(
     seed: int, lands: int, others_land: int
 ) -> None:
-    """From the step on at which each may begin to, and in the end wherever they are."""
     rng, scale, keep_m = np.random.default_rng(seed), np.array([1.0, 1.0, 0.5]), 1.0
-    up, each = np.array([0.0, 0.0, 9.0]), (drawn(rng, 13, 3), drawn(rng, 13, 3))
+    up, each = np.array([0.0, 0.0, 9.0]), (drawn(rng, 3, knots=13), drawn(rng, 3, knots=13))
     motion, other = (low._replace(position=low.position + up) for low in each)
     flown = PossibleMotions(scale, DT_S)
     flown.add(1, PossibleMotion(other, others_land))
@@ -340,8 +316,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
-    """It is in force, may still be taken, or is known to be lost."""
-    made, vehicle = alone()._state, VehicleMotions()
+    made, vehicle = alone().state, VehicleMotions()
     made.vehicles[0] = vehicle
     assert made.observe(0, observation(5, NO_HORIZON, (4.0, 0.0)))
     first, second = resting(10, np.array([4.0, 0.0])), resting(40, np.array([3.0, 0.0]))
@@ -361,7 +336,7 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
     """Its steps are smaller, so time would never tell; one that goes on tells by its motion."""
-    made, place = alone()._state, np.array([4.0, 0.0])
+    made, place = alone().state, np.array([4.0, 0.0])
     for in_force, left in ((NO_HORIZON, 0), (900, 1)):
         vehicle = made.vehicles[0] = VehicleMotions()
         vehicle.in_force = SentMotion(900, resting(900, place))
@@ -377,19 +352,16 @@ def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> Non
 
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
 def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) -> None:
-    """D = separation_m + 2 tube_m.
-
-    From one that was outside its tube the distance is as much larger.
-    """
+    """D = separation_m + 2 tube_m, and as much larger from one that was outside its tube."""
     made, flown = alone(), scenario(2)
     for row, x in ((0, 4.0), (1, -4.0)):
-        made.observe(row, observation(100, NO_HORIZON, (x, 0.0)))
-    made._state.align(np.arange(2), np.array([100, 100]))
-    made._state.vehicles[1].outside_m = 0.1
-    made._state.update_possible()
+        made.hear(row, 100, NO_HORIZON, x)
+    made.align(100)
+    made.vehicles[1].outside_m = 0.1
+    made.state.update_possible()
     keep_m = flown.clearances.apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
-    planned = made._state.possible_motion(0, near)
+    planned = made.state.possible_motion(0, near)
     assert made._conflicts(0, near, planned).tolist() == [False, is_hit, False]
 
 
@@ -397,28 +369,26 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
 def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
     """Though it may fly straight: it is still passing somebody. Bit by bit it turns back."""
     made = ready()
-    made._state.vehicles[0].turned_rad = turned
+    made.vehicles[0].turned_rad = turned
     end = planned(made).position[-1]
     assert end[0] < 3.0  # on its way from x = 4 m to -4 m
     assert (end[1] > 0.5) == (turned > 0.0)
-    assert made._state.vehicles[0].turned_rad == max(0.0, turned - waypoints.TURN_BACK)
+    assert made.vehicles[0].turned_rad == max(0.0, turned - waypoints.TURN_BACK)
 
 
 @pytest.mark.parametrize(("until", "yields"), [(0, True), (-1, False)])
 def test_a_vehicle_yields_up_to_its_last_step(until: int, yields: bool) -> None:
-    """One step later it flies to its own goal again, though the other has not passed."""
     made = ready()
     place = np.array([4.0, 3.0])
-    made._state.vehicles[0].yielding = yielding.Yielding(place, asker=1, until=until)
+    made.vehicles[0].yielding = yielding.Yielding(place, asker=1, until=until)
     end = planned(made).position[-1]
-    assert (made._state.vehicles[0].yielding is not None) == yields
+    assert (made.vehicles[0].yielding is not None) == yields
     assert (end[1] > 0.5, end[0] < 3.5) == (yields, not yields)
 
 
 def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
-    """The very same one, from the first step on after a third of that age."""
     made = ready()
-    vehicle, last = made._state.vehicles[0], 90 + made._resend_after
+    vehicle, last = made.vehicles[0], 90 + made._resend_after
     assert made._may_plan(0, vehicle, last)
     assert vehicle.next is None
     assert not made._may_plan(0, vehicle, last + 1)
@@ -426,26 +396,23 @@ def test_a_motion_is_sent_again_before_it_is_too_old_to_be_flown() -> None:
 
 
 def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
-    """Until that motion is over, however long it may be."""
     made = alone()
-    made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
-    made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._state.vehicles[0].in_force = SentMotion(90, resting(100, np.array([4.0, 0.0])))
+    made.hear(0, 100, NO_HORIZON, 4.0)
+    made.hear(1, 100, 70, -4.0)
+    made.vehicles[0].in_force = SentMotion(90, resting(100, np.array([4.0, 0.0])))
     over = 70 + LONGEST  # the last step of the longest motion
     for step, seen, plans in (
         (111, 111, False),
         (over + 1, over, False),
         (over + 11, over + 1, True),
     ):
-        made.observe(0, observation(step, 90, (4.0, 0.0)))
-        made.observe(1, observation(seen, 70, (-4.0, 0.0)))
-        rows, steps = np.arange(2), np.array([step, step])
-        made.plan(rows, steps, None)  # type: ignore[arg-type]
-        assert (made._state.vehicles[0].next is not None) == plans
+        made.hear(0, step, 90, 4.0)
+        made.hear(1, seen, 70, -4.0)
+        made.decide(step)
+        assert (made.vehicles[0].next is not None) == plans
 
 
 def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
-    """One step later than `link.join_s` it is refused."""
     terms = scenario(2).terms()
     knots = np.zeros((2, 1, 2), np.float32)
     told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
@@ -502,7 +469,6 @@ def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
 
 
 def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
-    """It is said once in that time; whoever comes nearer, or has another goal, is not stuck."""
     vehicle, goal = VehicleMotions(), np.array([4.0, 0.0])
     patience = vehicle_motions.PATIENCE_STEPS
     assert not vehicle.is_stuck(0, goal, 10.0)
@@ -521,9 +487,8 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
         made, x = alone(), -4.0
         for step in steps:
             x += 0.5
-            made.observe(1, observation(step, 70, (x, 0.0)))
-            vehicle = made._state.vehicles[1]
-            assert vehicle.in_force is not None
+            made.hear(1, step, 70, x)
+            vehicle = made.vehicles[1]
             rests_x = x if step != steps[-1] else x - 0.5
             assert vehicle.in_force.motion.position[-1].tolist() == [rests_x, 0.0]
             assert vehicle.is_foreign == (step <= until)
@@ -531,7 +496,7 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
 
 def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
     """It comes to rest v (τ + v / 2b) further on than where it was seen."""
-    made, terms = alone()._state, scenario(2).terms()
+    made, terms = alone().state, scenario(2).terms()
     made.absent.clear()
     moving = observation(100, NO_HORIZON, (4.0, 0.0))
     moving.state[0, 1] = 0.5
@@ -542,7 +507,7 @@ def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
 
 def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
     """A motion that was sent and may still be taken leads away from where it is."""
-    made = alone()._state
+    made = alone().state
     made.vehicles[1] = vehicle = VehicleMotions()
     vehicle.in_force = SentMotion(-100, resting(-100, np.array([1.0, 0.0])))
     assert len(made.resting_places(0)) == 1
@@ -574,10 +539,10 @@ def test_who_gets_a_motion_again_says_so_again() -> None:
 
 @pytest.mark.parametrize(("loss", "within_s"), [(0.0, 30.0), (0.3, 60.0)])
 def test_vehicles_swap_places_and_keep_apart(loss: float, within_s: float) -> None:
-    """Eight of them, in wind; all arrive, and nobody leaves its tube."""
-    flown = flight.fly(scenario(8, loss, duration=within_s), vehicles=8)
+    swaps = scenario(8, loss, duration=within_s)
+    flown = flight.fly(swaps, vehicles=8)
     assert separation_m(flown) > 0.5
-    assert max(left_m(flown, 8)) < 0.3
+    assert max(left_m(flown, swaps)) < 0.3
     assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
 
 
@@ -585,11 +550,12 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ablation: sent once each, most are lost, or their acknowledgements, and vehicles are slow."""
+    swaps = scenario(4, 0.5, duration=40.0)
 
     def left_over_m() -> float:
-        flown = flight.fly(scenario(4, 0.5, duration=40.0), vehicles=4)
+        flown = flight.fly(swaps, vehicles=4)
         assert separation_m(flown) > 0.5
-        return max(left_m(flown, 4))
+        return max(left_m(flown, swaps))
 
     assert left_over_m() < 0.3
     monkeypatch.setattr(vehicle_motions, "COPIES_MAX", 1)
@@ -597,7 +563,6 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
 
 
 def test_a_link_that_is_cut_leaves_them_apart() -> None:
-    """Whenever it is: each flies its motion to the end."""
     for cut_s in (4.0, 6.3):
         swaps = scenario(6, duration=25.0)
         flown = flight.fly(swaps, vehicles=6, changes=[(cut_s, LOST)])
@@ -619,12 +584,13 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
         return real(clock, rows, now_ns) + steps * (rows % 2)
 
     monkeypatch.setattr(ClockMap, "steps", mistaken)
-    flown = flight.fly(scenario(8, duration=30.0), vehicles=8)
+    swaps = scenario(8, duration=30.0)
+    flown = flight.fly(swaps, vehicles=8)
     counts = flown.figures["server"]["counts"]
     assert separation_m(flown) > 0.5
     assert "left_tube" not in counts
     if abs(steps) == 5:
-        assert max(left_m(flown, 8)) < 0.3
+        assert max(left_m(flown, swaps)) < 0.3
     else:
         assert counts["horizons_lost"] > 20
 
@@ -633,7 +599,6 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
 @pytest.mark.parametrize("keys", [{}, {"loss": 0.5}, {"loss": 0.3, "burst_s": 2.0}], ids=str)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_sixteen_swap_places_over_the_worst_networks(keys: dict[str, float], seed: int) -> None:
-    """Half of all packets lost, or bursts of two seconds: nobody comes too near."""
     flown = flight.fly(scenario(16, duration=60.0, seed=seed, **keys), vehicles=16)
     assert separation_m(flown) > 0.5
 
@@ -688,7 +653,7 @@ def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
     server = MortalServer(swaps, 8, [(6.0, 7.5), (14.0, 30.0), (36.0, 38.0)])
     flown = flight.fly(swaps, vehicles=8, server=server)
     assert separation_m(flown) > 0.5
-    assert max(left_m(flown, 8)) < 0.3
+    assert max(left_m(flown, swaps)) < 0.3
 
 
 class HardOfHearing(Server):
@@ -745,15 +710,6 @@ def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch
 # -- zones -----------------------------------------------------------------------------------------
 
 
-def clear_m(flown: Record, kept: Zones) -> float:
-    """Smallest distance of a vehicle from a zone, from its first motion on [m]."""
-    least = np.inf
-    for rows in each_of(flown):
-        begins = int(np.argmax(rows["mode"] == Mode.TRACK))
-        least = min(least, kept.clearance(rows["state"][begins:, :, 0]).min())
-    return float(least)
-
-
 @pytest.mark.parametrize(
     ("name", "within_s"),
     [
@@ -763,14 +719,11 @@ def clear_m(flown: Record, kept: Zones) -> float:
     ],
 )
 def test_missions_that_come_with_it(name: str, within_s: float) -> None:
-    """All arrive, apart from each other and from what is in their way."""
     shorter = msgspec.structs.replace(reading.load(name), duration=within_s)
     flown = flight.fly(shorter, vehicles=len(mission_of(name).vehicles))
     assert separation_m(flown) > 0.5
     assert clear_m(flown, reading.load(name).zones) > 0.0
-    for rows in each_of(flown):
-        goal = mission_of(name).of(int(rows["vehicle"][0]))(np.array(1e3))[:, 0]
-        assert np.linalg.norm(rows["state"][-1, :, 0] - goal) < 0.3
+    assert max(left_m(flown, shorter)) < 0.3
     assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
 
 
@@ -784,7 +737,7 @@ def mission_of(name: str) -> Mission:
 def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
     """For downwash; a zone is flown around at its own heights alone."""
     rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
-    table = in_space(tmp_path, rows, height_m=1.0, zones="box(-1, 1, -4, 1, 1.8, 3)")
+    table = with_goals(tmp_path, rows, height_m=1.0, zones="box(-1, 1, -4, 1, 1.8, 3)")
     high = reading.check(table | {"duration": 30.0}, "high")
     flown = flight.fly(high, vehicles=2)
     one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
@@ -800,10 +753,7 @@ def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) ->
 
 def test_vehicles_on_a_sphere_swap_places_through_its_centre() -> None:
     """Six of them; the distance that is kept is that of the ellipsoid of `mission.height_m`."""
-    table = reading.to_table(reading.load("sphere"))
-    table |= {"duration": 25.0}
-    table["reference"]["shape"] = "sphere(6)"
-    sphere = reading.check(table, "sphere")
+    sphere = packaged("sphere", duration=25.0, reference={"shape": "sphere(6)"})
     goals = sphere.make_reference()
     assert isinstance(goals, Mission)
     centre = np.array([0.0, 0.0, sphere.reference.altitude_m])
@@ -812,15 +762,11 @@ def test_vehicles_on_a_sphere_swap_places_through_its_centre() -> None:
     assert begins + ends == pytest.approx(np.tile(2.0 * centre, (6, 1)))
     flown = flight.fly(sphere, vehicles=6)
     assert separation_m(flown, sphere.mission.height_scale) > 0.5
-    for rows, end in zip(each_of(flown), ends, strict=True):
-        assert np.linalg.norm(rows["state"][-1, :, 0] - end) < 0.3
-    table["model"]["axes"] = 2
-    with pytest.raises(ConfigError, match=r"model\.axes: got 2, expected 3 with the shape sphere"):
-        reading.check(table, "sphere")
+    assert max(left_m(flown, sphere)) < 0.3
+    assert "model.axes: got 2, expected 3" in refusal(lambda: packaged("sphere", model={"axes": 2}))
 
 
 def test_the_least_distance_counts_heights_less() -> None:
-    """Two vehicles 1 m above each other are 0.5 m apart where 1 m of height counts half."""
     columns = [("step", "i8"), ("mode", "u1"), ("state", "f8", (3, 2))]
     one, other = (np.zeros(3, columns) for _ in range(2))
     for rows in (one, other):
@@ -831,12 +777,11 @@ def test_the_least_distance_counts_heights_less() -> None:
 
 
 def test_a_zone_that_is_drawn_in_flight() -> None:
-    """Vehicles go round it from then on; one that a vehicle may be in is refused, with its name."""
     swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
     drawn = [(3.0, {"mission.zones": zone})]
     flown = flight.fly(swaps, vehicles=2, changes=drawn)
     assert clear_m(flown, zones.parse(zone, 2)) > 0.0
-    assert max(left_m(flown, 2)) < 0.3
+    assert max(left_m(flown, swaps)) < 0.3
     over = [
         (1.0, {"mission.zones": zone}),
         (3.0, {"mission.zones": "cylinder(4, 0, 1)"}),
@@ -861,10 +806,10 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     table = reading.to_table(keys)
     table["mission"]["zones"] = "box(-0.5, 0.5, -4, 4)"
     walled = reading.check(table, "walled")
-    assert max(left_m(flight.fly(walled, vehicles=2), 2)) < 0.3
+    assert max(left_m(flight.fly(walled, vehicles=2), walled)) < 0.3
     monkeypatch.setattr(Routes, "way", lambda _, __, goal: goal[None])
     flown = flight.fly(walled, vehicles=2)
-    assert max(left_m(flown, 2)) > 3.0
+    assert max(left_m(flown, walled)) > 3.0
     assert clear_m(flown, walled.zones) > 0.0
 
 
@@ -876,13 +821,9 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     Unless a vehicle yields, which none does here.
     """
     monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
-    (tmp_path / "goals.csv").write_text(
-        "vehicle,t,x,y\n1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
-    )
-    table = reading.to_table(scenario(4, duration=40.0))
-    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
-    table["mission"]["zones"] = "box(1, 5, -0.2, 0.2)"
-    gap = reading.check(table, "gap")
+    goals = "1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
+    swaps, zone = scenario(4, duration=40.0), "box(1, 5, -0.2, 0.2)"
+    gap = reading.check(with_goals(tmp_path, goals, swaps, zones=zone), "gap")
 
     def left_over_m() -> float:
         flown = flight.fly(gap, vehicles=4)
@@ -911,12 +852,9 @@ def test_a_vehicle_at_its_goal_in_a_gap_yields(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It comes back once the other has passed. Ablation: else that one never gets through."""
-    (tmp_path / "goals.csv").write_text("vehicle,t,x,y\n1,0,0,0\n2,0,-3,0\n2,1,3,0\n")
-    table = reading.to_table(scenario(2, duration=35.0))
-    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
-    walls = "box(-0.5, 0.5, 0.6, 4) & box(-0.5, 0.5, -4, -0.6)"
-    table["mission"]["zones"] = f"fence(-5, 5, -3, 3) & {walls}"
-    gap = reading.check(table, "gap")
+    walls = "fence(-5, 5, -3, 3) & box(-0.5, 0.5, 0.6, 4) & box(-0.5, 0.5, -4, -0.6)"
+    goals, swaps = "1,0,0,0\n2,0,-3,0\n2,1,3,0\n", scenario(2, duration=35.0)
+    gap = reading.check(with_goals(tmp_path, goals, swaps, zones=walls), "gap")
 
     def fly() -> tuple[float, float, float]:
         flown = flight.fly(gap, vehicles=2)
@@ -938,7 +876,6 @@ def test_a_vehicle_at_its_goal_in_a_gap_yields(
 
 @given(st.integers(0, 2**31), st.integers(2, 3))
 def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
-    """The place is clear of the other vehicles and of zones, or there is none."""
     rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
     home, way = rng.uniform(-3, 3, axes), rng.uniform(-3, 3, (3, axes))
     others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
@@ -953,7 +890,6 @@ def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
 
 
 def test_the_first_vehicle_on_a_way_is_asked() -> None:
-    """Not one beside it, nor one that is far ahead, nor one that it leads away from."""
     way = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 9.0]])
     homes = np.array([[2.5, 1.0], [1.5, 0.5], [1.0, -1.5]])
     assert yielding.distance_from_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
@@ -990,7 +926,6 @@ def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
         return yielding.place_to_yield(home, way, way[:1], 0.93, ones, free, Routes(free, 0.2), 0.2)
 
     found = place()
-    assert found is not None
     assert yielding.distance_from_way(way[:1], np.stack([home, found]))[0] == pytest.approx(0.91)
     with mock.patch.object(
         yielding, "_kept_distance", lambda places, *_: np.full(len(places), 0.93)
@@ -1003,31 +938,17 @@ def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
 
 def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
     """With `mission.allocate`; where each begins stays as it is."""
-    file = tmp_path / "goals.csv"
-    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n")
-    table = reading.to_table(reading.load("swap"))
-    table["reference"] |= {"shape": "mission", "file": str(file)}
-    table["mission"]["allocate"] = True
-    found = reading.check(table, "mission")
+    goals = "1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n"
+    found = reading.check(with_goals(tmp_path, goals, allocate=True), "mission")
     ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2)]
     assert ends == [[0.0, 1.0], [9.0, 1.0]]
     assert found.start_m(2).tolist() == [9.0, 0.0]
-    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,9,1\n2,0,9,0\n")
+    fewer = with_goals(tmp_path, "1,0,0,0\n1,5,9,1\n2,0,9,0\n", allocate=True)
     with pytest.raises(ConfigError, match=r"mission\.allocate: .* a goal of each vehicle at each"):
-        reading.check(table, "mission")
+        reading.check(fewer, "mission")
 
 
 # -- landing ---------------------------------------------------------------------------------------
-
-
-def in_space(folder: Path, rows: str, **mission: Any) -> dict[str, Any]:
-    """Table of a scenario of vehicles in space; their goals are put into a folder."""
-    (folder / "goals.csv").write_text(f"vehicle,t,x,y,z\n{rows}")
-    table = reading.to_table(reading.load("swap"))
-    table["model"]["axes"] = 3
-    table["reference"] |= {"shape": "mission", "file": str(folder / "goals.csv")}
-    table["mission"] |= mission
-    return table
 
 
 class CutOff(Server):
@@ -1042,7 +963,6 @@ class CutOff(Server):
             super().receive(datagram, now_ns=now_ns)
 
     def outbox(self) -> list[Datagram]:
-        """See `Endpoint`."""
         sent = super().outbox()
         return [each for each in sent if each.peer[1] != 1 or self.since_s < 5.0]
 
@@ -1052,7 +972,7 @@ def test_nobody_is_below_a_vehicle_that_lands(
 ) -> None:
     """It hears nothing and lands, while another one is to pass below. Ablation: they meet."""
     goals = "1,0,0,0,4\n2,0,-4,0,1\n2,43.2,4,0,1\n"
-    passing = reading.check(in_space(tmp_path, goals) | {"duration": 65.0}, "passing")
+    passing = reading.check(with_goals(tmp_path, goals) | {"duration": 65.0}, "passing")
 
     def fly() -> tuple[float, Rows, Rows]:
         server = CutOff(passing, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=2)
@@ -1087,7 +1007,7 @@ def test_when_a_vehicle_may_begin_to_land(
     before: Mode | None, mode: Mode, lands: int, tmp_path: Path
 ) -> None:
     """10 s of hovering in silence after it was seen to do something else; at once if it hovers."""
-    flown = reading.check(in_space(tmp_path, "1,0,0,0,2\n"), "hover")
+    flown = reading.check(with_goals(tmp_path, "1,0,0,0,2\n"), "hover")
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
     mission = MissionState(flown, flown.terms(), 2, 2, goals.of, lambda row: row + 1, exact(2))
@@ -1117,8 +1037,7 @@ def test_when_a_vehicle_may_begin_to_land(
 def test_nobody_may_rest_above_what_it_must_not_land_on(
     goals: str, zones_text: str, said: str, tmp_path: Path
 ) -> None:
-    """A vehicle or a zone; where nobody ever lands, they may."""
-    table = in_space(tmp_path, goals, zones=zones_text)
+    table = with_goals(tmp_path, goals, zones=zones_text)
     with pytest.raises(ConfigError, match=re.escape(said)):
         reading.check(table, "above")
     table["vehicle"]["land_after_s"] = 0.0
@@ -1127,7 +1046,7 @@ def test_nobody_may_rest_above_what_it_must_not_land_on(
 
 def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Path) -> None:
     """Where it never lands, there may be one."""
-    table = in_space(tmp_path, "1,0,0,0,4\n") | {"duration": 12.0}
+    table = with_goals(tmp_path, "1,0,0,0,4\n") | {"duration": 12.0}
     changes = [(9.0, {"mission.zones": "box(-1, 1, -1, 1, 0, 2)"})]
 
     def refused() -> list[str]:
@@ -1141,7 +1060,7 @@ def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Pat
 
 
 def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
-    table = in_space(tmp_path, "1,0,0,0,1\n2,0,5,0,1\n", goals="goal(2, 0.5, 0, 9)")
+    table = with_goals(tmp_path, "1,0,0,0,1\n2,0,5,0,1\n", goals="goal(2, 0.5, 0, 9)")
     said = "expected a place 0.93 m to the side from the goal of vehicle 1"
     with pytest.raises(ConfigError, match=re.escape(said)):
         reading.check(table, "above")
@@ -1153,18 +1072,17 @@ def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
-    """It goes on with the mission once that is taken back."""
     swaps, elsewhere = scenario(2, duration=30.0), "goal(1, 0, 3)"
     sent = [(0.5, {"mission.goals": elsewhere})]
     flown = flight.fly(swaps, vehicles=2, changes=sent)
     ends = [rows["state"][-1, :, 0] for rows in each_of(flown)]
     assert np.linalg.norm(ends[0] - [0.0, 3.0]) < 0.3
-    assert max(left_m(flown, 2)[1:]) < 0.3
+    assert max(left_m(flown, swaps)[1:]) < 0.3
     assert flown.server is not None
     of_one = flown.server[flown.server["vehicle"] == 1]
     assert of_one["reference"][-1, :, 0].tolist() == [0.0, 3.0]
     flown = flight.fly(swaps, vehicles=2, changes=[*sent, (15.0, {"mission.goals": ""})])
-    assert max(left_m(flown, 2)) < 0.3
+    assert max(left_m(flown, swaps)) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -1174,10 +1092,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
         ("goal(1, 0)", "mission.goals: got 'goal(1, 0)', expected goal(vehicle, x, y)"),
         ("place(1, 0, 0)", "mission.goals: got 'place(1, 0, 0)', expected goal(vehicle, x, y)"),
         ("goal(1, nan, 0)", "mission.goals: got 'goal(1, nan, 0)', expected a place within"),
-        (
-            "goal(1, 7, 7) & goal(2, 7, 7.5)",
-            "got goal(2, 7, 7.5), expected a place 0.93 m from the goal of vehicle 1",
-        ),
+        ("goal(1, 7, 7) & goal(2, 7, 7.5)", "got goal(2, 7, 7.5), expected a place 0.93 m from"),
         ("goal(1, 3.2, 0)", "expected a place 0.93 m from the goal of vehicle 2"),
         ("goal(1, 1.1, 0)", "expected a place 0.23 m from box(-1, 1, -1, 1)"),
     ],
@@ -1185,8 +1100,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
 def test_a_goal_that_cannot_be_is_refused(goals: str, said: str) -> None:
     table = reading.to_table(scenario(2))
     table["mission"] |= {"goals": goals, "zones": "box(-1, 1, -1, 1)"}
-    with pytest.raises(ConfigError, match=re.escape(said)):
-        reading.check(table, "mission")
+    assert said in refusal(lambda: reading.check(table, "mission"))
 
 
 @pytest.mark.parametrize(
@@ -1196,14 +1110,16 @@ def test_goals_as_near_as_they_may_be_are_reached(
     dt_s: float, acceleration_mps2: float, tmp_path: Path
 ) -> None:
     """To each other and to a zone; also where motions bend much between their straight pieces."""
-    table = reading.to_table(scenario(4, duration=60.0))
-    table["mission"] |= {"acceleration_mps2": acceleration_mps2}
-    table["control"]["dt"] = dt_s
-    table["link"] |= {"timeout_s": 20.0, "age_max_s": 20.0}
-    file = tmp_path / "goals.csv"
-    table["reference"] |= {"shape": "mission", "file": str(file)}
-    file.write_text("vehicle,t,x,y\n1,0,0,0\n")
-    clear = reading.check(table, "near").clearances
+    swaps = scenario(4, duration=60.0)
+
+    def made(goals: str, **mission: Any) -> Scenario:
+        mission["acceleration_mps2"] = acceleration_mps2
+        table = with_goals(tmp_path, goals, swaps, **mission)
+        table["control"]["dt"] = dt_s
+        table["link"] |= {"timeout_s": 20.0, "age_max_s": 20.0}
+        return reading.check(table, "near")
+
+    clear = made("1,0,0,0\n").clearances
     half_m, wall_m = 0.5 * clear.planned_apart_m, 0.5 * clear.planned_apart_m
     wall_m += clear.planned_clear_m + 1e-3
     goals = [(x, y) for x in (-half_m - 1e-3, half_m) for y in (-half_m - 1e-3, half_m)]
@@ -1213,22 +1129,17 @@ def test_goals_as_near_as_they_may_be_are_reached(
         for number in range(1, 5)
         for t, (x, y) in ((0, starts[number - 1]), (1, goals[number - 1]))
     ]
-    file.write_text("vehicle,t,x,y\n" + "".join(rows))
-    table["mission"]["zones"] = f"box({-half_m}, {half_m}, {wall_m}, {wall_m + 1})"
-    near = reading.check(table, "near")
+    zone = f"box({-half_m}, {half_m}, {wall_m}, {wall_m + 1})"
+    near = made("".join(rows), zones=zone)
     flown = flight.fly(near, vehicles=4)
     assert separation_m(flown) > near.mission.separation_m
     assert clear_m(flown, near.zones) > 0.0
-    ends = [rows["state"][-1, :, 0] for rows in each_of(flown)]
-    assert np.abs(np.array(ends) - goals).max() < 0.1
+    assert max(left_m(flown, near)) < 0.1
     assert "asides" not in flown.figures["server"]["counts"]
 
 
 def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
-    file = tmp_path / "goals.csv"
-    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,5,3,1\n2,0,4,0\n")
-    table = reading.to_table(reading.load("swap"))
-    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table = with_goals(tmp_path, "1,0,0,0\n1,5,3,1\n2,0,4,0\n")
     mission = reading.check(table, "mission").make_reference(1)
     assert isinstance(mission, Mission)
     assert mission.vehicles == (1, 2)
@@ -1249,10 +1160,8 @@ def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
-    file = tmp_path / "goals.csv"
-    file.write_text(text)
-    table = reading.to_table(reading.load("swap"))
-    table["reference"] |= {"shape": "mission", "file": str(file)}
+    table = with_goals(tmp_path, "1,0,0,0\n")
+    Path(table["reference"]["file"]).write_text(text)
     with pytest.raises(ConfigError, match=said):
         reading.check(table, "mission")
 
@@ -1260,15 +1169,10 @@ def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "key", "value", "said"),
     [
-        ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0, and at most 1.5 s"),
-        (
-            "mission",
-            "height_m",
-            0.4,
-            "mission.height_m: got 0.4, expected 0, or at least mission.separation_m (0.5)",
-        ),
+        ("link", "join_s", 0.0, "link.join_s: got 0.0, expected more than 0"),
+        ("mission", "height_m", 0.4, "expected 0, or at least mission.separation_m (0.5)"),
         ("link", "join_s", 2.0, "link.join_s: got 2.0, expected more than 0, and at most 1.5 s"),
-        ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s on a mission"),
+        ("link", "timeout_s", 2.0, "link.timeout_s: got 2.0, expected at least 7.5 s"),
         ("control", "trigger", "always", "control.trigger: got 'always', expected 'expected_gap'"),
         ("vehicle", "exhausted", "hold", "vehicle.exhausted: got 'hold', expected 'brake'"),
     ],
@@ -1276,11 +1180,7 @@ def test_a_wrong_mission_is_told(text: str, said: str, tmp_path: Path) -> None:
 def test_what_would_end_the_guarantee_is_refused(
     section: str, key: str, value: Any, said: str
 ) -> None:
-    table = reading.to_table(reading.load("swap"))
-    table[section][key] = value
-    with pytest.raises(ConfigError) as refused:
-        reading.check(table, "swap")
-    assert said in str(refused.value)
+    assert said in refusal(lambda: packaged("swap", {section: {key: value}}))
 
 
 def test_the_fleet_tells_how_near_they_came(
@@ -1343,6 +1243,5 @@ def test_four_cross_as_published() -> None:
     cell = (1, ("Luis 2020: four cross", "20 ms"))
     done = missions.fly_published(PublishedOptions(duration=25.0), cell)
     assert done.least_m > 0.2
-    assert done.arrived_s is not None
     assert done.arrived_s < missions.TOLD_S
     assert done.plan_ms > 0.0

@@ -13,9 +13,8 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario import zones
 from skytether.shared.wire.protocol import NO_HORIZON
-from two_vehicles import DT_S, alone, observation, planned, ready, scenario
+from two_vehicles import DT_S, alone, planned, ready, scenario
 
-BOTH = np.arange(2)
 FAR = 100.0
 """Place of a vehicle that nobody meets, on each axis [m]."""
 
@@ -103,15 +102,14 @@ def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> Non
 def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
     """The last check before a motion is sent."""
     made = ready()
-    vehicle = made._state.vehicles[0]
+    vehicle = made.vehicles[0]
     vehicle.turned_rad = 0.5
-    made._conflicts = lambda *_: np.ones(made._state.possible.count + 1, dtype=bool)
-    made.plan(BOTH, np.array([101, 101]), None)
+    made._conflicts = lambda *_: np.ones(made.state.possible.count + 1, dtype=bool)
+    made.decide(101)
     assert vehicle.next is None
 
 
 def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
-    """Zones around (4, 0), where it is, and around (0, 0)."""
     made = ready()
     made.change_zones(zones.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
     way = np.stack([np.linspace(4.0, 0.0, 41), np.zeros(41)], axis=1)
@@ -124,27 +122,25 @@ def test_a_vehicle_that_moves_is_not_told_to_rest_where_it_passes() -> None:
     made = alone()
     for step in (100, 101):
         for row, x in ((0, 4.0), (1, -4.0)):
-            said = observation(step, NO_HORIZON, (x, 0.0))
-            said.state[0, 1] = 0.5
-            made.observe(row, said)
-    made.plan(BOTH, np.array([101, 101]), None)
-    assert made._state.vehicles[0].next is None
+            made.hear(row, step, NO_HORIZON, x, 0.5)
+    made.decide(101)
+    assert made.vehicles[0].next is None
     assert made.waits(0) == "coming to rest"
 
 
 def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_next_motion() -> None:
     """Towards motions that others fly, and those planned at the same step."""
     made = ready()
-    made._state.align(BOTH, np.array([101, 101]))
-    made._state.update_possible()
-    made._state.vehicles[0].outside_m = 0.1
+    made.align(101)
+    made.state.update_possible()
+    made.vehicles[0].outside_m = 0.1
     near = resting(101, np.array([-4.0 + scenario(2).clearances.apart_m + 0.05, 0.0]))
-    possible = made._state.possible_motion(0, near)
+    possible = made.state.possible_motion(0, near)
     assert made._conflicts(0, near, possible).tolist() == [False, True, False]
-    made._state.vehicles[0].outside_m, made._state.vehicles[0].turned_rad = 0.4, 0.5
-    made._state._changed.add(0)
+    made.vehicles[0].outside_m, made.vehicles[0].turned_rad = 0.4, 0.5
+    made.state._changed.add(0)
     planned(made)
-    motions = made._state.possible
+    motions = made.state.possible
     mine = [motions.arrays.extra[m] for m in range(motions.count) if motions.rows[m] == 0]
     assert mine == pytest.approx([0.4] * len(mine))
 
@@ -152,7 +148,7 @@ def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_nex
 def test_a_new_motion_is_the_old_one_as_long_as_it_may_be_taken() -> None:
     """Taken late, within `link.join_s`, it is no leap."""
     made = ready()
-    motion, before = planned(made), made._state.vehicles[0].in_force.motion
+    motion, before = planned(made), made.vehicles[0].in_force.motion
     steps = np.arange(101.0, 102.0 + scenario(2).terms().join)
     assert motion.at(steps, DT_S)[0] == pytest.approx(before.at(steps, DT_S)[0], abs=1e-9)
 
@@ -169,54 +165,53 @@ def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
 def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
     """Nobody knows where along its motions it is."""
     made = ready()
-    made._state.align(BOTH, np.array([100, 100]))
-    made._state.restart(0)
-    made.plan(BOTH, np.array([101, 101]), None)
-    assert made._state.vehicles[0].next is None
+    made.align(100)
+    made.state.restart(0)
+    made.decide(101)
+    assert made.vehicles[0].next is None
     assert made.waits(0) == "its client, which has begun anew"
 
 
 def test_others_keep_away_from_all_of_its_motions() -> None:
     """It may be as late as any vehicle can be."""
     made = ready()
-    made._state.align(BOTH, np.array([101, 101]))
-    made._state.restart(0)
-    made._state.align(BOTH, np.array([102, 102]))
-    assert made._state.error(0).late >= LONGEST
+    made.align(101)
+    made.state.restart(0)
+    made.align(102)
+    assert made.state.error(0).late >= LONGEST
 
 
 def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
     """One that was under way when it began anew."""
     made = ready()
-    made._state.align(BOTH, np.array([101, 101]))
-    assert made._state.restart(0)
-    made.observe(0, observation(110, 90, (4.0, 0.0)))
-    assert 0 in made._state.restarted
-    made.observe(0, observation(122, 90, (4.0, 0.0)))
-    assert 0 not in made._state.restarted
+    made.align(101)
+    assert made.state.restart(0)
+    made.hear(0, 110, 90, 4.0)
+    assert 0 in made.state.restarted
+    made.hear(0, 122, 90, 4.0)
+    assert 0 not in made.state.restarted
 
 
 # -- zones ---------------------------------------------------------------------------------------
 
 
 def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() -> None:
-    """The motion of an earlier server may lead anywhere."""
     made = alone()
-    made.observe(0, observation(100, NO_HORIZON, (4.0, 0.0)))
-    made.observe(1, observation(100, 70, (-4.0, 0.0)))
-    made._state.align(BOTH, np.array([101, 101]))
+    made.hear(0, 100, NO_HORIZON, 4.0)
+    made.hear(1, 100, 70, -4.0)
+    made.align(101)
     assert "vehicle 2" in made.objection(zones.parse("cylinder(20, 20, 1)", 2))
 
 
 def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
     """It may be 60 steps behind the place that its step tells."""
     made = ready()
-    made._state.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
-    made._state.align(BOTH, np.array([165, 165]))
+    made.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
+    made.align(165)
     zone = zones.parse("cylinder(3.4, 0, 0.3)", 2)
-    made._state.rows.late[0] = 0.0
+    made.state.rows.late[0] = 0.0
     assert not made.objection(zone)
-    made._state.rows.late[0] = 60.0
+    made.state.rows.late[0] = 60.0
     assert "vehicle 1" in made.objection(zone)
 
 
@@ -264,7 +259,6 @@ def test_a_time_of_day_that_delays_contradict_moves_no_step() -> None:
 
 
 def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
-    """Neither its closed places nor its detour are left."""
     vehicle = VehicleMotions()
     vehicle.is_stuck(0, np.array([4.0, 0.0]), 9.0)
     vehicle.closed.append(np.zeros(2))

@@ -180,7 +180,6 @@ class OnPaper:
 
 
 def test_planner_solves_the_papers_two_problems() -> None:
-    """Step after step, over gaps, and anew after a long one; inputs are float32."""
     planner, paper, wind = make(), OnPaper(), np.array([0.1, -0.2])
     for step in (0, 1, 2, 5, 6, 6 + H, 7 + 2 * H, 8 + 2 * H):
         found = seen(elsewhere(step)[None])
@@ -194,7 +193,6 @@ def test_planner_solves_the_papers_two_problems() -> None:
 
 
 def test_first_plan_starts_from_the_estimate() -> None:
-    """There is no plan before: x_p = x̂."""
     made = run(make(), 7, START)
     assert made.figures["fresh"].tolist() == [True]
     np.testing.assert_array_equal(made.planned[0], START)
@@ -255,7 +253,6 @@ def test_tracker_follows_all_of_the_trajectory() -> None:
 
 @pytest.mark.parametrize("anew", ["gap", "forget"])
 def test_vehicle_starts_anew_after_a_long_gap_or_when_forgotten(anew: str) -> None:
-    """The result equals that of a new vehicle, to the last bit."""
     used, step = make(), 3 + H
     for past in (0, 1, 2):
         run(used, past, elsewhere(past))
@@ -310,7 +307,7 @@ def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> floa
     return float(cost + (weights.changes[LATER] * (inputs - told) ** 2).sum())
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, H), st.integers(0, H))
 def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
     """V of (16), the cost of flying on above that of the plan, and how far that leads from it."""
@@ -359,7 +356,6 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
 
 @pytest.mark.parametrize("flown", [0, 1, H - 3, H])
 def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
-    """Inputs beyond the flown ones change no figure; the flown ones change the costs."""
     rng, rows = np.random.default_rng(7), np.array([0])
     first, found = crowd(rng, np.array([0])), crowd(rng, np.array([0]))
     found = found._replace(
@@ -507,7 +503,6 @@ def test_plan_is_good_only_if_both_problems_were_solved(who: int) -> None:
 
 
 def test_vehicle_without_any_plan_hovers() -> None:
-    """Even the first problem has no solution here."""
     assert not run(make_faulty({GENERATOR, TRACKER}), 0, START).tracked.any()
 
 
@@ -523,7 +518,6 @@ def test_first_plan_is_tried_again_until_it_is_solved() -> None:
 
 
 def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> None:
-    """The neighbour is planned for as ever, and it itself goes on, and is solved a step later."""
     planner, neighbour, rows = make(2), make(), np.array([0, 1])
     plans = []
     for step in (0, 1, 2):

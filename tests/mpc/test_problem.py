@@ -30,7 +30,7 @@ from skytether.server.mpc.problem import (
 from skytether.shared.law.model import Array, discretise
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 
 TAU_S = (0.81, 0.3)
 TWO_TAUS = discretise(TAU_S, 0.05)
@@ -93,30 +93,6 @@ def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Arra
     return size * x, size * target, size * rng.normal(size=(axes, H))
 
 
-@pytest.mark.parametrize("input_reference", [False, True])
-@pytest.mark.parametrize("change_weight", [0.0, 0.7])
-@pytest.mark.parametrize("H", [1, 2, 6])
-def test_qp_is_the_printed_cost(H: int, change_weight: float, input_reference: bool) -> None:
-    """𝓗 and g are the second and first differences of ½ J, which is quadratic: exact."""
-    weights = control(H, input_reference=input_reference, change_weight=change_weight)
-    problem = make(weights)
-    x, target, previous = situation(H, H)
-    unit, wind = np.eye(H), np.array([0.4, -0.2])
-
-    def half_cost(u: Array) -> Array:
-        both = np.tile(u, (2, 1))
-        return 0.5 * printed_cost(weights, both, x=x, target=target, previous=previous, wind=wind)
-
-    still = half_cost(np.zeros(H))
-    g = gradients(problem, x[None], target[None], previous[None], wind[None])[0]
-    for i in range(H):
-        slope = 0.5 * (half_cost(unit[i]) - half_cost(-unit[i]))
-        np.testing.assert_allclose(g[:, i], slope, rtol=1e-9, atol=1e-9)
-        for j in range(H):
-            bend = half_cost(unit[i] + unit[j]) - half_cost(unit[i]) - half_cost(unit[j]) + still
-            np.testing.assert_allclose(problem.hessian[:, i, j], bend, rtol=1e-9, atol=1e-9)
-
-
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 50), st.booleans())
 def test_qp_ranks_any_two_plans_as_the_printed_cost(
@@ -148,22 +124,12 @@ def test_qp_ranks_any_two_plans_as_the_printed_cost(
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 50))
 def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
-    """ΔUᵀ 𝓗 ΔU, added up along the horizon and over the axes."""
     problem, change = make(control(H, change_weight=0.7)), situation(seed, H)[2]
     cost = 3.0
     for axis in range(2):
         cost = add_cost(problem.mpc, axis, (0.0, 0.0), change[axis], cost)
     expected = np.einsum("ak,akl,al->", change, problem.hessian, change)
     np.testing.assert_allclose(cost - 3.0, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_last_stage_has_no_change_weight() -> None:
-    """(9) sums S up to H-2: the horizon before says nothing about stage H-1."""
-    with_s = make(control(5, change_weight=3.0)).hessian
-    without = make(control(5, change_weight=0.0)).hessian
-    np.testing.assert_allclose(
-        with_s - without, [np.diag([3.0, 3.0, 3.0, 3.0, 0.0])] * 2, atol=1e-12
-    )
 
 
 def test_first_step_has_no_change_weight() -> None:
@@ -173,16 +139,6 @@ def test_first_step_has_no_change_weight() -> None:
     x, target, previous = (each[None] for each in situation(1, 5))
     one, other = (gradients(each, x, target, previous, CALM) for each in (first, without))
     np.testing.assert_array_equal(one, other)
-
-
-def test_last_input_of_the_horizon_before_changes_nothing() -> None:
-    """The S-term leaves it out of the gradient, too."""
-    problem = make(control(5, change_weight=3.0))
-    x, target, previous = situation(1, 5)
-    other = previous.copy()
-    other[:, -1] = 99.0
-    one, two = (gradients(problem, x[None], target[None], u[None], CALM) for u in (previous, other))
-    np.testing.assert_array_equal(one, two)
 
 
 @quick
@@ -235,15 +191,6 @@ def test_solver_finds_the_optimum(
     assert solved.tolist() == [True]
     assert at_bound.any() == (size > 1)
     assert np.abs(u[0] - best).max() < 1e-6
-
-
-def test_vehicle_that_is_where_it_shall_be_stays() -> None:
-    """At rest on a resting target the best input is none at all."""
-    problem, still = make(control(40, change_weight=0.033)), np.zeros((1, 2, 40))
-    x = np.array([[[1.5, 0.0], [-2.0, 0.0]]])
-    gradient = gradients(problem, x, np.repeat(x[:, :, None], 41, axis=2), still, CALM)
-    u, _ = OsqpSolver(problem).solve(gradient, still)
-    np.testing.assert_allclose(u, 0.0, atol=1e-9)
 
 
 def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:

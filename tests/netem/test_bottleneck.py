@@ -21,6 +21,13 @@ Packet = tuple[int, int, int]
 """Time of entry [ns], size [B], flow."""
 
 
+def linked(text: str) -> tuple[Link, Lane]:
+    """A link with these impairments, and a flow through it."""
+    direction = DirectionConfig(impairments=text)
+    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+    return Link(UPLINK, 1472, None, direction.path), lane
+
+
 def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[int]]:
     """Times at which packets have passed by number [ns], and the numbers of those dropped."""
     queue = path(text).queue
@@ -38,7 +45,6 @@ def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[i
 
 
 def test_a_packet_takes_its_size_over_the_rate() -> None:
-    """Packets that come meanwhile go one after the other."""
     out, dropped = passed("rate(1000)", [(0, 100, 0), (0, 50, 0), (SECOND_NS, 100, 0)])
     assert out == {0: SECOND_NS // 10, 1: 15 * SECOND_NS // 100, 2: 11 * SECOND_NS // 10}
     assert dropped == []
@@ -70,7 +76,6 @@ def test_random_arrivals_wait_as_in_m_d_1(load: float) -> None:
 
 
 def test_fair_serves_each_flow_alike() -> None:
-    """A flow that sends ten times as much takes nothing from the other; first come, it does."""
     loud = [(number * MILLISECOND_NS, 1000, 0) for number in range(5000)]
     quiet = [(number * 20 * MILLISECOND_NS, 100, 1) for number in range(250)]
     packets = sorted(loud + quiet)
@@ -107,7 +112,6 @@ def test_codel_drops_at_the_times_of_rfc_8289() -> None:
 
 
 def test_codel_keeps_the_queue_short() -> None:
-    """A tail drop keeps the queue full; CoDel does not, and drops nothing of a short burst."""
     every_ns = SECOND_NS * 100 // 12_000
     steady = [(number * every_ns, 100, 0) for number in range(6000)]
     waits = {}
@@ -144,7 +148,6 @@ def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
 def test_every_packet_passes_once_or_is_dropped(
     packets: list[Packet], drop: str, serve: str
 ) -> None:
-    """In the order of each flow, never faster than the rate, and never while it could go."""
     packets = sorted(packets)
     out, dropped = passed(f"rate(20000, queue=6000, drop={drop}, serve={serve})", packets)
     assert sorted([*out, *dropped]) == list(range(len(packets)))
@@ -160,9 +163,7 @@ def test_every_packet_passes_once_or_is_dropped(
 
 def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
     """A packet lost on the air has used it; one that waits is no earlier for that."""
-    direction = DirectionConfig(impairments="loss(1) & constant(0.1) & rate(12800)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+    link, lane = linked("loss(1) & constant(0.1) & rate(12800)")
     for _ in range(3):
         link.accept(Datagram(b"x" * (128 - HEADER_BYTES), ("a", 1)), lane, now_ns=0)
     assert link.next_due_ns() == 10 * MILLISECOND_NS
@@ -172,9 +173,7 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
 
 def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
     """Both count, but for the packet that is served; what waits counts with its header."""
-    direction = DirectionConfig(impairments="constant(0.1) & rate(12800)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane, size = Lane(0, Fates(direction, 1, "uplink", 0), 0), 128 - HEADER_BYTES
+    (link, lane), size = linked("constant(0.1) & rate(12800)"), 128 - HEADER_BYTES
     for _ in range(5):
         link.accept(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)
     assert (link.depth(), link.depth_bytes()) == (4, 4 * 128)
@@ -185,11 +184,8 @@ def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
 
 
 def test_a_rate_that_changes_serves_those_who_wait() -> None:
-    """Under the new one; without one they are under way at once."""
     for text, due_ms in (("rate(100000)", 40), ("constant(0)", 20)):
-        slow = DirectionConfig(impairments="rate(10000)")
-        link = Link(UPLINK, 1472, None, slow.path)
-        lane = Lane(0, Fates(slow, 1, "uplink", 0), 0)
+        link, lane = linked("rate(10000)")
         for _ in range(20):
             link.accept(Datagram(b"x" * 72, ("a", 1)), lane, now_ns=0)
         link.release(now_ns=20 * MILLISECOND_NS)
@@ -202,11 +198,8 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
 
 
 def test_ordered_lets_nobody_overtake() -> None:
-    """Packets of one flow keep their order; without `ordered` the same packets do not."""
     for text, reordered in (("uniform(0, 0.1)", True), ("uniform(0, 0.1) & ordered", False)):
-        direction = DirectionConfig(impairments=text)
-        link = Link(UPLINK, 1472, None, direction.path)
-        lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+        link, lane = linked(text)
         for number in range(200):
             now_ns = number * 5 * MILLISECOND_NS
             link.release(now_ns=now_ns)
@@ -217,10 +210,7 @@ def test_ordered_lets_nobody_overtake() -> None:
 
 
 def test_copies_and_flipped_bits() -> None:
-    """A copy comes right after its packet; exactly one bit differs."""
-    direction = DirectionConfig(impairments="duplicate(1) & corrupt(1)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+    link, lane = linked("duplicate(1) & corrupt(1)")
     for number in range(50):
         link.accept(Datagram(bytes(20), ("a", 1)), lane, now_ns=number * MILLISECOND_NS)
     out = [datagram.payload for datagram in link.release(now_ns=SECOND_NS)]

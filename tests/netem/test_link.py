@@ -39,7 +39,6 @@ class Listed(Fates):
         self._listed = iter(fates)
 
     def at(self, slot: int, rank: int = 0) -> Fate:  # noqa: ARG002
-        """See `Fates`."""
         return next(self._listed)
 
 
@@ -66,15 +65,7 @@ def give(link: Link, *, now_ns: int) -> str:
     return "".join(datagram.payload.decode() for datagram in link.release(now_ns=now_ns))
 
 
-def test_packets_leave_when_they_are_due_and_not_before() -> None:
-    """In the order of their due times, whatever that of their arrival."""
-    link = make_link()
-    take(link, make_lane(30, 10, 20), "abc", now_ns=100)
-    assert [give(link, now_ns=now) for now in (109, 110, 119, 130)] == ["", "b", "", "ca"]
-
-
 def test_packets_due_at_once_leave_in_the_order_in_which_they_came() -> None:
-    """Whichever flow they are of, and however long they were under way."""
     link, near, far = make_link(), make_lane(50, 0, flow=1), make_lane(50, 40, flow=0)
     take(link, near, "a", now_ns=0)
     take(link, far, "b", now_ns=0)
@@ -110,12 +101,6 @@ def test_a_packet_leaves_as_it_came() -> None:
     assert link.release(now_ns=5) == [datagram]
 
 
-def test_a_packet_leaves_once() -> None:
-    link = make_link()
-    take(link, make_lane(5), "a")
-    assert [give(link, now_ns=5), give(link, now_ns=5)] == ["a", ""]
-
-
 def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
     link = make_link()
     assert link.next_due_ns() is None
@@ -128,7 +113,6 @@ def test_the_next_due_time_is_that_of_the_earliest_packet() -> None:
 
 
 def test_lost_packets_never_leave_and_are_counted() -> None:
-    """Lost packets are counted as packets, but hold no place in the queue."""
     link = make_link()
     take(link, make_lane(0, 0, 0, lost=[0, 2]), "abc")
     assert (link.counts.packets, link.counts.lost, link.depth()) == (3, 2, 1)
@@ -139,7 +123,6 @@ def test_lost_packets_never_leave_and_are_counted() -> None:
 def test_a_full_queue_drops_what_comes_and_counts_it_apart_from_losses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Packets under way keep their places; once there is room, packets pass again."""
     monkeypatch.setattr(link_module, "QUEUE_MAX", 2)
     link, lane = make_link(), make_lane(9, 8, 1, 1)
     take(link, lane, "abc")
@@ -161,7 +144,6 @@ def test_a_packet_that_overflows_uses_up_its_fate(monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_is_longer_than_the_mtu_is_dropped_and_counted_apart() -> None:
-    """The longest that passes is the MTU itself; the dropped one uses up its fate."""
     link, lane = make_link(mtu=1200), make_lane(0, 0, 7)
     for size in (1200, 1201, 1):
         link.accept(Datagram(bytes(size), PEER), lane, now_ns=0)
@@ -186,7 +168,6 @@ def test_what_is_under_way_is_bounded_in_bytes_too() -> None:
 
 
 def test_what_leaves_makes_room_for_as_many_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A short packet still passes where a long one would not."""
     monkeypatch.setattr(link_module, "QUEUE_BYTES_MAX", 100)
     link, lane = make_link(), make_lane(5, 5, 5, 5)
     for size in (90, 20, 10):
@@ -197,7 +178,6 @@ def test_what_leaves_makes_room_for_as_many_bytes(monkeypatch: pytest.MonkeyPatc
 
 
 def test_figures_tell_delays_between_edges_and_how_late_packets_have_left() -> None:
-    """Errors of 0, 1, 1 and 10 ms, to the 20 µs of their bins; and the edges by name."""
     link, late_ms = make_link(), (0, 1, 1, 10)
     lane = make_lane(*[150 * MILLISECOND_NS] * 4)
     for number, late in enumerate(late_ms):
@@ -220,7 +200,6 @@ def test_the_greatest_depth_is_remembered() -> None:
 
 
 def test_overtaken_packets_are_counted_as_reordered() -> None:
-    """Two of four here: both come out after a later one."""
     link = make_link()
     take(link, make_lane(30, 20, 10, 40), "abcd")
     assert give(link, now_ns=40) == "cbad"
@@ -228,7 +207,6 @@ def test_overtaken_packets_are_counted_as_reordered() -> None:
 
 
 def test_flows_do_not_overtake_each_other() -> None:
-    """Reordering is of packets of one flow."""
     link = make_link()
     take(link, make_lane(20, flow=0), "a")
     take(link, make_lane(5, 10, flow=1), "bc")
@@ -237,7 +215,6 @@ def test_flows_do_not_overtake_each_other() -> None:
 
 
 def test_a_lost_packet_overtakes_nobody() -> None:
-    """A lost packet never comes out, so nothing counts as overtaken by it."""
     link = make_link()
     take(link, make_lane(20, 0, lost=[1]), "ab")
     assert give(link, now_ns=20) == "a"
@@ -252,7 +229,6 @@ def test_the_bytes_of_all_packets_are_counted() -> None:
 
 
 def test_the_added_delay_error_is_how_late_packets_left() -> None:
-    """Against their due time, by the clock that `give` is told."""
     link = make_link()
     take(link, make_lane(MILLISECOND_NS, 3 * MILLISECOND_NS), "ab")
     give(link, now_ns=MILLISECOND_NS)
@@ -263,7 +239,6 @@ def test_the_added_delay_error_is_how_late_packets_left() -> None:
 
 
 def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
-    """Forwarded packets are counted, however late they left."""
     link, ms = make_link(), MILLISECOND_NS
     take(link, make_lane(400 * ms, 440 * ms, 440 * ms, 500 * ms, lost=[3]), "abcd")
     give(link, now_ns=900 * ms)
@@ -281,7 +256,6 @@ def recorded(direction: int, lane: Lane, names: str) -> Rows:
 
 
 def test_the_fate_of_every_packet_is_written_down() -> None:
-    """A lost one's at once, another's when it leaves."""
     rows = recorded(DOWNLINK, make_lane(9000, 500, 70, flow=4, lost=[2]), "abc")
     assert rows["number"].tolist() == [2, 1, 0]
     assert rows["direction"].tolist() == [DOWNLINK] * 3
@@ -294,7 +268,6 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
 
 
 def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
-    """The fate depends on the packet's slot since the flow began and its rank in the slot alone."""
     fates, began_ns = Fates(DirectionConfig(loss=0.0), 1, "uplink", 0), 500
     for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: the clock went back
         link, lane = make_link(), Lane(0, fates, began_ns)
@@ -319,7 +292,6 @@ def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
 def test_slices_of_time_give_packets_in_the_order_of_one_heap(
     steps: list[tuple[int, int]],
 ) -> None:
-    """By due time and then by order of entry, whenever packets enter and leave."""
     queue, now_ns = link_module.Queue(), 0
     heap: list[QueuedPacket] = []
     lane = make_lane()

@@ -66,7 +66,6 @@ def fly(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
 
 
 def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
-    """Another port is another client; the same address keeps its socket."""
     proxy = make_proxy()
     sockets = [pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL, ALICE, CAROL)]
     assert sockets == [1, 2, 3, 1, 3]
@@ -92,7 +91,6 @@ def test_the_servers_answers_find_their_client() -> None:
 
 
 def test_a_stranger_at_a_flows_socket_is_refused() -> None:
-    """Only the server may answer, not another host, nor another port of the server's."""
     proxy = make_proxy()
     socket = pass_on(proxy, b"?", ALICE)
     for stranger in (BOB, (SERVER[0], 1), ("192.0.2.8", SERVER[1])):
@@ -107,7 +105,6 @@ def test_a_packet_at_a_socket_of_no_flow_is_refused() -> None:
 
 
 def test_a_client_too_many_is_refused() -> None:
-    """While those that are there, and have earned their places, stay served."""
     proxy = make_proxy(flows=2)
     assert [fly(proxy, client) for client in (ALICE, BOB)] == [1, 2]
     hear(proxy, b"?", CAROL)
@@ -116,9 +113,7 @@ def test_a_client_too_many_is_refused() -> None:
 
 
 def test_a_place_is_earned_for_a_while_and_then_goes_to_a_new_client() -> None:
-    """The flow's socket then carries the new client's answers, and the old client comes back where
-    somebody else has not earned a place.
-    """
+    """The old client comes back where somebody else has not earned a place."""
     proxy = make_proxy(flows=2)
     fly(proxy, ALICE, at=0)
     fly(proxy, BOB, at=1)
@@ -131,7 +126,6 @@ def test_a_place_is_earned_for_a_while_and_then_goes_to_a_new_client() -> None:
 
 
 def test_a_vehicle_that_goes_on_flying_keeps_its_place() -> None:
-    """At one exchange a second, through an outage of two seconds."""
     proxy = make_proxy(flows=1)
     fly(proxy, ALICE)
     for second in (*range(1, 60), *range(62, 120)):
@@ -142,7 +136,6 @@ def test_a_vehicle_that_goes_on_flying_keeps_its_place() -> None:
 
 @pytest.mark.parametrize(("asks", "answers"), [(1, 1), (100, 1), (1, 100), (0, 100), (100, 0)])
 def test_only_a_conversation_earns_a_place(asks: int, answers: int) -> None:
-    """Not one answer, nor any number of packets one way."""
     proxy = make_proxy(flows=1)
     socket = pass_on(proxy, b"?", ALICE)
     for _ in range(asks):
@@ -154,7 +147,6 @@ def test_only_a_conversation_earns_a_place(asks: int, answers: int) -> None:
 
 
 def test_flows_give_way_in_the_order_of_their_last_use() -> None:
-    """Whether that was the client's packet or the server's."""
     proxy = make_proxy(flows=3)
     for client in (ALICE, BOB, CAROL):
         ask(proxy, client)
@@ -182,7 +174,6 @@ def test_a_refusal_looks_at_one_flow_however_many_there_are(
 
 
 def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> None:
-    """Nobody talks with them; a flow that has earned its place keeps it."""
     proxy = make_proxy(flows=3)
     assert fly(proxy, ALICE) == 1
     strangers = [("192.0.2.3", port) for port in range(4)]
@@ -264,9 +255,7 @@ SIEGES = [
 def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
     hosts: list[str], ports: int, rate_hz: int
 ) -> None:
-    """Neither a vehicle that flies, nor one that comes, nor one whose port changes; from one host
-    or many, or behind the same address as the vehicles.
-    """
+    """Neither a vehicle that flies, nor one that comes, nor one whose port changes."""
     siege = Siege(make_proxy(flows=128), hosts, ports, rate_hz)
     siege.run(3, ALICE)
     siege.run(15)  # all places are taken
@@ -324,7 +313,6 @@ def no_bound_for_a_host(patch: pytest.MonkeyPatch) -> None:
 def test_if_places_were_earned_otherwise_newcomers_would_be_shut_out(
     monkeypatch: pytest.MonkeyPatch, ablation: Callable[[pytest.MonkeyPatch], None], rate_hz: int
 ) -> None:
-    """Ablation: by one answer; or by one host without a bound."""
     ablation(monkeypatch)
     siege = Siege(make_proxy(flows=128), [ATTACKER], 128, rate_hz)
     siege.run(13)
@@ -412,13 +400,11 @@ def test_a_packet_that_comes_back_ends_after_a_number_of_laps(count: int) -> Non
 def test_if_laps_were_not_counted_a_packet_would_circulate_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: through all flows, again and again."""
     monkeypatch.setattr("skytether.netem.proxy.LAPS_MAX", 2**62)
     assert circulate(make_proxy(), packets=1) == 5000
 
 
 def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None:
-    """Before it does, so many of them, and each that has a flow already."""
     proxy = make_proxy()
     clients = [("192.0.2.1", port) for port in range(LAPS_MAX + 2)]
     for client in clients[:-1]:
@@ -435,7 +421,6 @@ def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
-    """The client that took the place does not get the packet."""
     slow = DirectionConfig(delay="constant", minimum_s=61.0, loss=0.0)
     proxy = make_proxy(uplink=slow, downlink=AT_ONCE, flows=1)
     socket = pass_on(proxy, b"?", ALICE)
@@ -447,7 +432,6 @@ def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() 
 
 @pytest.mark.parametrize("length", [0, 1, 600, 65_507])
 def test_payloads_pass_unread(length: int) -> None:
-    """Any bytes, none, and the longest that UDP takes, both ways."""
     payload = random.Random(length).randbytes(length)
     proxy = make_proxy(mtu=65_507)
     socket = pass_on(proxy, payload, ALICE)
@@ -456,7 +440,6 @@ def test_payloads_pass_unread(length: int) -> None:
 
 
 def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
-    """The path does not fragment datagrams; the flow goes on."""
     proxy = make_proxy(mtu=1300)
     socket = pass_on(proxy, bytes(1300), ALICE)
     hear(proxy, bytes(1301), ALICE)
@@ -474,7 +457,6 @@ def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
 
 
 def test_a_duplicate_is_a_packet_of_its_own() -> None:
-    """Copies are not told apart by netem: each has its own number, and its own fate."""
     proxy = make_proxy()
     assert [pass_on(proxy, b"?", ALICE) for _ in range(3)] == [1, 1, 1]
     assert proxy.downlink.counts.packets == 3
@@ -500,7 +482,6 @@ def test_being_woken_early_does_no_harm() -> None:
 
 
 def test_each_direction_and_flow_meets_its_own_fates() -> None:
-    """Those that netem.fate names, by the rank of the packets in their slot."""
     half = DirectionConfig(delay="none", loss=0.5)
     proxy = make_proxy(half, seed=7)
     for flow, client in enumerate((ALICE, BOB)):
@@ -515,14 +496,7 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
             assert passed == [number for number in range(40) if not drawn[number]]
 
 
-def test_what_is_sent_is_handed_out_once() -> None:
-    proxy = make_proxy()
-    hear(proxy, b"?", ALICE)
-    assert [len(proxy.outbox()), len(proxy.outbox())] == [1, 0]
-
-
 def test_the_figures_name_every_statistic() -> None:
-    """Flows, refusals, and by direction: forwarded, lost, reordered, queue, delay and its error."""
     proxy, ms = make_proxy(uplink=DirectionConfig(loss=1.0), downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)
     hear(proxy, b"?", ALICE, at=2 * ms)
@@ -580,7 +554,6 @@ ARRIVALS = st.lists(
 def test_no_packet_appears_or_vanishes(
     arrivals: list[tuple[tuple[tuple[str, int], int], int]], seed: int
 ) -> None:
-    """At every moment each one is forwarded, lost, overflowed, refused or still under way."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(link_module, "QUEUE_MAX", 8)
         proxy, now_ns, sent = make_proxy(DirectionConfig(loss=0.3), seed=seed, flows=2), 0, 0

@@ -82,7 +82,6 @@ def test_formats_are_told_apart_by_their_content(
     delay_s: list[float] | None,
     lost: list[int],
 ) -> None:
-    """Times from 0, half of a round trip, and what was lost between its neighbours."""
     found = traces.recorded_in(file(tmp_path, text), way)
     delay_s = delay_s or [0.1, 0.1 + 0.1 / 3, 0.2]
     np.testing.assert_allclose(found.time_s, time_s, atol=1e-6)
@@ -130,7 +129,6 @@ def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> 
 
 
 def test_too_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
-    """Ten million of them, within a moment."""
     name = file(tmp_path, "time_s,delay_s\n" + "0,1\n" * 10_000_000)
     with pytest.raises(ValueError, match="got 10000000 rows, expected at most 1000000"):
         traces.recorded_in(name)
@@ -145,7 +143,6 @@ def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("play", ["loop", "once"])
 def test_a_trace_is_replayed_by_time(tmp_path: Path, play: str) -> None:
-    """Interpolated between rows, lost as the nearer row, and round and round or once."""
     name = file(tmp_path, "time_s,delay_s,lost\n0,0.1,0\n1,0.3,0\n2,,1\n3,0.3,0\n")
     fates = Fates(DirectionConfig(impairments=f"trace({name}, {play})"), 1, "uplink", 0)
 
@@ -162,7 +159,6 @@ def test_a_trace_is_replayed_by_time(tmp_path: Path, play: str) -> None:
 
 @pytest.mark.parametrize("name", ["urban", "edge-of-cell", "outage", "rural", "rural-queue"])
 def test_the_recorded_links_are_scenarios(name: str) -> None:
-    """Half of the round trips that the file holds, each way."""
     network = reading.load(f"5g-{name}").network
     table = np.loadtxt(reading.SCENARIOS / "traces" / f"5g-{name}.csv", delimiter=",", skiprows=1)
     assert network.uplink == network.downlink

@@ -55,7 +55,7 @@ class Crowd:
         return sent
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(st.integers(40, 400), min_size=1, max_size=12),
     st.floats(200.0, 20_000.0),
@@ -78,14 +78,12 @@ def test_no_more_goes_than_the_rate(sizes: list[int], rate: float, blocks: int, 
 
 
 def test_a_rate_that_is_enough_holds_nobody_back() -> None:
-    """All that ask are sent to at once, and nothing is counted as deferred."""
     crowd = Crowd(1e6, [100] * 8)
     assert [len(crowd.tick(np.ones(8))) for _ in range(20)] == [8] * 20
     assert crowd.budget.deferred == 0
 
 
 def test_who_gains_most_a_byte_goes_first() -> None:
-    """Not who gains most: of two packets that cost as much as one the larger sum counts."""
     crowd = Crowd(2 * GUESS_BYTES / DT_S, [100, 100, 200, 100])
     crowd.tick(np.zeros(4), owed=[0, 1, 2, 3])  # from here on sizes are known
     for _ in range(8):  # the others pay for what was owed
@@ -104,7 +102,6 @@ def test_what_is_owed_goes_in_any_case_and_the_others_pay() -> None:
 
 
 def test_debts_are_bounded() -> None:
-    """After a surge of what is owed the others wait no longer than twice BURST_S."""
     crowd = Crowd(GUESS_BYTES / DT_S, [100] * 50)
     crowd.tick(np.ones(50), owed=list(range(49)))
     waited = 0
@@ -125,16 +122,13 @@ def longest_wait_s() -> float:
 
 
 def test_nobody_starves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle that was sent nothing for WAIT_S goes first; ablation: without the bound it
-    starves.
-    """
+    """After WAIT_S without a packet it goes first; ablation: without the bound it starves."""
     assert longest_wait_s() <= WAIT_S + 3 * DT_S
     monkeypatch.setattr(budgets, "WAIT_S", np.inf)
     assert longest_wait_s() == pytest.approx(400 * DT_S)
 
 
 def test_blocks_share_one_ranking() -> None:
-    """Vehicles of the first block leave the bytes to those of the second that gain more."""
     worth = np.array([1.0, 2.0, 3.0, 40.0, 50.0, 60.0])
     sent = []
     for blocks in (1, 2, 3):
@@ -147,7 +141,6 @@ def test_blocks_share_one_ranking() -> None:
 
 
 def test_who_no_longer_asks_holds_nobody_back() -> None:
-    """A vehicle that is gone had asked for more than all others, and was not sent anything."""
     crowd = Crowd(GUESS_BYTES / DT_S, [100, 100])
     for _ in range(4):
         crowd.tick(np.array([1.0, 9.0]), owed=[0])
@@ -202,7 +195,6 @@ class Air:
 
 @pytest.mark.parametrize("rate", [2_000.0, 12_500.0, 100_000.0])
 def test_the_rate_of_the_air_is_found(rate: float) -> None:
-    """After a minute most of it is used, and the queue is short."""
     air = Air(rate, jitter_s=0.03).run(240.0)
     late = slice(len(air.rates) // 4, None)
     assert 0.75 * rate < np.mean(air.rates[late]) <= 1.02 * rate
@@ -210,7 +202,6 @@ def test_the_rate_of_the_air_is_found(rate: float) -> None:
 
 
 def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A target that no queue reaches is none: the queue grows to seconds."""
     assert max(Air(12_500.0).run(60.0).queues_s) < 1.0
     monkeypatch.setattr(rates, "TARGET_S", np.inf)
     assert Air(12_500.0).run(60.0).queues_s[-1] > 10.0
@@ -218,14 +209,12 @@ def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.5, 0.0), (0.7, 0.03)])
 def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
-    """Without a queue, all packets are sent in the end, and the rate stays."""
     air = Air(1e9, loss=loss, jitter_s=jitter_s).run(240.0, wanted=20_000.0)
     late = slice(len(air.rates) // 2, None)
     assert np.mean(air.rates[late]) > 0.9 * 20_000.0
 
 
 def test_an_air_that_slows_down_is_followed() -> None:
-    """It passes a quarter from one moment on, and all again later."""
     air = Air(20_000.0).run(60.0)
     air.rate = 5_000.0
     air.run(60.0)
@@ -236,7 +225,6 @@ def test_an_air_that_slows_down_is_followed() -> None:
 
 
 def test_a_rate_that_nobody_uses_does_not_rise() -> None:
-    """Unused capacity gives no information about the network."""
     air = Air(12_500.0).run(60.0, wanted=2_000.0)
     assert air.control.bytes_per_s == rates.START
 
@@ -281,9 +269,7 @@ def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
 
 @pytest.mark.long
 def test_random_loss_costs_no_budget() -> None:
-    """Half of the packets are lost and nobody queues: the error is that of thresholds; a rate cut
-    by losses, as a queue's would be, is far worse.
-    """
+    """The error is that of thresholds; a rate that losses cut, as a queue does, is far worse."""
     lossy = "paper(0.4, 0.02, 2) & loss(0.5)"
     _, threshold_m = flown({}, 8, lossy)
     _, budget_m = flown(AUTO, 8, lossy)
@@ -294,7 +280,6 @@ def test_random_loss_costs_no_budget() -> None:
 
 @pytest.mark.long
 def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
-    """Runs of a batch share a server, and no budget."""
     scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
     for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):
         alone = fly(crowd({**AUTO, "duration": 4.0, "settle": 1.0, "seed": seed}))
@@ -322,7 +307,6 @@ def test_each_vehicle_of_a_fleet_has_a_target_of_its_own() -> None:
 
 
 def test_vehicles_of_a_fleet_start_one_after_the_other() -> None:
-    """A step apart, and all of a large fleet within five seconds."""
     record = fly(crowd({"duration": 2.0, "settle": 1.0}), vehicles=3)
     netem = record.netem[np.unique(record.netem["flow"], return_index=True)[1]]
     assert np.diff(netem["arrived_ns"]).tolist() == [DT_NS, DT_NS]

@@ -20,7 +20,7 @@ from skytether.server.schemes.delay_bound import (
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario.schema import DirectionConfig
 
-quick = settings(max_examples=100, deadline=None)
+quick = settings(max_examples=100)
 
 MOST = 39
 
@@ -74,21 +74,10 @@ def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps
 
 
 def test_before_any_sample_it_is_the_guess() -> None:
-    """Within 1 and the most; 0 says that there is not even a guess."""
     bound = estimated(4)
     for row, guess in ((3, 11), (0, 0), (1, 90)):
         begin(bound, row, guess)
     assert bound.steps.tolist() == [1, MOST, 0, 11]
-
-
-def test_it_rises_at_once_and_no_further_than_most() -> None:
-    """A delay that no horizon has room for counts as the most."""
-    assert known([9, 10, 14, 50]) == [9, 10, 14, MOST]
-
-
-def test_a_guess_too_high_is_left_step_by_step_once_it_is_known_to_be() -> None:
-    """After the 16 newest, as after a sample."""
-    assert known([9] * 22, first=14) == [14] * 15 + [13, 12, 11, 10] + [9] * 3
 
 
 def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
@@ -102,7 +91,6 @@ def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None
 
 
 def test_what_was_raised_falls_step_by_step() -> None:
-    """The bound falls once none of the newest samples needs it, as after a late horizon."""
     bound, steps = estimated(), []
     begin(bound, 0, 9)
     at_least(bound, 0, 14)
@@ -116,12 +104,10 @@ LONE = [11] * 128 + [30] + [11] * 40
 
 
 def test_a_lone_late_horizon_is_left_behind_step_by_step() -> None:
-    """A lone late horizon counts for as long as it is recent."""
     assert known(LONE)[128:] == [30] * 16 + list(range(29, 10, -1)) + [11] * 6
 
 
 def test_a_few_of_a_hundred_are_no_lone_one() -> None:
-    """Several late horizons count until the ring has forgotten all but one."""
     delays = [11] * 128 + [30] * 3 + [11] * 200
     steps = known(delays)[130:]
     assert steps[:127] == [30] * 127
@@ -153,7 +139,6 @@ SAMPLES = st.lists(
 @quick
 @given(SAMPLES, st.integers(1, MOST))
 def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
-    """It equals the definition, computed one sample after the other."""
     d, expected = first, []
     for count, sample in enumerate(delays, 1):
         d = max(d, min(sample, MOST))
@@ -168,7 +153,6 @@ def test_it_is_what_the_samples_say(delays: list[int], first: int) -> None:
 @quick
 @given(SAMPLES, st.integers(1, MOST))
 def test_it_is_never_below_what_was_seen_recently(delays: list[int], most: int) -> None:
-    """Delay d stays within 1 and the most, falls by one at most, and rises only to a sample."""
     steps = known(delays, most=most)
     for count, d in enumerate(steps, 1):
         assert min(max(delays[max(0, count - 16) : count]), most) <= d <= most

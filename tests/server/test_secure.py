@@ -72,12 +72,19 @@ def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Addr
     return error.value.reason
 
 
-def challenged(client: SecureLink, server: Gate, now_ns: int = 0) -> None:
+def challenged(client: SecureLink, server: Gate, now_ns: int = 0, *, hello: bytes = HELLO) -> None:
     """Give the client a cookie."""
-    asked = Datagram(client.hello(HELLO, now_ns=now_ns), HERE)
+    asked = Datagram(client.hello(hello, now_ns=now_ns), HERE)
     assert server.open(asked, now_ns=now_ns) is None
     (challenge,) = server.outbox()
     assert client.open(challenge.payload, now_ns=now_ns) is None
+
+
+def apart() -> tuple[SecureLink, Gate]:
+    """Both ends, of which the client has a cookie and no more."""
+    client, server = link(), gate()
+    challenged(client, server)
+    return client, server
 
 
 def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
@@ -90,12 +97,17 @@ def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
     return response
 
 
-def joined(now_ns: int = 0) -> tuple[SecureLink, Gate]:
-    """Both ends of an open link, before the first packet in the channel."""
-    client, server = link(), gate()
+def keyed(client: SecureLink, server: Gate, now_ns: int = 0) -> None:
+    """A handshake, up to its adoption."""
     challenged(client, server, now_ns)
     welcomed(client, server, now_ns)
     client.adopt(now_ns=now_ns)
+
+
+def joined() -> tuple[SecureLink, Gate]:
+    """Both ends of an open link, before the first packet in the channel."""
+    client, server = link(), gate()
+    keyed(client, server)
     return client, server
 
 
@@ -109,7 +121,6 @@ def live(server: Gate, vehicle: int = 1) -> int | None:
 
 
 def test_a_handshake_takes_two_round_trips_and_opens_a_channel() -> None:
-    """INITIATION, CHALLENGE, INITIATION, RESPONSE; then messages both ways."""
     client, server = joined()
     call = called(server, client.seal(OBSERVATION))
     assert (call.payload, call.vehicle, call.moves) == (OBSERVATION, 1, True)
@@ -155,13 +166,10 @@ def test_the_forms_that_are_admitted_are_those_on_the_wire() -> None:
 
 
 def test_no_answer_is_longer_than_what_draws_it() -> None:
-    """Even the longest; and the longest HELLO fits."""
-    client, server = link(), gate()
     room, head = HELLO_BYTES_MAX - 3, HELLO[:3]
     for hello in (head, head + b"\0" * room, head + b"\x80" * room, head + b"\x80\0"):
         client, server = link(), gate()
-        server.open(Datagram(client.hello(hello, now_ns=0), HERE), now_ns=0)
-        client.open(server.outbox()[0].payload, now_ns=0)
+        challenged(client, server, hello=hello)
         call = called(server, client.hello(hello, now_ns=0))
         assert call.payload == hello
     assert len(call.line.seal(bytes(WELCOME_BYTES_MAX))) == INITIATION_BYTES
@@ -172,9 +180,7 @@ def test_no_answer_is_longer_than_what_draws_it() -> None:
 
 
 def test_a_refused_client_goes_on_with_its_attempt() -> None:
-    """A WELCOME that is not adopted, and not admitted, opens nothing."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     before = client.hello(HELLO, now_ns=0)
     call = called(server, before)
     assert client.open(call.line.seal(WELCOME), now_ns=0) == WELCOME
@@ -186,9 +192,7 @@ def test_a_refused_client_goes_on_with_its_attempt() -> None:
 
 
 def test_an_attempt_has_one_ephemeral_key() -> None:
-    """Another HELLO, or 60 s, begin another attempt; the cookie stays."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, _ = apart()
     first = client.hello(HELLO, now_ns=0)
     assert client.hello(HELLO, now_ns=ATTEMPT_NS) == first
     later = client.hello(HELLO, now_ns=ATTEMPT_NS + 1)
@@ -200,8 +204,7 @@ def test_an_attempt_has_one_ephemeral_key() -> None:
 
 def test_a_repeated_hello_is_answered_with_other_keys() -> None:
     """No key seals two different answers; the vehicle may adopt either."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     answers = []
     for i in range(3):
@@ -221,8 +224,7 @@ def test_a_repeated_hello_is_answered_with_other_keys() -> None:
 
 def test_an_adopted_response_opens_no_channel_again() -> None:
     """Its counters would begin anew, and what was recorded be opened a second time."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     response = welcomed(client, server)
     client.adopt(now_ns=0)
     sent = called(server, client.seal(OBSERVATION)).line.seal(HORIZON)
@@ -236,9 +238,7 @@ def test_an_adopted_response_opens_no_channel_again() -> None:
 def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the attempt's end."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     response = welcomed(client, server)
     adopt = SecureLink.adopt
 
@@ -315,8 +315,7 @@ def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_the_mac_comes_before_any_costly_mathematics(monkeypatch: pytest.MonkeyPatch) -> None:
     """A forged INITIATION draws nothing, and a forged RESPONSE costs no elliptic curve."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     initiation = client.hello(HELLO, now_ns=0)
     response = called(server, initiation).line.seal(WELCOME)
     costs = exchanges(monkeypatch)
@@ -330,9 +329,7 @@ def test_the_mac_comes_before_any_costly_mathematics(monkeypatch: pytest.MonkeyP
 def test_without_the_mac_strangers_cost_mathematics_and_draw_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the MAC."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     initiation = client.hello(HELLO, now_ns=0)
     response = called(server, initiation).line.seal(WELCOME)
     costs = exchanges(monkeypatch)
@@ -348,8 +345,7 @@ def test_without_the_mac_strangers_cost_mathematics_and_draw_answers(
 
 def test_a_cookie_is_good_for_its_address_and_up_to_two_minutes() -> None:
     """Elsewhere and later it draws a CHALLENGE; so it does in another life of the server."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     assert server.open(Datagram(hello, ELSEWHERE), now_ns=0) is None
     assert server.open(Datagram(hello, ("vehicle", 2)), now_ns=0) is None
@@ -411,7 +407,6 @@ def test_foreign_challenges_keep_no_vehicle_from_its_own(*, foreign_first: bool)
 
 
 def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
-    """One more, and the first of them is tried again, however soon it comes."""
     client, server = link(), gate()
     hello = client.hello(HELLO, now_ns=0)
     for port in range(65):
@@ -425,7 +420,6 @@ def test_of_the_cookies_that_were_tried_the_newest_64_are_remembered() -> None:
 
 
 def test_a_cookie_that_is_tried_again_is_the_newest_of_those_tried() -> None:
-    """It is forgotten after 64 others, and not as early as it would have been without."""
     client, server = link(), gate()
     hello = client.hello(HELLO, now_ns=0)
     for port in range(65):
@@ -452,8 +446,7 @@ def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
 
 def test_who_repeats_an_attempt_uses_up_no_answers() -> None:
     """A vehicle that is answered no more as often as it asks gets the same answer again."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     for _ in range(1 + HANDSHAKES):
         call = called(server, hello)
@@ -495,8 +488,7 @@ def test_without_cookies_a_recorded_hello_draws_handshakes_from_anywhere(
 
 
 def test_a_vehicle_gets_five_handshakes_a_second() -> None:
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     for start_ns in (0, 10 * SECOND_NS):
         for _ in range(HANDSHAKES):
@@ -505,8 +497,7 @@ def test_a_vehicle_gets_five_handshakes_a_second() -> None:
         assert refusal(server, hello, start_ns + SECOND_NS // 5 - 1) == "too many handshakes"
         called(server, hello, start_ns + SECOND_NS // 5)
     other = link(key=KEYS[2, 5])
-    server.open(Datagram(other.hello(HELLO, now_ns=0), HERE), now_ns=0)
-    other.open(server.outbox()[0].payload, now_ns=0)
+    challenged(other, server)
     called(server, other.hello(HELLO, now_ns=0))
 
 
@@ -519,13 +510,11 @@ def test_an_address_moves_with_the_highest_counter_only() -> None:
     packets = [client.seal(OBSERVATION) for _ in range(4)]
     assert [called(server, packets[i]).moves for i in (0, 2, 1, 3)] == [True, True, False, True]
     late = [client.seal(OBSERVATION) for _ in range(2)]
-    challenged_at = 200 * SECOND_NS  # the cookie has expired
-    challenged(client, server, challenged_at)
-    welcomed(client, server, challenged_at)
-    client.adopt(now_ns=challenged_at)
-    assert called(server, late[0], challenged_at).moves
-    assert called(server, client.seal(OBSERVATION), challenged_at).moves
-    assert not called(server, late[1], challenged_at).moves
+    later_ns = 200 * SECOND_NS  # the cookie has expired
+    keyed(client, server, later_ns)
+    assert called(server, late[0], later_ns).moves
+    assert called(server, client.seal(OBSERVATION), later_ns).moves
+    assert not called(server, late[1], later_ns).moves
 
 
 def test_without_the_order_of_counters_a_late_packet_moves_the_address(
@@ -539,13 +528,6 @@ def test_without_the_order_of_counters_a_late_packet_moves_the_address(
     assert called(server, held, peer=ELSEWHERE).moves
 
 
-def rekeyed(client: SecureLink, server: Gate, now_ns: int) -> None:
-    """A second handshake, up to its adoption."""
-    challenged(client, server, now_ns)
-    welcomed(client, server, now_ns)
-    client.adopt(now_ns=now_ns)
-
-
 def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
     """Packets under way in the old channel are opened at both ends, for 10 s."""
     client, server = joined()
@@ -554,7 +536,7 @@ def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
     assert client.wants_hello(FRESH_NS)
     up = [client.seal(OBSERVATION) for _ in range(4)]
     down = [line.seal(OBSERVATION) for _ in range(4)]
-    rekeyed(client, server, FRESH_NS)
+    keyed(client, server, FRESH_NS)
     assert not client.wants_hello(FRESH_NS)
     assert called(server, up[0], FRESH_NS).moves  # the new channel is pending until it is used
     assert client.open(down[0], now_ns=FRESH_NS) == OBSERVATION
@@ -565,14 +547,13 @@ def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
     assert client.open(down[1], now_ns=end_ns) == OBSERVATION
     assert refusal(server, up[2], end_ns + 1) == "expired"
     assert refusal(client, down[2], end_ns + 1) == "expired"
-    rekeyed(client, server, 2 * FRESH_NS)
+    keyed(client, server, 2 * FRESH_NS)
     called(server, client.seal(OBSERVATION), 2 * FRESH_NS)
     assert refusal(server, up[3], 2 * FRESH_NS) == "unknown channel"
     assert refusal(client, down[3], 2 * FRESH_NS) == "unknown channel"
 
 
 def test_without_a_successor_a_channel_ends() -> None:
-    """After 600 s neither end opens anything."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert refusal(server, client.seal(OBSERVATION), LIFE_NS + 1) == "expired"
@@ -580,7 +561,6 @@ def test_without_a_successor_a_channel_ends() -> None:
 
 
 def test_a_hello_that_is_repeated_ends_no_flight() -> None:
-    """The live channel stays, whatever is pending, until the vehicle uses another."""
     client, server = joined()
     called(server, client.seal(OBSERVATION))
     before = live(server)
@@ -600,8 +580,7 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
 
 def test_a_closed_attempt_is_not_answered() -> None:
     """Its INITIATION, recorded and repeated, gives nobody a HELLO, cookie or not."""
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     welcomed(client, server)
     client.adopt(now_ns=0)
@@ -712,7 +691,6 @@ def test_a_handshake_succeeds_over_a_terrible_network(seeds: range) -> None:
     for seed in seeds:
         flight = Flight(seed, 0.5, lambda rng: rng.uniform(0.0, 3.0))
         flight.until(horizons=30)
-        assert flight.client._current is not None
         assert flight.client._current.number == live(flight.server)
         assert set(flight.dropped) <= {"replayed", "unasked", "unknown channel"}
 
@@ -724,7 +702,6 @@ def test_a_handshake_succeeds_where_a_round_trip_takes_seven_hellos() -> None:
 
 
 def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation of their number."""
     monkeypatch.setattr(server_secure, "PENDING_MAX", 4)
     flight = Flight(1, 0.0, lambda _: 3.5)
     with pytest.raises(AssertionError, match="unknown channel"):
@@ -786,7 +763,6 @@ def test_nothing_of_a_recorded_session_is_accepted_again(peer: Address, later_ns
 
 @pytest.mark.parametrize("restarted", ["client", "server", "both"])
 def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
-    """With the same keys, while a new handshake is under way."""
     flight = recorded(2)
     if restarted != "server":
         flight.client = link(seed=5)
@@ -807,8 +783,7 @@ def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
 def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
     """Anything else, whose packet others could repeat, is dropped."""
     server, client = gate(), link()
-    server.open(Datagram(client.hello(message, now_ns=0), HERE), now_ns=0)
-    client.open(server.outbox()[0].payload, now_ns=0)
+    challenged(client, server, hello=message)
     assert refusal(server, client.hello(message, now_ns=0)) == "out of place"
 
 
@@ -839,7 +814,6 @@ def test_what_does_not_begin_as_a_message_of_msgpack_travels_nowhere(*, in_hands
 
 
 def test_the_shortest_and_the_longest_response_are_read() -> None:
-    """One with a WELCOME of no bytes, and one as long as an INITIATION."""
     key, public = KEYS[1, 5], bytes(32)
     for welcome, packet_bytes in (
         (b"", RESPONSE_BYTES_MIN),
@@ -855,8 +829,7 @@ def test_the_shortest_and_the_longest_response_are_read() -> None:
 
 
 def test_a_response_with_another_message_opens_no_channel() -> None:
-    client, server = link(), gate()
-    challenged(client, server)
+    client, server = apart()
     call = called(server, client.hello(HELLO, now_ns=0))
     assert refusal(client, call.line.seal(HORIZON)) == "out of place"
     assert client._candidate is None
@@ -872,8 +845,7 @@ def test_a_flood_of_initiations_takes_no_memory() -> None:
     clients = [link(seed, key) for seed in range(20) for key in KEYS.values()]
     good = []
     for client in clients:
-        server.open(Datagram(client.hello(HELLO, now_ns=0), HERE), now_ns=0)
-        client.open(server.outbox()[0].payload, now_ns=0)
+        challenged(client, server)
         good.append(client.hello(HELLO, now_ns=0))
     reasons = Counter[str]()
     for i in range(100_000):

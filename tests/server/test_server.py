@@ -143,21 +143,39 @@ class Vehicles:
             silence=40,
         )
 
-    def tick(self) -> list[tuple[Message, Address]]:
-        """Time passes until the next tick; what is sent at it."""
+    @property
+    def due_ns(self) -> int:
+        """Time of the next tick."""
         due_ns = self.server.next_wake_ns()
         assert due_ns is not None
-        self.now_ns = max(self.now_ns, due_ns)
+        return due_ns
+
+    def tick(self) -> list[tuple[Message, Address]]:
+        """Time passes until the next tick; what is sent at it."""
+        self.now_ns = max(self.now_ns, self.due_ns)
         self.server.wake(now_ns=self.now_ns)
         return self.answers()
+
+    def planned(self) -> tuple[Horizon, Address]:
+        """The only message of the next tick, a horizon, and to whom it is sent."""
+        ((horizon, peer),) = self.tick()
+        assert isinstance(horizon, Horizon)
+        return horizon, peer
 
     def rows(self) -> Rows:
         """The record so far."""
         return parse(self.sink.getvalue())
 
 
+def live(step: int = 0, **more: Any) -> tuple[Vehicles, Welcome]:
+    """A server with one vehicle, which has been observed once, and its WELCOME."""
+    vehicles = Vehicles(scenario(), **more)
+    welcome = vehicles.open()
+    vehicles.observe(welcome, step)
+    return vehicles, welcome
+
+
 def test_hello_is_welcomed_with_the_servers_terms() -> None:
-    """The answer echoes the vehicle's boot id and carries the server's."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open(vehicle=3, boot_id=42)
     assert (welcome.vehicle, welcome.boot_id, welcome.server_boot_id) == (3, 42, 77)
@@ -175,7 +193,6 @@ def test_a_repeated_hello_gets_the_same_session() -> None:
 
 
 def test_other_terms_open_no_session() -> None:
-    """The server says what it flies, and the operator hears what differs."""
     vehicles = Vehicles(scenario())
     other = vehicles.terms._replace(horizon=20)
     ((welcome, _),) = vehicles.say(Hello(1, 5, other))
@@ -189,7 +206,6 @@ def test_other_terms_open_no_session() -> None:
 
 
 def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
-    """One of a vehicle that has been forgotten since is told again."""
     vehicles = Vehicles(scenario())
     other = vehicles.terms._replace(horizon=20)
 
@@ -207,7 +223,6 @@ def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
 
 
 def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
-    """At once of the first; the address and reason are those of the newest."""
     gate = SecureGate(Keyring("keys", {}), entropy=stream(2, "gate").bytes)
     server = Server(scenario(), boot_id=1, entropy=stream(1, "entropy").bytes, gate=gate)
     told = []
@@ -228,41 +243,31 @@ def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
 
 
 def test_an_idle_server_asks_for_no_wake() -> None:
-    """No vehicle, no ticks; they begin with the first observation."""
     vehicles = Vehicles(scenario())
     assert vehicles.server.next_wake_ns() is None
     welcome = vehicles.open()
     assert vehicles.server.next_wake_ns() is None
     vehicles.observe(welcome, 0)
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
-    assert due_ns % vehicles.dt_ns == 0
-    assert 0 < due_ns - vehicles.now_ns <= vehicles.dt_ns
+    assert vehicles.due_ns % vehicles.dt_ns == 0
+    assert 0 < vehicles.due_ns - vehicles.now_ns <= vehicles.dt_ns
 
 
 def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
-    """Stamped with k on the vehicle's grid and with the observation behind it."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 100)
-    ((horizon, peer),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    vehicles, welcome = live(100)
+    horizon, peer = vehicles.planned()
     assert peer == HERE
     assert (horizon.vehicle, horizon.session) == (1, welcome.session)
     # 30 ms have passed since the start of step 100, a step is 50 ms.
     assert horizon.step == 100
     assert horizon.age == 0
-    ((later, _),) = vehicles.tick()
-    assert isinstance(later, Horizon)
+    later, _ = vehicles.planned()
     assert (later.step, later.age) == (101, 1)
 
 
 @pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
 def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
     """However often stamps have begun anew since: it makes a round trip of less than nothing."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     vehicles.observe(welcome, 1)
     later = round(minutes * 60 * SECOND_NS) // vehicles.dt_ns
     vehicles.observe(welcome, later)
@@ -288,10 +293,7 @@ def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
 
 
 def test_the_newest_observation_wins_after_reordering() -> None:
-    """An older one is counted as stale, and neither state nor address follow it."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 5)
+    vehicles, welcome = live(5)
     vehicles.observe(welcome, 4, state=((9.0, 0.0), (9.0, 0.0)), sender=("old", 2))
     ((_, peer),) = vehicles.tick()
     assert peer == HERE
@@ -305,9 +307,7 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
 
     Until it says HELLO there it is answered at home as well, for somebody may send on copies.
     """
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     assert [peer for _, peer in vehicles.tick()] == [HERE]
     vehicles.observe(welcome, 1, sender=("elsewhere", 9))
     (there, at), (here, home) = vehicles.tick()
@@ -321,26 +321,20 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
 
 
 def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
-    """Until then the old session flies on; after it, the old one is a stranger."""
-    vehicles = Vehicles(scenario())
-    old = vehicles.open(boot_id=5)
-    vehicles.observe(old, 50)
+    vehicles, old = live(50)
     vehicles.now_ns += SILENCE_NS + 1
     new = vehicles.open(boot_id=6)
     assert new.session != old.session
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert horizon.session == old.session
     vehicles.observe(new, 0)
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert (horizon.session, horizon.step) == (new.session, 0)
     vehicles.observe(old, 51)
     assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
 
 
 def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing() -> None:
-    """It is refused while the first is heard; both logs say so, once for each boot."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(vehicle=3, boot_id=5)
     for step in range(100):
@@ -348,8 +342,7 @@ def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing
         if step % 20 == 0:
             refused = vehicles.ask(vehicle=3, boot_id=6, sender=("other", 2))
             assert (refused.refusal, refused.session, refused.boot_id) == (Refusal.TAKEN, 0, 6)
-        ((horizon, peer),) = vehicles.tick()
-        assert isinstance(horizon, Horizon)
+        horizon, peer = vehicles.planned()
         assert (horizon.session, peer) == (first.session, HERE)
     taken = NumberTaken(vehicle=3, host="other", port=2, holder="vehicle:1")
     opened = SessionOpened(vehicle=3, host="vehicle", port=1)
@@ -358,13 +351,11 @@ def test_a_second_client_under_a_number_in_flight_is_told_so_and_changes_nothing
 
 
 def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
-    """The second is refused before the first has come, and gets in if that never does."""
     vehicles = Vehicles(scenario())
     first = vehicles.open(boot_id=5)
     assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
     vehicles.observe(first, 0)
-    ((horizon, _),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, _ = vehicles.planned()
     assert horizon.session == first.session
     vehicles = Vehicles(scenario())
     vehicles.open(boot_id=5)
@@ -375,24 +366,19 @@ def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
 
 def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
     """The network was away, not the vehicle: who was welcomed meanwhile is told when it asks."""
-    vehicles = Vehicles(scenario())
-    first = vehicles.open(boot_id=5)
-    vehicles.observe(first, 0)
+    vehicles, first = live()
     vehicles.now_ns += SILENCE_NS + 1
     second = vehicles.open(boot_id=6, sender=("other", 2))
     vehicles.observe(first, 61)
     vehicles.observe(second, 0, sender=("other", 2))
     assert vehicles.server.dropped[Drop.TAKEN] == 1
     assert vehicles.ask(boot_id=6, sender=("other", 2)).refusal == Refusal.TAKEN
-    ((horizon, peer),) = vehicles.tick()
-    assert isinstance(horizon, Horizon)
+    horizon, peer = vehicles.planned()
     assert (horizon.session, peer) == (first.session, HERE)
 
 
 def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
-    """It was welcomed while the old one had its row, and gets one of its own."""
-    vehicles = Vehicles(scenario(), room=1)
-    vehicles.observe(vehicles.open(boot_id=5), 0)
+    vehicles, _ = live(room=1)
     vehicles.now_ns += SESSION_NS - SECOND_NS
     new = vehicles.open(boot_id=6)
     vehicles.now_ns += 2 * SECOND_NS
@@ -404,7 +390,6 @@ def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> No
 
 
 def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
-    """Two lives of the server share no session."""
     welcome = Vehicles(scenario(), boot_id=1).open()
     vehicles = Vehicles(scenario(), boot_id=2**63)
     vehicles.observe(welcome, 3)
@@ -412,10 +397,7 @@ def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None
 
 
 def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
-    """One of another session is dropped; after its own the vehicle is a stranger."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     vehicles.server.events()
     assert vehicles.say(Close(1, welcome.session + 1)) == []
     assert vehicles.say(Close(2, welcome.session)) == []
@@ -429,13 +411,9 @@ def test_a_close_ends_the_session_that_it_names_and_no_other() -> None:
 
 
 def test_ticks_slept_through_are_counted_and_skipped() -> None:
-    """One horizon, for the step it is now; the grid does not move."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, _ = live()
     vehicles.tick()
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
+    due_ns = vehicles.due_ns
     vehicles.now_ns = due_ns + 3 * vehicles.dt_ns + 1
     vehicles.server.wake(now_ns=vehicles.now_ns)
     ((horizon, _),) = vehicles.answers()
@@ -475,18 +453,14 @@ def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
 
 
 def test_a_wake_before_its_time_does_nothing() -> None:
-    """A timer that fires early must not tick twice."""
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
-    due_ns = vehicles.server.next_wake_ns()
-    assert due_ns is not None
+    vehicles, _ = live()
+    due_ns = vehicles.due_ns
     vehicles.server.wake(now_ns=due_ns - 1)
     assert vehicles.answers() == []
     assert vehicles.server.next_wake_ns() == due_ns
 
 
 def test_a_silent_server_sends_heartbeats() -> None:
-    """A heartbeat keeps the session alive while no event sends a horizon."""
     vehicles = Vehicles(scenario(trigger="state_gap", epsilon=1e9))
     welcome = vehicles.open()
     sent = []
@@ -501,10 +475,7 @@ def test_a_silent_server_sends_heartbeats() -> None:
 
 
 def test_no_estimate_without_a_recent_observation() -> None:
-    """Five seconds after the last one the server plans no more, says why, and stays in touch."""
-    vehicles = Vehicles(scenario())
-    welcome = vehicles.open()
-    vehicles.observe(welcome, 0)
+    vehicles, welcome = live()
     said = [[message for message, _ in vehicles.tick()] for _ in range(122)]
     assert [[type(message) for message in each] for each in said[:101]] == [[Horizon]] * 101
     ((heartbeat,),) = (each for each in said[101:] if each)
@@ -518,8 +489,7 @@ def test_no_estimate_without_a_recent_observation() -> None:
 
 
 def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
+    vehicles, _ = live()
     vehicles.now_ns += SESSION_NS + vehicles.dt_ns
     vehicles.server.wake(now_ns=vehicles.now_ns)
     assert vehicles.server.next_wake_ns() is None
@@ -527,7 +497,6 @@ def test_a_vehicle_unheard_for_long_is_forgotten() -> None:
 
 
 def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
-    """So is the operator, once; a vehicle that is known is always welcome."""
     vehicles = Vehicles(scenario())
     for number in range(VEHICLES_MAX):
         vehicles.observe(vehicles.open(vehicle=number), 0)
@@ -556,7 +525,6 @@ def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> N
 
 
 def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
-    """Each that was told so gets its row; one that never came makes room for the next."""
     vehicles = Vehicles(scenario(), room=3)
     welcomes = [vehicles.open(vehicle=number) for number in range(3)]
     assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
@@ -653,8 +621,6 @@ def test_two_vehicles_fly_as_each_would_alone() -> None:
 
 
 def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:
-    """The first of three vehicles falls silent; a fourth takes its row, and flies as if alone."""
-
     def fourth(others: tuple[int, ...]) -> list[bytes]:
         vehicles = Vehicles(scenario())
         welcomes = {number: vehicles.open(vehicle=number) for number in others}
@@ -705,8 +671,7 @@ def test_figures_of_many_vehicles_stay_readable() -> None:
 
 
 def test_figures_tell_what_was_counted() -> None:
-    vehicles = Vehicles(scenario())
-    vehicles.observe(vehicles.open(), 0)
+    vehicles, _ = live()
     vehicles.tick()
     figures = vehicles.server.figures()
     assert (figures["vehicles"], figures["missed"]) == (1, 0)

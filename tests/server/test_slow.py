@@ -67,7 +67,6 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
             self._delay = delays[seed][name != "uplink"]
 
         def at(self, slot: int, rank: int = 0) -> Fate:  # noqa: ARG002
-            """See `Fates`."""
             return Fate(delay_ns=round(self._delay(slot * SLOT_NS / SECOND_NS) * SECOND_NS))
 
     with pytest.MonkeyPatch.context() as patch:
@@ -97,7 +96,6 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     flight = fly(flown)
     assert flight.failure is None
     error = summarise(flown, "test", flight.client).error_max
-    assert error is not None
     assert error < error_m
 
 
@@ -152,7 +150,6 @@ def growing_flights(dt: float, horizon: int, *, feedback: bool) -> dict[tuple[st
 def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
     dt: float, horizon: int, growing: str, side: str, *, feedback: bool
 ) -> None:
-    """Nothing flies away; where a flight ends without a plan, both ends have said why."""
     flight = growing_flights(dt, horizon, feedback=feedback)[growing, side]
     assert far_m(flight) < OUTSIDE_M
     if flight.failure is None:
@@ -173,7 +170,6 @@ SILENT = "the server is silent"
 
 
 def test_a_delay_that_comes_and_goes_is_flown_again() -> None:
-    """Six seconds for ten: hover, then the plan goes on, and the flight is one to the end."""
     flown = scenario(control={"dt": 0.02, "horizon": 20})
     (flight,) = fly_over(flown, [(short, lambda t: 6.0 if 8.0 < t < 18.0 else 0.05)])
     assert flight.failure is None
@@ -235,7 +231,6 @@ def test_without_echoes_a_longer_delay_is_never_flown_again(
 def test_without_echoes_and_bound_on_lateness_it_flies_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also where only observations are delayed."""
     forget_late(monkeypatch)
     forget_echoes(monkeypatch)
     assert min(far_without_m(("slowly", "downlink"), ("slowly", "both"))) > 2 * OUTSIDE_M

@@ -66,14 +66,6 @@ def hear(endpoint: Endpoint, times_ns: Sequence[int]) -> None:
         endpoint.receive(Datagram(b"?", ("peer", 1)), now_ns=now_ns)
 
 
-def test_a_clock_that_goes_on_is_passed_on_as_it_is() -> None:
-    """Also where it stalls for as long as a jump is not, and where it begins at any time."""
-    probe = Probe(due_ns=0)
-    times_ns = [MIDNIGHT_NS, MIDNIGHT_NS, MIDNIGHT_NS + 5, MIDNIGHT_NS + 5 + JUMP_NS]
-    hear(Steady(probe), times_ns)
-    assert probe.times_ns == times_ns
-
-
 def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
     asked = {name for name in vars(Endpoint) if name[0] != "_"}
     own = {
@@ -86,7 +78,6 @@ def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
 
 
 def test_a_change_is_made_at_steady_time() -> None:
-    """A change while the clock stands back happens at the latest time so far."""
     probe = Probe()
     steady = Steady(probe)
     hear(steady, [HOUR_NS])
@@ -96,7 +87,6 @@ def test_a_change_is_made_at_steady_time() -> None:
 
 @pytest.mark.parametrize("jump_ns", [-1, -HOUR_NS, JUMP_NS + 1, HOUR_NS])
 def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
-    """Every call that reads the clock notices the jump, and the wake that is due moves with it."""
     for look in ("receive", "wake", "close"):
         probe = Probe(due_ns=MIDNIGHT_NS)
         steady = Steady(probe)
@@ -111,39 +101,27 @@ def test_time_stands_still_for_a_jump_and_goes_on(jump_ns: int) -> None:
         assert steady.next_wake_ns() == MIDNIGHT_NS + jump_ns
 
 
-def test_a_clock_that_goes_on_by_more_than_a_minute_past_its_wake_has_jumped() -> None:
-    """A minute to the nanosecond has been slept through."""
-    for late_ns, shown_ns in ((60 * SECOND_NS, 60 * SECOND_NS), (60 * SECOND_NS + 1, 0)):
-        probe = Probe(due_ns=0)
-        hear(Steady(probe), [0, late_ns])
-        assert probe.times_ns == [0, shown_ns]
+MINUTE_NS = 60 * SECOND_NS
+SHOWN: dict[str, tuple[int | None, list[int], list[int], int | None]] = {
+    "goes on": (0, [7, 7, 12, 12 + JUMP_NS], [7, 7, 12, 12 + JUMP_NS], 0),
+    "a minute is slept through": (0, [0, MINUTE_NS], [0, MINUTE_NS], 0),
+    "more than a minute is a jump": (0, [0, MINUTE_NS + 1], [0, 0], MINUTE_NS + 1),
+    "an hour ahead and back": (0, [0, HOUR_NS, HOUR_NS + 1, 1, 2], [0, 0, 1, 1, 2], 0),
+    "waits for datagrams": (None, [0, HOUR_NS, HOUR_NS - 1], [0, HOUR_NS, HOUR_NS], None),
+    "a wake late": (HOUR_NS, [0, HOUR_NS + JUMP_NS], [0, HOUR_NS + JUMP_NS], HOUR_NS),
+}
+"""Wake that is asked for, what the clock shows, what the endpoint is shown, and the wake then."""
 
 
-def test_every_jump_counts() -> None:
-    """An hour ahead and an hour back is where it was."""
-    probe = Probe(due_ns=0)
+@pytest.mark.parametrize(("due_ns", "times_ns", "shown_ns", "wake_ns"), SHOWN.values(), ids=SHOWN)
+def test_an_endpoint_is_shown_a_steady_time(
+    due_ns: int | None, times_ns: list[int], shown_ns: list[int], wake_ns: int | None
+) -> None:
+    probe = Probe(due_ns)
     steady = Steady(probe)
-    hear(steady, [0, HOUR_NS, HOUR_NS + 1, 1, 2])
-    assert probe.times_ns == [0, 0, 1, 1, 2]
-    assert steady.next_wake_ns() == 0
-
-
-def test_who_only_waits_for_datagrams_may_wait_for_hours() -> None:
-    """A server without vehicles forgets in time who was there."""
-    probe = Probe(due_ns=None)
-    steady = Steady(probe)
-    hear(steady, [0, HOUR_NS, HOUR_NS - 1])
-    assert probe.times_ns == [0, HOUR_NS, HOUR_NS]
-    assert steady.next_wake_ns() is None
-
-
-def test_a_wake_that_was_asked_for_late_is_no_jump() -> None:
-    """Only what goes on past the wake is."""
-    probe = Probe(due_ns=HOUR_NS)
-    steady = Steady(probe)
-    hear(steady, [0])
-    steady.wake(now_ns=HOUR_NS + JUMP_NS)
-    assert probe.times_ns == [0, HOUR_NS + JUMP_NS]
+    hear(steady, times_ns)
+    assert probe.times_ns == shown_ns
+    assert steady.next_wake_ns() == wake_ns
 
 
 def test_all_else_is_the_endpoints_own() -> None:

@@ -42,7 +42,6 @@ def test_a_stream_is_the_same_in_another_process() -> None:
     ],
 )
 def test_other_names_give_another_stream(other: tuple[int, str | int]) -> None:
-    """Seed, purpose, number, their order and their type all count."""
     assert numbers(*other) != numbers(3, *NAMES)
 
 

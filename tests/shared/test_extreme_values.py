@@ -97,7 +97,6 @@ def fly(scenario: Scenario) -> str:
 
 @settings(
     max_examples=int(os.environ.get("LIMITS_EXAMPLES", "100")),
-    deadline=None,
     suppress_health_check=list(HealthCheck),
 )
 @given(drawn())

@@ -21,10 +21,9 @@ TWO_AXES = discretise([0.81, 0.3], DT, [1.0, 0.8])
 FIRM = ControlConfig(state_weight=(7.0, 1.0), input_weight=0.01)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(0.0, 10.0))
 def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> None:
-    """On either axis, with S beside R, and with the gain of the velocity loop."""
     weights = ControlConfig(state_weight=(7.1, q), input_weight=r, change_weight=s)
     for A, B, K in zip(
         TWO_AXES.A, TWO_AXES.B[:, :, None], gain_for(TWO_AXES, weights), strict=True
@@ -34,7 +33,7 @@ def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> Non
         np.testing.assert_allclose(K, expected, rtol=1e-7)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(1e-4, 10.0))
 def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(
     q: float, r: float, s: float
@@ -54,7 +53,6 @@ def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(
 
 
 def test_without_a_weight_of_changes_it_is_the_feedback_gain() -> None:
-    """Bit for bit, and nothing of the input before is kept."""
     flown = scenario(control={"change_weight": 0.0, "feedback": True})
     along = regulator(flown)
     np.testing.assert_array_equal(along[:, :2], feedback_gain(flown))
@@ -62,7 +60,6 @@ def test_without_a_weight_of_changes_it_is_the_feedback_gain() -> None:
 
 
 def test_where_nothing_weighs_the_position_nothing_leads_back_to_it() -> None:
-    """No weights at all ask for nothing."""
     gain = gain_for(TWO_AXES, ControlConfig(state_weight=(0.0, 1.0)))
     np.testing.assert_allclose(gain[:, 0], 0.0, atol=1e-12)
     assert (gain[:, 1] > 0.0).all()
@@ -113,7 +110,6 @@ def test_a_scenario_s_gain_is_for_its_model_but_for_the_dead_time() -> None:
 
 
 def test_a_vehicle_with_dead_time_flies_calmly_where_that_is_known() -> None:
-    """Without dead time in the model, firm feedback swings at its bounds without end."""
     commands = {}
     for dead_time_s in (0.0, 0.3):
         flown = scenario(model={"dead_time_s": dead_time_s})

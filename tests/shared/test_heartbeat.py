@@ -110,7 +110,6 @@ def test_a_new_session_assumes_a_loss_of_three_in_ten() -> None:
 
 @given(st.lists(st.integers(0, NUMBERS - 2), max_size=60), st.sampled_from([0, 2 * WINDOW]))
 def test_the_share_lost_does_not_depend_on_the_order(numbers: list[int], before: int) -> None:
-    """Within the window, whoever comes first and however often."""
     heard, sorted_ = ear(), ear()
     for number in range(before):
         hear(heard, number)
@@ -124,7 +123,6 @@ def test_the_share_lost_does_not_depend_on_the_order(numbers: list[int], before:
 
 @given(st.integers(0, 4 * NUMBERS))
 def test_of_a_burst_no_more_than_its_rest_by_the_modulus_is_seen(burst: int) -> None:
-    """All of it where it is shorter than NUMBERS."""
     hearing = ear()
     for number in range(2 * WINDOW):
         hear(hearing, number)
@@ -166,7 +164,6 @@ def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> N
 
 
 def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
-    """A loss of 10 % ends no link by mistake; a loss of 60 % does."""
     kept = keep(DirectionConfig(loss=0.1), 6)
     assert kept.false_per_h <= 1.0
     assert len(kept.noticed_s) == 6
@@ -177,12 +174,10 @@ def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
 
 
 def test_bursts_are_longer_than_any_heartbeat_helps_against() -> None:
-    """Bursts of 2 s make a link be taken for lost dozens of times an hour."""
     assert keep(DirectionConfig(loss=0.1, burst_s=2.0), 6).false_per_h > 20
 
 
 def test_a_flight_notices_that_it_is_cut() -> None:
-    """At the step after the time-out, counted from the packet that came last."""
     cut_s = 40.0
     keys = {
         "control.scheme": "trajectory",

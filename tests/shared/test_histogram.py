@@ -13,14 +13,12 @@ def filled(*values_ns: int) -> Histogram:
 
 
 def test_a_histogram_counts_by_bins_of_equal_width() -> None:
-    """The lower edge belongs to its bin; what is beyond the last bin is in it."""
     counts = filled(0, 9, 10, 19, 20, 10 * BINS - 1, 10**9).counts
     assert counts[:4] == [2, 2, 1, 0]
     assert (counts[-1], sum(counts)) == (2, 7)
 
 
 def test_a_quantile_is_never_below_the_true_one_and_at_most_a_bin_above() -> None:
-    """For a hundred durations in a row."""
     histogram = filled(*range(100, 200))
     for share, true_ns in ((0.01, 100), (0.5, 149), (0.99, 198), (1.0, 199)):
         assert true_ns <= histogram.quantile_ms(share) * MILLISECOND_NS <= true_ns + 10
@@ -39,13 +37,11 @@ def test_a_quantile_beyond_the_last_bin_is_not_understated() -> None:
 
 
 def test_bins_without_any_are_left_out() -> None:
-    """Named by their lower edges; an empty histogram has none."""
     assert filled(0, 1, 20).by_bin() == {"0": 2, "2e-05": 1}
     assert filled().by_bin() == {}
 
 
 def test_durations_below_edges_are_counted() -> None:
-    """Each number with those before it; what is beyond the last bin is among all alone."""
     histogram = Histogram(MILLISECOND_NS)
     for value_ms in (0.0, 0.9, 1.0, 2.5, 499.0, 10_000.0):
         histogram.add(round(value_ms * MILLISECOND_NS))

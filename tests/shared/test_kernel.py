@@ -111,6 +111,17 @@ print([each.name for each in kernels], len(done), kernel.missing())
 """
 
 
+def put(folder: Path, helper: str = HELPER, caller: str = CALLER) -> Path:
+    """A folder with both modules."""
+    (folder / "helper.py").write_text(helper)
+    (folder / "caller.py").write_text(caller)
+    return folder
+
+
+MODULE = CALLER.split("\nvalues = ", maxsplit=1)[0]
+"""The caller's kernel alone."""
+
+
 def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
     """Output of the caller: the result, and 1 if its machine code came from the disk.
 
@@ -134,16 +145,10 @@ def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
 
 
 def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
-    """A function, and a constant, of another module; left alone, it comes from the disk."""
-    helper = tmp_path / "helper.py"
-    helper.write_text(HELPER)
-    (tmp_path / "caller.py").write_text(CALLER)
-    assert run(tmp_path) == "2.0 0"
+    assert run(put(tmp_path)) == "2.0 0"
     assert run(tmp_path) == "2.0 1"
-    helper.write_text(HELPER.replace("FACTOR = 2", "FACTOR = 3"))
-    assert run(tmp_path) == "3.0 0"
-    helper.write_text(HELPER.replace("x * FACTOR", "x * FACTOR + 1"))
-    assert run(tmp_path) == "3.0 0"
+    assert run(put(tmp_path, HELPER.replace("FACTOR = 2", "FACTOR = 3"))) == "3.0 0"
+    assert run(put(tmp_path, HELPER.replace("x * FACTOR", "x * FACTOR + 1"))) == "3.0 0"
     assert run(tmp_path) == "3.0 1"
 
 
@@ -162,15 +167,13 @@ def quiet(folder: Path, code: str, *argv: str) -> str:
 
 @pytest.mark.long
 def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
-    """Every command is asked, with nothing on disk: it took 80 s until the first words."""
     quiet(tmp_path, HELP, *REFUSED)
     assert not (tmp_path / "kept").exists()
 
 
 def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     """A line where there is no terminal; nothing where machine code is on disk."""
-    (tmp_path / "helper.py").write_text(HELPER)
-    (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    put(tmp_path, caller=MODULE)
     said = "compiling the control loops, once on this machine: it takes up to a minute\n"
     assert quiet(tmp_path, PREPARED) == said
     assert quiet(tmp_path, PREPARED) == ""
@@ -181,7 +184,7 @@ def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -
     """Their machine code is read from the disk; where no helper can be started, it is made here."""
     (tmp_path / "helper.py").write_text(HELPER)
     for name in ("caller", "second"):
-        (tmp_path / f"{name}.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+        (tmp_path / f"{name}.py").write_text(MODULE)
     done = subprocess.run(
         [sys.executable, "-P", "-c", SIDE_BY_SIDE, helpers],
         cwd=tmp_path,
@@ -200,29 +203,21 @@ def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -
 
 def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:
     """The type has moved to another module, as it may between two versions."""
-    (tmp_path / "helper.py").write_text(HELPER)
-    caller = tmp_path / "caller.py"
-    caller.write_text(CALLER)
-    assert run(tmp_path) == "2.0 0"
+    assert run(put(tmp_path)) == "2.0 0"
     (tmp_path / "elsewhere.py").write_text(HELPER)
-    (tmp_path / "helper.py").write_text(HELPER.replace("Given", "Told"))
-    caller.write_text(CALLER.replace("from helper import Given, ", "from elsewhere import Given, "))
-    assert run(tmp_path) == "2.0 0"
+    moved = CALLER.replace("from helper import Given, ", "from elsewhere import Given, ")
+    assert run(put(tmp_path, HELPER.replace("Given", "Told"), moved)) == "2.0 0"
 
 
 def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
-    """Neither beside the source, nor in a home: it compiles, and keeps nothing."""
-    (tmp_path / "helper.py").write_text(HELPER)
-    (tmp_path / "caller.py").write_text(CALLER)
+    put(tmp_path)
     (tmp_path / "__pycache__").write_text("a file, where a folder should be")
     (tmp_path / ".cache").write_text("likewise")
     assert run(tmp_path) == "2.0 0"
 
 
 def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
-    """A file that can be opened but not written keeps nothing; the kernel still compiles."""
-    (tmp_path / "helper.py").write_text(HELPER)
-    (tmp_path / "caller.py").write_text(CALLER)
+    put(tmp_path)
     assert run(tmp_path, file_bytes=100) == "2.0 0"
     assert run(tmp_path) == "2.0 0"
     assert run(tmp_path) == "2.0 1"
@@ -283,7 +278,6 @@ def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
 
 def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
     """At its first call, and at each where that is asked for, as in all tests."""
-    (tmp_path / "helper.py").write_text(HELPER)
-    (tmp_path / "caller.py").write_text(CALLER.split("\nvalues = ", maxsplit=1)[0])
+    put(tmp_path, caller=MODULE)
     assert quiet(tmp_path, REFUSING) == ""
     assert quiet(tmp_path, REFUSING, "checked") == ""

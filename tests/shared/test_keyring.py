@@ -48,7 +48,6 @@ def put(path: Path, content: bytes, mode: int = 0o600) -> Path:
 
 
 def test_a_vehicle_uses_its_key_with_the_highest_number() -> None:
-    """Unless it is told another; the server finds each by its number."""
     keys = keyring(write(1, 7, A), "# the next\n\n", write(1, 9, B), f"2 0 {C.hex()} # spare\n")
     assert len(keys) == 3
     assert keys.of(1) == VehicleKey.of(1, 9, B)
@@ -67,7 +66,6 @@ def test_a_key_that_is_missing_is_named() -> None:
 
 
 def test_what_is_derived_from_a_secret_depends_on_all_of_it() -> None:
-    """Key and MAC have nothing in common, and one bit of the secret changes both."""
     key, other = VehicleKey.of(1, 1, A), VehicleKey.of(1, 1, A[:-1] + b"\0")
     assert len({key.psk, key.mac, other.psk, other.mac, A}) == 5
 
@@ -91,10 +89,7 @@ GOOD = f"1 1 {A.hex()}"
         (GOOD[:-1] + "g", "line 1: a secret of 64 characters, expected 64 hexadecimal digits"),
         (f"{GOOD}\n1 1 {B.hex()}", "line 2: key 1 of vehicle 1 again"),
         (f"{GOOD}\n2 1 {A.hex()}", "line 2: the secret of line 1 again, expected another"),
-        (
-            f"{GOOD}\n1 2 {B.hex()}\n1 3 {C.hex()}",
-            "line 3: one more key of vehicle 1, expected at most 2",
-        ),
+        (f"{GOOD}\n1 2 {B.hex()}\n1 3 {C.hex()}", "line 3: one more key of vehicle 1"),
     ],
 )
 def test_a_line_that_is_none_is_refused_and_not_repeated(content: str, message: str) -> None:
@@ -106,7 +101,6 @@ def test_a_line_that_is_none_is_refused_and_not_repeated(content: str, message: 
 
 
 def test_any_bytes_give_keys_or_one_line() -> None:
-    """Binary files, and lines that no text has."""
     for content in (b"\0\xff\xfe", b"1 1 " + b"\xb2" * 64, b"\x0c", "1 1 ٣".encode()):
         with pytest.raises(ConfigError):
             parse("keys", content)
@@ -114,7 +108,6 @@ def test_any_bytes_give_keys_or_one_line() -> None:
 
 @pytest.mark.parametrize("mode", [0o640, 0o620, 0o604, 0o602, 0o666, 0o700, 0o610])
 def test_a_file_that_others_can_read_or_write_is_refused(mode: int, tmp_path: Path) -> None:
-    """Other users who can read the file have the keys; ssh refuses such a file, too."""
     path = put(tmp_path / "keys", write(1, 1, A).encode(), mode)
     with pytest.raises(ConfigError, match=rf"its mode is {mode:04o}, expected 0600"):
         load(path)
@@ -148,7 +141,6 @@ def test_a_file_that_others_can_put_another_for_is_refused(tmp_path: Path) -> No
 
 
 def test_keygen_makes_no_file_that_would_be_refused(tmp_path: Path) -> None:
-    """In a folder that anybody may write to, or by a link that leads nowhere yet."""
     (tmp_path / "link").symlink_to(tmp_path / "keys")
     run = keygen("link", cwd=tmp_path)
     assert (run.returncode, "it is a link" in run.stderr) == (2, True)
@@ -159,7 +151,6 @@ def test_keygen_makes_no_file_that_would_be_refused(tmp_path: Path) -> None:
 
 
 def test_what_is_no_file_of_keys_is_refused_in_one_line(tmp_path: Path) -> None:
-    """Missing, a folder, a device, too long, or with a name that no file can have."""
     long = put(tmp_path / "long", b"#" * 16_000_001)
     for path, message in (
         (tmp_path / "none", "cannot be read: No such file or directory"),
@@ -182,7 +173,6 @@ def test_no_secret_is_shown_by_a_repr() -> None:
 
 
 def test_keygen_writes_a_file_for_its_owner_alone(tmp_path: Path) -> None:
-    """A key for each vehicle, each another; nothing of a secret is printed."""
     run = keygen("fleet.keys", "--vehicles", "3", "--first", "5", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "fleet.keys: wrote 3 keys, of vehicles 5 to 7." in run.stdout
@@ -197,7 +187,6 @@ def test_keygen_writes_a_file_for_its_owner_alone(tmp_path: Path) -> None:
 
 
 def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
-    """The present key stays; the vehicle uses the next one."""
     path = put(tmp_path / "k", write(4, 1, A).encode().rstrip())  # without an end of line
     assert keygen("k", "--add", "--first", "4", cwd=tmp_path).returncode == 0
     keys = load(path)
@@ -245,7 +234,6 @@ def test_keygen_refuses_in_one_line_and_changes_nothing(
 
 
 def test_keygen_adds_nothing_to_a_file_that_others_can_read(tmp_path: Path) -> None:
-    """It is checked as a server would."""
     put(tmp_path / "k", write(4, 1, A).encode(), 0o644)
     run = keygen("k", "--add", cwd=tmp_path)
     assert run.returncode == 2

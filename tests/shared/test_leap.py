@@ -13,7 +13,6 @@ LEAST = 1e-9
     [(0.0, 2.0), (0.05, 4.5), (0.5, 27.0), (2.0, 102.0)],
 )
 def test_a_velocity_changes_by_noise_and_50_m_s2_at_most(time: float, change: float) -> None:
-    """In either direction, and from whatever velocity."""
     for v in (-30.0, 0.0, 8.0):
         for sign in (1.0, -1.0):
             assert not velocity_leaps(v, v + sign * (change - LEAST), time, 2.0)
@@ -27,7 +26,6 @@ def test_a_velocity_changes_by_noise_and_50_m_s2_at_most(time: float, change: fl
 def test_a_position_goes_on_with_the_mean_velocity_but_for_noise_and_what_50_m_s2_bring(
     time: float, travel: float, off: float
 ) -> None:
-    """From 3 to 5 m/s; in either direction, and from wherever it was."""
     for p in (-100.0, 0.0, 7.0):
         for sign in (1.0, -1.0):
             reached = p + travel + sign * off

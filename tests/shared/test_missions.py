@@ -29,7 +29,6 @@ def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_first_two_that_are_too_near_are_found(seed: int) -> None:
-    """As if each were compared with each at each time."""
     rng = np.random.default_rng(seed)
     for _ in range(20):
         goals: Goals = {}
@@ -42,7 +41,6 @@ def test_the_first_two_that_are_too_near_are_found(seed: int) -> None:
 
 
 def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
-    """One leaves when the next one comes."""
     turns: Goals = {
         1: (np.array([0.0, 5.0]), np.array([[0.0, 0.0], [9.0, 9.0]])),
         2: (np.array([0.0, 5.0]), np.array([[5.0, 5.0], [0.0, 0.0]])),
@@ -58,7 +56,6 @@ def grid(vehicles: int) -> Array:
 
 
 def test_many_vehicles_are_checked_in_proportion() -> None:
-    """In a table, with places apart, all at one place, and one place visited by all in turn."""
     lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
     table = "\n".join(["vehicle,t,x,y", *lines]).encode()
     before = resource.getrusage(resource.RUSAGE_SELF)

@@ -13,9 +13,7 @@ from skytether.server.common.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
 
-quick = settings(max_examples=60, deadline=None)
-time_constants = st.floats(0.02, 50.0)
-steps_s = st.floats(0.001, 1.0)
+quick = settings(max_examples=60)
 
 
 def sampled(tau_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -26,49 +24,19 @@ def sampled(tau_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("dt_s", [0.001, 0.05, 1.0])
-@pytest.mark.parametrize("tau_s", [(0.81, 0.81), (0.3, 2.0), (0.05, 0.81, 7.0)])
+@pytest.mark.parametrize("tau_s", [(0.81, 0.81), (0.3, 2.0), (0.05, 0.81, 7.0), (1e-4, 50.0)])
 def test_discretisation_is_the_matrix_exponential(tau_s: tuple[float, ...], dt_s: float) -> None:
-    """Each axis is sampled exactly, with its own time constant."""
-    model = discretise(np.array(tau_s), dt_s)
-    for axis, tau in enumerate(tau_s):
+    gains = [1.0, 0.8, 1.3][: len(tau_s)]
+    model = discretise(np.array(tau_s), dt_s, gains)
+    for axis, (tau, gain) in enumerate(zip(tau_s, gains, strict=True)):
         A, B = sampled(tau, dt_s)
         np.testing.assert_allclose(model.A[axis], A, rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(model.B[axis], B, rtol=1e-12, atol=1e-15)
-
-
-@quick
-@given(time_constants, steps_s)
-def test_two_half_steps_make_a_whole_one(tau_s: float, dt_s: float) -> None:
-    """An input held for Δt leads where holding it twice for Δt/2 leads."""
-    whole, half = (discretise(np.array([tau_s]), dt) for dt in (dt_s, dt_s / 2))
-    x, u = np.array([[1.3, -0.7]]), np.array([1.8])
-    twice = half.step(half.step(x, u), u)
-    np.testing.assert_allclose(whole.step(x, u), twice, rtol=0, atol=1e-13)
-
-
-def test_velocity_covers_63_percent_of_a_change_in_one_time_constant() -> None:
-    """After τ, v = (1 - 1/e) u and p = u τ / e."""
-    tau_s, u = np.array([0.5, 0.8]), np.array([2.0, -3.0])
-    for axis in range(2):
-        x = discretise(tau_s, tau_s[axis]).step(np.zeros((2, 2)), u)[axis]
-        assert x[1] == pytest.approx(u[axis] * (1 - np.exp(-1)), rel=1e-14)
-        assert x[0] == pytest.approx(u[axis] * tau_s[axis] * np.exp(-1), rel=1e-14)
-
-
-def test_flight_at_the_commanded_velocity_is_a_straight_line() -> None:
-    """With v = u nothing accelerates, however many steps are flown."""
-    model = discretise(np.array([0.3, 0.9, 4.0]), 0.05)
-    u = np.array([1.0, -2.0, 0.25])
-    x = np.stack([np.zeros(3), u], axis=-1)
-    for _ in range(200):
-        x = model.step(x, u)
-    np.testing.assert_allclose(x, np.stack([10.0 * u, u], axis=-1), rtol=1e-12)
+        np.testing.assert_allclose(model.B[axis], gain * B, rtol=1e-12, atol=1e-15)
 
 
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.sampled_from([2, 3]))
 def test_batch_steps_as_its_singles(seed: int, vehicles: int, axes: int) -> None:
-    """A vehicle flies the same alone and in a fleet, to the last bit."""
     rng = np.random.default_rng(seed)
     model = discretise(rng.uniform(0.1, 3.0, axes), 0.05)
     x, u = rng.normal(size=(vehicles, axes, 2)), rng.normal(size=(vehicles, axes))
@@ -84,21 +52,6 @@ def test_very_long_time_constant_stays_exact(tau_s: float) -> None:
     np.testing.assert_allclose(model.A[0], A, rtol=1e-15, atol=1e-17)
     assert model.B[0, 1] == pytest.approx(B[1], rel=1e-14)
     assert model.B[0, 0] == pytest.approx(B[0], abs=2e-17)
-
-
-def test_very_long_time_constant_is_a_double_integrator() -> None:
-    """For τ → ∞, u / τ is an acceleration: p + v Δt + ½ a Δt², v + a Δt."""
-    tau_s, dt, acceleration = 1e7, 0.1, 3.0
-    model = discretise(np.array([tau_s]), dt)
-    p, v = model.step(np.array([[2.0, -1.0]]), np.array([acceleration * tau_s]))[0]
-    assert p == pytest.approx(2.0 - 1.0 * dt + 0.5 * acceleration * dt**2, abs=1e-8)
-    assert v == pytest.approx(-1.0 + acceleration * dt, abs=1e-7)
-
-
-def test_very_short_time_constant_follows_at_once() -> None:
-    """With τ far below Δt the vehicle flies u, and lags by u τ."""
-    x = discretise(np.array([1e-4]), 0.5).step(np.array([[0.0, -9.0]]), np.array([2.0]))
-    np.testing.assert_allclose(x, [[2.0 * 0.5 - 11.0 * 1e-4, 2.0]], rtol=1e-14)
 
 
 def test_a_roll_is_its_steps() -> None:
@@ -137,14 +90,15 @@ def test_a_step_is_the_matrix_equation(seed: int) -> None:
     np.testing.assert_allclose(model.step(x, u), expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("dt_s", [0.02, 0.05, 0.5])
+@pytest.mark.parametrize("dt_s", [0.01, 0.05, 0.5])
 def test_the_covariance_under_white_acceleration_is_that_of_the_integral(dt_s: float) -> None:
     """∫ e^{As} G Gᵀ e^{Aᵀs} over a step, by quadrature, on axes that differ."""
-    tau_s = np.array([0.2, 0.84, 3.0])
+    tau_s = np.array([0.05, 0.3, 0.84, 5.0])
     roots = white_acceleration(tau_s, dt_s)
-    nodes, weights = np.polynomial.legendre.leggauss(20)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
     s = 0.5 * dt_s * (nodes + 1.0)
     for root, tau in zip(roots, tau_s, strict=True):
         felt = np.array([tau * (1.0 - np.exp(-s / tau)), np.exp(-s / tau)])
         expected = 0.5 * dt_s * (weights * felt) @ felt.T
-        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6)
+        assert root[0, 1] == 0.0
+        np.testing.assert_allclose(root @ root.T, expected, rtol=1e-8)

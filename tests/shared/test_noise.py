@@ -92,7 +92,6 @@ def packet(key: bytes, counter: int, payload: bytes) -> bytes:
 
 @pytest.mark.parametrize("i", range(len(VECTORS)))
 def test_every_byte_is_that_of_noise(i: int) -> None:
-    """Both messages and the first packets each way, with the ephemeral keys given."""
     prologue, hello, welcome, first, second, *packets = map(bytes.fromhex, VECTORS[i])
     psk = fixed(f"psk {i}")
     initiator = Initiator(psk, prologue, fixed(f"initiator {i}"), hello)
@@ -112,7 +111,6 @@ def test_every_byte_is_that_of_noise(i: int) -> None:
 
 
 def test_each_answer_has_keys_of_its_own() -> None:
-    """One first message may be answered twice, and both answers be opened."""
     initiator, responder = shake(PSK)
     found = set()
     for name in ("b", "c"):
@@ -125,7 +123,6 @@ def test_each_answer_has_keys_of_its_own() -> None:
 
 
 def test_a_message_that_was_changed_is_refused() -> None:
-    """Every bit of either message, and every shorter and longer one."""
     initiator, responder = shake(PSK)
     answer, _ = responder.answer(fixed("b"), b"welcome")
     for message, read in (
@@ -144,7 +141,6 @@ def test_a_message_that_was_changed_is_refused() -> None:
 
 
 def test_another_key_or_prologue_is_refused() -> None:
-    """At the first message, before any costly mathematics."""
     initiator, _ = shake(PSK)
     with pytest.raises(NoiseError):
         Responder(bytes(32), b"", initiator.message)
@@ -153,7 +149,6 @@ def test_another_key_or_prologue_is_refused() -> None:
 
 
 def test_an_answer_to_another_attempt_is_refused() -> None:
-    """Even where hello, key and prologue are alike."""
     initiator, _ = shake(PSK)
     other = Initiator(PSK, b"", fixed("other"), b"hello")
     answer, _ = Responder(PSK, b"", other.message).answer(fixed("b"), b"welcome")
@@ -173,7 +168,6 @@ def test_an_ephemeral_key_without_secret_is_refused() -> None:
 
 
 def test_a_message_is_48_bytes_longer_than_its_payload() -> None:
-    """The packets of the handshake are laid out with it."""
     initiator, responder = shake(PSK)
     assert len(initiator.message) == len(b"hello") + MESSAGE_BYTES
     assert len(responder.answer(fixed("b"), b"")[0]) == MESSAGE_BYTES == 48

@@ -4,7 +4,6 @@ from skytether.shared.core.stopwatch import Stopwatch
 
 
 def test_laps_follow_each_other_and_add_up_by_name() -> None:
-    """From the start to the first lap, from lap to lap; what lies before a start is nobody's."""
     times = iter([100, 130, 135, 1000, 1007])
     watch = Stopwatch(lambda: next(times))
     watch.start()

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import packaged, refusal
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
@@ -16,6 +17,7 @@ from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.policies import PolicyError
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.zones import Zones
+from two_vehicles import with_goals
 
 BOX = "box(1, 2, -1, 1)"
 U = "polygon(0, 0, 4, 0, 4, 3, 3, 3, 3, 1, 1, 1, 1, 3, 0, 3)"
@@ -58,7 +60,6 @@ def test_distances(text: str, point: tuple[float, ...], distance_m: float) -> No
 
 
 def test_a_cylinder_lies_within_its_corners() -> None:
-    """Nobody is nearer to it than the polygon says."""
     angle = np.linspace(0.0, 2.0 * np.pi, 100)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     assert max(away_m("cylinder(0, 0, 1)", *map(tuple, around))) < 1e-9
@@ -68,7 +69,6 @@ def test_a_cylinder_lies_within_its_corners() -> None:
 def test_a_straight_piece_is_no_nearer_than_it_says(
     x0: float, y0: float, x1: float, y1: float, text: str
 ) -> None:
-    """Held against many points of it, and never off by more than there can be between them."""
     kept, ends = zones.parse(text, 2), np.array([[x0, y0], [x1, y1]])
     share = np.linspace(0.0, 1.0, 201)[:, None]
     points = ends[0] + share * (ends[1] - ends[0])
@@ -111,7 +111,6 @@ def test_straight_pieces_in_space(
 
 @given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
 def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, text: str) -> None:
-    """A point outside does, and a convex zone lies wholly on their other side."""
     kept, point = zones.parse(text, 2), np.array([[x, y]])
     if kept.clearance(point).min() < room_m:
         return
@@ -125,7 +124,6 @@ def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, 
 
 
 def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
-    """Below it they may be; a fence stays as it is."""
     kept = zones.parse("box(0, 1, 0, 1, 2, 3) & fence(-5, 5, -5, 5)", 3)
     points = np.array([[0.5, 0.5, 1.0], [0.5, 0.5, 9.0]])
     assert kept.clearance(points)[:, 0].tolist() == [1.0, 6.0]
@@ -173,7 +171,6 @@ def polygon(points: Any, **properties: Any) -> dict[str, Any]:
 
 
 def test_zones_from_a_map(tmp_path: Path) -> None:
-    """Degrees become metres east and north of the origin; a hole in a fence is kept out of."""
     file = tmp_path / "map.geojson"
     degree_m = 111_319.5
     square = [[10.0, 50.0], [10.001, 50.0], [10.001, 50.001], [10.0, 50.001], [10.0, 50.0]]
@@ -274,7 +271,6 @@ def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -
 
 
 def test_neither_winding_nor_hole_changes_where_a_vehicle_may_be(tmp_path: Path) -> None:
-    """A hole in what is kept out of does not open it; a hole in a fence is kept out of."""
     file = tmp_path / "map.geojson"
     hole = [[3, 3], [6, 3], [6, 6], [3, 6], [3, 3]]
     places = np.array([[1.0, 1.0], [4.5, 4.5], [12.0, 1.0]])
@@ -293,15 +289,6 @@ def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
     zones.parse(U, 2)
 
 
-def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n") -> Any:
-    """The table of a mission with these zones."""
-    (tmp_path / "goals.csv").write_text(f"vehicle,t,x,y\n{goals}")
-    table = reading.to_table(reading.load("swap"))
-    table["reference"] |= {"shape": "mission", "file": str(tmp_path / "goals.csv")}
-    table["mission"]["zones"] = text
-    return table
-
-
 @pytest.mark.parametrize(
     ("text", "goals", "said"),
     [
@@ -313,18 +300,13 @@ def mission(tmp_path: Path, text: str, goals: str = "1,0,0,0\n1,2,4,0\n2,0,0,4\n
     ],
 )
 def test_goals_that_cannot_be_reached(text: str, goals: str, said: str, tmp_path: Path) -> None:
-    table = mission(tmp_path, text, *([goals] if goals else []))
-    with pytest.raises(ConfigError) as refused:
-        reading.check(table, "mission")
-    assert said in str(refused.value)
+    table = with_goals(tmp_path, goals or "1,0,0,0\n1,2,4,0\n2,0,0,4\n", zones=text)
+    assert said in refusal(lambda: reading.check(table, "mission"))
 
 
 def test_zones_are_of_missions_alone() -> None:
-    """Elsewhere nobody would keep out of them."""
-    table = reading.to_table(reading.load("target"))
-    table["mission"]["zones"] = BOX
     with pytest.raises(ConfigError, match=r"mission\.zones: .*expected none without a mission"):
-        reading.check(table, "target")
+        packaged("target", mission={"zones": BOX})
 
 
 def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
@@ -351,7 +333,6 @@ def length_m(way: Array) -> float:
     ],
 )
 def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) -> None:
-    """It keeps its distance, and is hardly longer than the shortest that there is."""
     kept, begin = zones.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
     way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
     assert len(way) > 2
@@ -360,7 +341,6 @@ def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) 
 
 
 def test_where_there_is_no_way() -> None:
-    """The goal itself is aimed at, and that there is none can be asked."""
     kept = zones.parse("fence(-5, 5, -5, 5) & box(-0.5, 0.5, -5, 5)", 2)
     routes = Routes(kept, 0.2)
     begin, goal = np.array([-3.0, 0.0]), np.array([3.0, 0.0])

@@ -82,7 +82,6 @@ scenarios = st.fixed_dictionaries(
 @settings(max_examples=60)
 @given(scenarios)
 def test_flights_are_the_same(sections: dict[str, Any]) -> None:
-    """Of any scheme, sensor, wind, report and network."""
     assert_same(packaged("paper", SHORT, **sections))
 
 
@@ -108,14 +107,12 @@ def test_flights_of_each_kind_of_vehicle_are_the_same(name: str, sections: dict[
 
 @pytest.mark.parametrize("name", ["swap", "corridor"])
 def test_missions_are_the_same(name: str) -> None:
-    """Vehicles that hold their places, fly motions and come to rest, over a network that loses."""
     lossy = {"uplink": {"loss": 0.3}, "downlink": {"loss": 0.3}}
     flown = packaged(name, {"duration": 12.0, "settle": 0.0}, network=lossy)
     assert_same(flown, vehicles=len(flown.make_reference().vehicles))
 
 
 def test_vehicles_of_a_batch_and_of_a_fleet_keep_the_order_of_their_records() -> None:
-    """The order is that of time: of several vehicles, of a batch, and on a sealed link."""
     flown = packaged("target", {"duration": 8.0, "settle": 0.0})
     assert_same(flown, vehicles=3, secure=True)
     batch = fly_batch(flown, [3, 4, 5])

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,10 +33,14 @@ def summary(flown: Scenario, flight: Record) -> Summary:
     return summarise(flown, "test", flight.client, flight.server, flight.netem)
 
 
-QUIET = {
-    "uplink": {"delay": "none", "loss": 0.0},
-    "downlink": {"delay": "none", "loss": 0.0},
-}
+def flew(name: str = "paper-every-step", **changes: Any) -> Summary:
+    """Summary of a flight of a packaged scenario with other keys."""
+    flown = packaged(name, **changes)
+    return summary(flown, fly(flown))
+
+
+NOTHING = {"delay": "none", "loss": 0.0}
+QUIET = {"uplink": NOTHING, "downlink": NOTHING}
 """A network that does nothing."""
 
 HASH = """
@@ -59,7 +64,6 @@ def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None
 
 
 def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
-    """The paper's claim, over five seeds: without compensation the error is 2.5 times as large."""
     error = {}
     for name in ("paper-no-compensation", "paper-every-step"):
         flown = packaged(name, duration=33.0)
@@ -69,18 +73,10 @@ def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
 
 
 def test_the_event_trigger_saves_four_packets_in_five() -> None:
-    """For an error that grows, but stays under what no compensation costs."""
-    every_step, triggered = (
-        summary(flown, fly(flown)) for flown in (packaged("paper-every-step"), packaged("paper"))
-    )
+    every_step, triggered = flew(), flew("paper")
     assert every_step.event_ratio == 1.0
-    assert triggered.event_ratio is not None
     assert triggered.event_ratio < 0.2
-    assert triggered.uplink_packets is not None
-    assert every_step.uplink_packets is not None
     assert triggered.uplink_packets < 0.25 * every_step.uplink_packets
-    assert triggered.rmse_xy is not None
-    assert every_step.rmse_xy is not None
     assert every_step.rmse_xy < triggered.rmse_xy < 2.5 * every_step.rmse_xy
 
 
@@ -107,7 +103,6 @@ HORIZONS = "uplink horizons, other packets"
 
 
 def test_the_summary_counts_what_the_network_saw() -> None:
-    """Every packet once, lost ones with them."""
     flown = packaged("paper", duration=20.0)
     flight = fly(flown)
     result = summary(flown, flight)
@@ -119,7 +114,6 @@ def test_the_summary_counts_what_the_network_saw() -> None:
     assert result.downlink_packets == len(down) >= 390
     assert result.downlink_bytes == down["bytes"].sum()
     assert result.uplink_packets == len(up)
-    assert result.event_ratio is not None
     assert result.event_ratio * len(flight.server) == pytest.approx(flight.server["event"].sum())
     assert result.uplink_horizons == flight.server["event"].sum()
     horizons = summary_rows(result)[[name for name, _ in summary_rows(result)].index(HORIZONS)][1]
@@ -132,7 +126,6 @@ def test_the_summary_counts_what_the_network_saw() -> None:
 
 
 def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
-    """Packets that enter at one time meet one fate, for any contender and earlier traffic."""
     met: list[dict[tuple[int, int], tuple[int, bool]]] = []
     bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
     for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
@@ -151,14 +144,10 @@ def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
 
 def test_age_is_a_round_trip_and_the_wait_for_the_next_step() -> None:
     """At least 0.8 s of delay, at most 0.25 s of waiting and jitter at the median."""
-    flown = packaged("paper-every-step", duration=20.0)
-    result = summary(flown, fly(flown))
-    assert result.age_ms_p50 is not None
-    assert 850 <= result.age_ms_p50 <= 1050
+    assert 850 <= flew(duration=20.0).age_ms_p50 <= 1050
 
 
 def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
-    """A record of six steps, from the second on, counted by hand."""
     flown = packaged("paper", duration=1.0, settle=0.05)
     rows = np.zeros(6, client_columns(2))
     rows["step"] = range(6)
@@ -177,7 +166,6 @@ def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
 
 @pytest.mark.parametrize("offset_s", [-3600.0, 0.5, 86000.0])
 def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
-    """The vehicle's clock may be hours off: only the round trip enters."""
     flown = packaged("paper-every-step", duration=15.0)
     plain = fly(flown)
     clocks = {"clock_offset_s": offset_s}
@@ -187,21 +175,16 @@ def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
 
 def test_a_drifting_clock_is_followed() -> None:
     """200 ppm for a minute are 12 ms: the flight is as good as without."""
-    flown = packaged("paper-every-step", seed=3)
-    drifting = packaged("paper-every-step", seed=3, simulation={"clock_drift_ppm": 200.0})
-    plain, drifted = summary(flown, fly(flown)), summary(drifting, fly(drifting))
+    plain, drifted = flew(seed=3), flew(seed=3, simulation={"clock_drift_ppm": 200.0})
     assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
 
 
 def test_a_server_too_slow_for_its_steps_misses_deadlines_and_says_so() -> None:
     """80 ms of computing in steps of 50 ms: three ticks in eight are skipped."""
-    flown = packaged("paper-every-step", duration=10.0, simulation={"compute_s": 0.08})
-    result = summary(flown, fly(flown))
-    assert 65 <= result.deadline_misses <= 75
+    assert 65 <= flew(duration=10.0, simulation={"compute_s": 0.08}).deadline_misses <= 75
 
 
 def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
-    """3-D: the third axis holds its altitude, all axes are controlled."""
     flown = packaged(
         "paper-every-step",
         duration=20.0,
@@ -212,39 +195,30 @@ def test_it_flies_in_space_with_a_time_constant_for_each_axis() -> None:
     flight = fly(flown)
     result = summary(flown, flight)
     assert flight.client["state"].shape == (400, 3, 2)
-    assert result.rmse_z is not None
     assert result.rmse_z < 0.2
     assert flight.client["state"][-1, 2, 0] == pytest.approx(5.0, abs=0.05)
 
 
 def test_two_vehicles_share_one_server() -> None:
-    """Each vehicle has its own flow, and both fly as well as one alone."""
     flown = packaged("paper-every-step", duration=20.0)
     flight = fly(flown, vehicles=2)
     for vehicle in (1, 2):
         rows = flight.client[flight.client["vehicle"] == vehicle]
         result = summarise(flown, "test", rows, flight.server, flight.netem)
         assert result.steps == 400
-        assert result.rmse_xy is not None
         assert result.rmse_xy < 0.4
     assert set(flight.netem["flow"]) == {0, 1}
 
 
 def test_a_network_that_loses_everything_is_no_flight() -> None:
-    """The client gives up, and says why."""
-    lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
+    lost = QUIET | {"uplink": NOTHING | {"loss": 1.0}}
     flight = fly(packaged("paper", settle=0.0, network=lost))
     assert flight.failure == NoAnswer(vehicle=1, host="netem 1", port=0, waited_s=121.0)
     assert len(flight.client) == 0
 
 
 def test_a_flight_keeps_what_everybody_said() -> None:
-    """In the order of time, each with its host; names and numbers are the flight's own."""
-    lossless = {
-        "uplink": {"delay": "none", "loss": 0.0},
-        "downlink": {"delay": "none", "loss": 0.0},
-    }
-    flown = packaged("paper", duration=2.0, settle=0.0, seed=7, network=lossless)
+    flown = packaged("paper", duration=2.0, settle=0.0, seed=7, network=QUIET)
     events = fly(flown, vehicles=2).events
     assert [event.time_ns for event in events] == sorted(event.time_ns for event in events)
     said = {host: [event for _, name, event in events if name == host] for _, host, _ in events}
@@ -264,16 +238,9 @@ def test_a_flight_keeps_what_everybody_said() -> None:
 
 
 def test_wind_and_gusts_push_but_do_not_break() -> None:
-    calm = packaged("paper-every-step", duration=30.0)
-    windy = packaged(
-        "paper-every-step",
-        duration=30.0,
-        vehicle={"wind": 0.3, "gust_mps2": 0.5, "gust_every_s": 5.0},
-    )
-    calm_m, windy_m = (summary(flown, fly(flown)).rmse_xy for flown in (calm, windy))
-    assert calm_m is not None
-    assert windy_m is not None
-    assert calm_m < windy_m < 2.0
+    gusts = {"wind": 0.3, "gust_mps2": 0.5, "gust_every_s": 5.0}
+    calm, windy = flew(duration=30.0), flew(duration=30.0, vehicle=gusts)
+    assert calm.rmse_xy < windy.rmse_xy < 2.0
 
 
 def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import skytether.sim.flight
 from helpers import packaged
 from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import Finished, ModeChanged, NotFlown
@@ -64,12 +64,10 @@ class Interrupted(Server):
         return encode(Heartbeat(vehicle, session, server_us, Idle.PLANS, 0))
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if self.mute or not self.gone(now_ns):
             super().receive(datagram, now_ns=now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if not self.gone(now_ns):
             super().wake(now_ns=now_ns)
         elif self.mute:
@@ -80,28 +78,16 @@ class Interrupted(Server):
 
 
 def interrupted(
-    monkeypatch: pytest.MonkeyPatch,
-    flown: Scenario,
-    begin_s: float,
-    end_s: float = 1e6,
-    *,
-    mute: bool = False,
+    flown: Scenario, begin_s: float, end_s: float = 1e6, *, mute: bool = False
 ) -> Record:
     """A flight with a server that is gone, or sends no horizon, from one time to another."""
-
-    class ThisOne(Interrupted):
-        gone_s = begin_s, end_s
-
-    ThisOne.mute = mute
-    monkeypatch.setattr(skytether.sim.flight, "Server", ThisOne)
-    return fly(flown)
+    server = Interrupted(flown, boot_id=1, entropy=stream(1, "entropy").bytes)
+    server.gone_s, server.mute = (begin_s, end_s), mute
+    return fly(flown, server=server)
 
 
-def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The server answers, and sends heartbeats: that is no flight."""
-    flight = interrupted(monkeypatch, scenario(), 0.0, mute=True)
+def test_a_vehicle_that_never_had_a_horizon_was_never_flown() -> None:
+    flight = interrupted(scenario(), 0.0, mute=True)
     why = str(Reason.OLD)
     assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
     assert said(flight)[-1] == flight.failure
@@ -109,11 +95,8 @@ def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
 
 
 @pytest.mark.parametrize("mute", [False, True])
-def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
-    monkeypatch: pytest.MonkeyPatch, *, mute: bool
-) -> None:
-    """The server dies after a heartbeat, or sends nothing but heartbeats from then on."""
-    flight = interrupted(monkeypatch, scenario(), 10.6, mute=mute)
+def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(*, mute: bool) -> None:
+    flight = interrupted(scenario(), 10.6, mute=mute)
     why = str(Reason.OLD if mute else Reason.LOST)
     assert isinstance(flight.failure, NotFlown)
     assert flight.failure.why == why
@@ -126,19 +109,16 @@ def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(
     assert np.abs(flight.client["state"][-1, :, 1]).max() < 0.1
 
 
-def test_a_server_that_dies_within_the_last_horizon_leaves_a_flight(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_server_that_dies_within_the_last_horizon_leaves_a_flight() -> None:
     """No longer without a plan than `link.timeout_s`: it was flown to the end."""
-    flight = interrupted(monkeypatch, scenario(), 18.5)
+    flight = interrupted(scenario(), 18.5)
     assert not flight.client["covered"][-1]
     assert flight.failure is None
     assert said(flight)[-1] == Finished(vehicle=1, steps=400, missed=0)
 
 
-def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server is gone for six seconds and back in another life: braked, hovered, flown on."""
-    flight = interrupted(monkeypatch, scenario(), 6.0, 12.0)
+def test_a_flight_with_a_gap_is_a_flight() -> None:
+    flight = interrupted(scenario(), 6.0, 12.0)
     assert flight.failure is None
     *changes, finished = said(flight)[-6:]
     assert isinstance(finished, Finished)
@@ -153,13 +133,11 @@ def test_a_flight_with_a_gap_is_a_flight(monkeypatch: pytest.MonkeyPatch) -> Non
     assert flight.client["covered"][-100:].all()
 
 
-def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input() -> None:
     """Wind of 4 m/s against inputs of up to 1.6 m/s: what is committed is kept within these."""
     wind = {"steady_wind_mps": [4.0, 0.0], "start_m": [-10.0, 0.0]}
     flown = scenario(vehicle=wind, model={"u_max": [1.6]})
-    flight = interrupted(monkeypatch, flown, 3.0, 10.0)
+    flight = interrupted(flown, 3.0, 10.0)
     before, after = flight.client[199], flight.client[-1]
     assert before["state"][0, 1] > 3.9
     assert not before["covered"]

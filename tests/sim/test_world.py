@@ -45,18 +45,32 @@ class Probe(Endpoint):
         return self.wakes_ns[0] if self.wakes_ns else None
 
 
-def never() -> bool:
-    """Until nothing is left to happen."""
-    return False
+class Finite(Probe):
+    """Ends with its last wake."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has been woken as often as it was to be."""
+        return not self.wakes_ns
+
+
+def run(world: World, limit_ns: int = SECOND_NS) -> None:
+    """Let everything happen, up to a time."""
+    world.run(lambda: False, limit_ns=limit_ns)
+
+
+def hosted(*wakes_ns: int, **keys: Any) -> tuple[World, Probe]:
+    """A world with one host, and what happens to that."""
+    world, probe = World(), Probe(list(wakes_ns))
+    world.add("host", probe, **keys)
+    return world, probe
 
 
 def test_what_lies_behind_the_limit_happens_when_time_goes_on() -> None:
-    """A world that is run a second time has lost nothing."""
-    world, probe = World(), Probe([10, 20])
-    world.add("probe", probe)
-    world.run(never, limit_ns=15)
+    world, probe = hosted(10, 20)
+    run(world, 15)
     assert probe.log == [("wake", 10)]
-    world.run(never, limit_ns=25)
+    run(world, 25)
     assert probe.log == [("wake", 10), ("wake", 20)]
 
 
@@ -78,7 +92,6 @@ def test_a_drifting_clock_gains_what_it_should() -> None:
 
 
 def test_hosts_wake_in_the_order_of_the_worlds_time() -> None:
-    """Each by its own clock: a clock that is ahead wakes earlier."""
     world, ahead, behind = World(), Probe([1000]), Probe([1000])
     world.add("behind", behind, clock=Clock(offset_ns=100))
     world.add("ahead", ahead, clock=Clock(offset_ns=400))
@@ -89,36 +102,33 @@ def test_hosts_wake_in_the_order_of_the_worlds_time() -> None:
 
 
 def test_a_datagram_arrives_at_once_with_the_senders_address() -> None:
-    """Socket 2 of the sender is (name, 2), as a UDP source port would tell."""
     world, receiver = World(), Probe([])
     there = world.add("there", receiver, clock=Clock(offset_ns=7))
     world.add("here", Probe([50], answer_to=there))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert receiver.log == [("hi from here 2", 57)]
 
 
 def test_a_datagram_to_nobody_is_lost() -> None:
-    """The sender is not told of the loss, as with UDP."""
     world = World()
     world.add("here", Probe([50], answer_to=("nobody", 0)))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert world.now_ns == 50
 
 
 def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
-    """Ties are the rule on a lattice of delays."""
     world = World()
     receiver = Probe([50])
     there = world.add("there", receiver)
     world.add("here", Probe([50], answer_to=there))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     # Both wake at 50; the sender was asked second, but what it sends still comes at 50.
     assert receiver.log == [("wake", 50), ("hi from here 2", 50)]
     later = Probe([50, 60])
     world = World()
     there = world.add("there", later)
     world.add("here", Probe([60], answer_to=there), clock=Clock())
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert later.log[0] == ("wake", 50)
 
 
@@ -128,21 +138,19 @@ def test_a_computing_host_sends_late_and_hears_at_once() -> None:
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)
     busy.answer_to, other.answer_to = other_address, busy_address
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert other.log == [("wake", 60), ("hi from busy 2", 80)]
     assert busy.log == [("wake", 50), ("hi from other 2", 60)]
 
 
 def test_a_wake_during_computing_comes_late() -> None:
-    """A deadline can so be missed in virtual time."""
     world, busy = World(), Probe([50, 60])
     world.add("busy", busy, compute_ns=30)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert busy.log == [("wake", 50), ("wake", 80)]
 
 
 def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
-    """Hosts are not woken in the order of asking, which depends on who else is there."""
     world, first, second = World(), Probe([70, 90]), Probe([90])
     there = world.add("there", Probe([]))
     for name, probe in (("first", first), ("second", second)):
@@ -155,41 +163,25 @@ def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
 
 
 def test_a_host_is_not_woken_before_its_start() -> None:
-    """However long it has been wanting it."""
-    world, probe = World(), Probe([0])
-    world.add("host", probe, clock=Clock(offset_ns=1000), start_ns=40)
-    world.run(never, limit_ns=SECOND_NS)
+    world, probe = hosted(0, clock=Clock(offset_ns=1000), start_ns=40)
+    run(world)
     assert probe.log == [("wake", 1040)]
 
 
 def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
-    """After the wake with which it finished, before anything else happens."""
-
-    class Finite(Probe):
-        @property
-        def finished(self) -> bool:
-            """After the second of three wakes."""
-            return len(self.wakes_ns) < 2
-
-    world, probe, told_ns = World(), Finite([50, 60, 70]), []
-    world.add("host", probe, on_finished=lambda: told_ns.append(world.now_ns))
-    world.run(never, limit_ns=SECOND_NS)
+    world, told_ns = World(), []
+    world.add("host", Finite([50, 60]), on_finished=lambda: told_ns.append(world.now_ns))
+    world.add("other", Probe([60, 70]))
+    run(world)
     assert told_ns == [60]
 
 
 def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
-    """In the world's time, whatever the host's own clock shows."""
-
-    class Talker(Probe):
+    class Talker(Finite):
         def wake(self, *, now_ns: int) -> None:
             """Say something."""
             super().wake(now_ns=now_ns)
             self._events.append(Flying(vehicle=len(self.log)))
-
-        @property
-        def finished(self) -> bool:
-            """After the last wake."""
-            return not self.wakes_ns
 
     told: list[tuple[int, str, Event] | str] = []
     world = World(on_event=lambda *event: told.append(event))
@@ -200,7 +192,7 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
             clock=Clock(offset_ns),
             on_finished=lambda name=name: told.append(f"{name} has finished"),
         )
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert told == [
         (50, "one", Flying(vehicle=1)),
         (60, "two", Flying(vehicle=1)),
@@ -212,9 +204,8 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
 
 @pytest.mark.parametrize("limit_ns", [49, 50])
 def test_time_stops_at_its_limit(limit_ns: int) -> None:
-    world, probe = World(), Probe([50])
-    world.add("host", probe)
-    world.run(never, limit_ns=limit_ns)
+    world, probe = hosted(50)
+    run(world, limit_ns)
     assert len(probe.log) == (limit_ns == 50)
 
 
@@ -227,7 +218,6 @@ def at(world: World, time_ns: int, action: Callable[..., None], *args: Any, **na
 def test_a_changed_clock_goes_on_from_the_time_it_shows(
     offset_ns: int, drift_ppb: int, time_ns: int, step_ns: int, other_ppb: int
 ) -> None:
-    """A step is seen at once, a rate only from then on."""
     clock = Clock(offset_ns, drift_ppb)
     changed = clock.changed(time_ns, step_ns=step_ns, drift_ppb=other_ppb)
     assert changed.local(time_ns) == clock.local(time_ns) + step_ns
@@ -236,17 +226,15 @@ def test_a_changed_clock_goes_on_from_the_time_it_shows(
 
 
 def test_actions_come_first_at_their_instant_and_in_the_order_they_were_asked_for() -> None:
-    """Before what arrives then, and what wakes."""
     world, probe, order = World(), Probe([50]), []
     world.add("host", probe)
     for number in (1, 2):
         at(world, 50, lambda number=number: order.append((number, len(probe.log))))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert order == [(1, 0), (2, 0)]
 
 
 def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
-    """Not what it was woken for, nor what it was still computing; its next life begins anew."""
     world, first, second, hearer = World(), Probe([50, 60]), Probe([0, 95]), Probe([])
     there = world.add("there", hearer)
     first.answer_to = second.answer_to = there
@@ -254,37 +242,29 @@ def test_a_host_that_is_down_hears_nothing_and_sends_nothing() -> None:
     world.add("caller", Probe([70, 90], answer_to=here))
     at(world, 62, world.stop, "here")
     at(world, 80, world.restart, "here", second)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert first.log == [("wake", 50), ("wake", 60)]
     assert second.log == [("wake", 80), ("hi from caller 2", 90), ("wake", 95)]
     assert hearer.log == [("hi from here 2", 55), ("hi from here 2", 85), ("hi from here 2", 100)]
 
 
 def test_a_host_at_work_can_be_restarted_at_once() -> None:
-    """The new life does not finish the work of the old one."""
     world, second = World(), Probe([0])
     world.add("here", Probe([50]), compute_ns=1000)
     at(world, 60, world.restart, "here", second)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert second.log == [("wake", 60)]
 
 
 def test_the_end_of_a_later_life_is_told() -> None:
-    class Finite(Probe):
-        @property
-        def finished(self) -> bool:
-            """After the last wake."""
-            return not self.wakes_ns
-
     world, told_ns = World(), []
     world.add("host", Finite([90]), on_finished=lambda: told_ns.append(world.now_ns))
     at(world, 50, world.restart, "host", Finite([0, 70]))
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert told_ns == [70]
 
 
 def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
-    """In the order in which they came, and as many as there is room for."""
     world, probe = World(), Probe([50, 200])
     there = world.add("there", probe)
     world.add("here", Probe([20, 60, 70, 80], answer_to=there))
@@ -294,51 +274,45 @@ def test_datagrams_wait_for_a_frozen_host_and_it_wakes_late() -> None:
         at(world, 45, world.freeze, "there")
         at(world, 100, world.thaw, "there")
         at(world, 110, world.thaw, "there")
-        world.run(never, limit_ns=SECOND_NS)
+        run(world)
     hi = "hi from here 2"
     assert probe.log == [(hi, 20), (hi, 100), (hi, 100), ("wake", 100), ("wake", 200)]
 
 
 def test_a_frozen_host_can_be_taken_down_and_a_host_that_is_down_not_frozen() -> None:
-    """Hosts are like processes: a stopped one can be killed, a dead one cannot be stopped."""
     world, old, new = World(), Probe([50]), Probe([60])
     world.add("host", old)
     for time_ns, action in ((10, world.freeze), (20, world.stop), (30, world.freeze)):
         at(world, time_ns, action, "host")
     at(world, 40, world.thaw, "host")
     at(world, 55, world.restart, "host", new)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert (old.log, new.log) == ([], [("wake", 60)])
 
 
 @pytest.mark.parametrize("step_ns", [1000, -1000])
 def test_a_timer_counts_on_where_the_clock_is_set(step_ns: int) -> None:
-    """Later requests use the clock as it is then."""
-    world, probe = World(), Probe([50, 60 + step_ns])
-    world.add("host", probe)
+    world, probe = hosted(50, 60 + step_ns)
     at(world, 30, world.set_clock, "host", step_ns=step_ns)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert probe.log == [("wake", 50 + step_ns), ("wake", 60 + step_ns)]
     assert world.now_ns == 60
 
 
 def test_a_timer_counts_on_while_its_host_is_frozen() -> None:
-    """It has ended when the host goes on, whatever its clock shows by then."""
-    world, probe = World(), Probe([50])
-    world.add("host", probe)
+    world, probe = hosted(50)
     at(world, 30, world.freeze, "host")
     at(world, 40, world.set_clock, "host", step_ns=-1000)
     at(world, 100, world.thaw, "host")
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert probe.log == [("wake", -900)]
 
 
 def test_another_rate_holds_from_now_on() -> None:
     """A clock that runs twice as fast from 50 on has shown 300 at 175."""
-    world, probe = World(), Probe([100, 300])
-    world.add("host", probe)
+    world, probe = hosted(100, 300)
     at(world, 50, world.set_clock, "host", drift_ppb=1_000_000_000)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert (probe.log, world.now_ns) == ([("wake", 150), ("wake", 300)], 175)
 
 
@@ -347,5 +321,5 @@ def test_a_host_can_be_given_more_to_compute() -> None:
     there = world.add("there", hearer)
     world.add("here", Probe([50, 60], answer_to=there))
     at(world, 55, world.set_compute, "here", 30)
-    world.run(never, limit_ns=SECOND_NS)
+    run(world)
     assert hearer.log == [("hi from here 2", 50), ("hi from here 2", 90)]

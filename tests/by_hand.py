@@ -1,0 +1,89 @@
+"""A client whose server a test plays by hand: it says exactly what the test wants it to."""
+
+import io
+
+import numpy as np
+
+from skytether.client.endpoint import Client
+from skytether.client.link import PlainLink
+from skytether.client.simulated.vehicle import simulated
+from skytether.client.vehicle import Vehicle
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.wire.protocol import (
+    Horizon,
+    Message,
+    Refusal,
+    Terms,
+    Welcome,
+    decode,
+    encode,
+)
+
+SERVER: Address = ("server", 0)
+
+
+class ByHand:
+    """A client of vehicle 4, and the time that its clock shows.
+
+    Args:
+        flown: its scenario.
+        flies: its vehicle; that of the scenario unless given.
+        link: its link; one in plaintext unless given.
+    """
+
+    def __init__(
+        self, flown: Scenario, flies: Vehicle | None = None, link: PlainLink | None = None
+    ) -> None:
+        self.scenario, self.terms, self.dt_ns = flown, flown.terms(), flown.dt_ns
+        self.flies = flies or simulated(flown, 1)
+        self.sink = io.BytesIO()
+        self.client = Client(
+            flown,
+            self.flies,
+            server=SERVER,
+            vehicle=4,
+            boot_id=99,
+            link=link,
+            recorder=Recorder(client_columns(flown.model.axes), self.sink),
+        )
+        self.now_ns = 5 * SECOND_NS
+        self.session = 7
+
+    def wake(self) -> list[Message]:
+        """Time passes until the client wants to be woken; what it then says."""
+        due_ns = self.client.next_wake_ns()
+        assert due_ns is not None
+        self.now_ns = max(self.now_ns, due_ns)
+        self.client.wake(now_ns=self.now_ns)
+        said = self.client.outbox()
+        assert {datagram.peer for datagram in said} <= {SERVER}
+        return [decode(datagram.payload, self.terms) for datagram in said]
+
+    def say(self, message: Message) -> None:
+        """One datagram to the client."""
+        self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
+
+    def welcome(
+        self,
+        *,
+        boot_id: int = 99,
+        server_boot_id: int = 1,
+        refusal: int = Refusal.ACCEPTED,
+        terms: Terms | None = None,
+    ) -> None:
+        """Open a session, or refuse it."""
+        session, terms = self.session if refusal == Refusal.ACCEPTED else 0, terms or self.terms
+        self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
+
+    def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
+        """A horizon of one constant input, planned from a step that is its own unless told."""
+        age = 0 if observed is None else step - observed
+        inputs = np.full((self.terms.axes, self.terms.planned), value, np.float32)
+        self.say(Horizon(4, self.session, step, 5678, age, inputs))
+
+    def rows(self) -> Rows:
+        """The record so far."""
+        return parse(self.sink.getvalue())
