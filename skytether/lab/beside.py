@@ -1,5 +1,7 @@
 """Baselines beside the contenders of a case: floors, and flights that need no network."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -31,13 +33,14 @@ class Floor(msgspec.Struct, frozen=True):
     """Floor of RMSE xy [m]."""
 
 
-class Baselines(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Baselines:
     """Baselines beside the contenders of a case."""
 
-    floor: list[Floor] = []
+    floor: Sequence[Floor] = ()
     """Points of the floor: for all contenders if only the server sees the target; in wind, for
     those without feedback aboard."""
-    aboard: list[Summary] = []
+    aboard: Sequence[Summary] = ()
     """Flights with the reference aboard, and no packets; none if only the server knows the
     reference."""
 
@@ -51,23 +54,24 @@ class Work:
 
     def __init__(self, plan: Plan) -> None:
         scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
-        self.regular = [
-            replace(scenario, control=replace(scenario.control, trigger="periodic", period=period))
+        self.regular = {
+            period: replace(
+                scenario, control=replace(scenario.control, trigger="periodic", period=period)
+            )
             for period in PERIODS
-        ]
-        """Scenarios for the points of the floor."""
+        }
+        """Scenario for each point of the floor, by the steps between packets."""
         first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
-        self.aboard = [replace(aboard, seed=seed) for seed in range(first, first + runs)]
-        """Scenarios with the reference aboard."""
+        self.aboard = {seed: replace(aboard, seed=seed) for seed in range(first, first + runs)}
+        """Scenarios with the reference aboard, by seed."""
+        self._tables = scenario, aboard
 
     def settings(self) -> dict[str, Any]:
         """Settings that determine the results, as plain values."""
         return {
-            "files": digests(self.regular),
-            "periods": list(PERIODS),
-            "runs": [RUNS, len(self.aboard)],
-            "scenario": reading.to_table(self.regular[0]),
-            "aboard": [reading.to_table(each) for each in self.aboard[:1]],
+            "files": digests(self._tables),
+            "runs": RUNS,
+            "scenarios": [reading.to_table(each) for each in self._tables],
         }
 
 
