@@ -10,9 +10,9 @@ import numpy as np
 from skytether.figures.page import Cell, Row, Table, as_text, lettered, table_of
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab import plates
-from skytether.lab.beside import Baselines, Floor
 from skytether.lab.budgets import BUDGETS, EVERY, SOUGHT, Chosen, FlownContender, Plan
 from skytether.lab.contenders import ABOARD, CASES, CONTENDERS, Case, Contender
+from skytether.lab.floor import Baselines, Floor
 from skytether.lab.intervals import Estimate, interval, jackknife
 from skytether.lab.plates import Plate
 from skytether.lab.report import Drawn

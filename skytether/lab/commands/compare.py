@@ -9,13 +9,13 @@ import tyro
 
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
-from skytether.lab.beside import Baselines, Floor, Work, floor_of, fly_aboard
 from skytether.lab.budgets import Plan
 from skytether.lab.calibration import HERE, Rmse, SearchLimits
 from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
+from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
 from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
@@ -120,7 +120,7 @@ def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
     settings = work.settings()
     floor = flyers.study(floor_of, work.regular, Floor, settings, folder / "floor", size=no_work)
     aboard = flyers.study(
-        fly_aboard, work.aboard, Summary, settings, folder / "aboard", size=no_work
+        summarise_aboard, work.aboard, Summary, settings, folder / "aboard", size=no_work
     )
     return Baselines(list(floor.values()), list(aboard.values()))
 
