@@ -27,7 +27,7 @@ from skytether.lab.adversary import (
 )
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
-from skytether.lab.journal import digests
+from skytether.lab.journal import ENTRIES, digests
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
@@ -116,6 +116,7 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
         CommandError: interrupted before any climb was done.
     """
     command.check_count("--tries", options.tries, TRIES_MAX)
+    command.claim_folder("--out", options.out, ENTRIES)
     command.check_count("--moves", options.moves, MOVES_MAX)
     pool, patience = Flags(workers=options.workers), 0 if options.random else PATIENCE
     pool.check()
