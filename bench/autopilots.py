@@ -21,8 +21,9 @@ import tyro
 
 from bench.harness import TextTable, refresh
 from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.commands.pool import Flags, crew
+from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying
@@ -165,14 +166,23 @@ def fly(
     """Fly a contender; the record has true states, and packets from the first step to the last."""
     if law is not None:
         return straight.fly(scenario, law, flavour, changes=changes)
-    sink = io.BytesIO()
+    autopilot, truth = autopilot_of(scenario, flavour)
+    flown = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
+    return as_it_was(scenario, flown, parse(truth.getvalue()))
+
+
+def autopilot_of(
+    scenario: Scenario, flavour: FlavourName, faults: Sequence[ScriptedFault] = ()
+) -> tuple[Autopilot, io.BytesIO]:
+    """Autopilot that may be flown, and its true states: rows of TRUTH_COLUMNS."""
+    truth = io.BytesIO()
+    recorder = Recorder(TRUTH_COLUMNS, truth)
     autopilot = Autopilot(
-        scenario, flavour, ready_s=straight.READY_S, recorder=Recorder(TRUTH_COLUMNS, sink)
+        scenario, flavour, ready_s=straight.READY_S, faults=faults, recorder=recorder
     )
     for name, value in SAFE[flavour].items():
         autopilot.flight.set(name, value)
-    flown = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
-    return as_it_was(scenario, flown, parse(sink.getvalue()))
+    return autopilot, truth
 
 
 def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
@@ -295,8 +305,8 @@ class AutopilotBenchmarkOptions:
     """Air: calm, or wind of 6 m/s."""
     jobs: int = 1
     """Number of flights at once."""
-    json: Path | None = None
-    """File for the figures of every flight; flights already in the file are not repeated."""
+    out: Path | None = None
+    """Folder that keeps the flights: after Ctrl-C the same command goes on."""
     write: bool = False
     """Put the tables into docs/compare.md."""
 
@@ -304,37 +314,19 @@ class AutopilotBenchmarkOptions:
 def main(argv: Sequence[str]) -> None:
     """Fly as the command line says, and print the tables."""
     options = tyro.cli(AutopilotBenchmarkOptions, args=argv, description=__doc__)
-    seeds = range(1, options.seeds + 1)
-    flights = kept(options.json)
-    done = {(each.contender, each.flavour, each.air, each.seed) for each in flights}
     cells = [
         Cell(name, flavour, air, seed)
         for flavour, air in product(options.flavours, options.airs)
         for name in contenders(flavour)
-        for seed in seeds
-        if (not options.only or name in options.only) and (name, flavour, air, seed) not in done
+        if not options.only or name in options.only
+        for seed in range(1, options.seeds + 1)
     ]
-    with crew(Flags(options.jobs), "flying", len(cells), "flights") as flyers:
-
-        def keep(_: int, flown: FlownCell) -> None:
-            flights.append(flown)
-            flyers.advance(1)
-            if options.json:
-                command.write(options.json, msgspec.json.encode(flights))
-
-        flyers.share(fly_cell, cells, keep)
+    flights = study(fly_cell, cells, FlownCell, {}, options.out, Flags(options.jobs))
     made = tables(flights)
     for title, table in made.items():
         table.show(title)
     if options.write:
         files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
-
-
-def kept(file: Path | None) -> list[FlownCell]:
-    """Flights that a file has already."""
-    if file is None or not file.exists():
-        return []
-    return msgspec.json.decode(file.read_bytes(), type=list[FlownCell])
 
 
 if __name__ == "__main__":

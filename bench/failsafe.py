@@ -6,14 +6,13 @@ flavours. A fault happens FAULT_S into each flight, and the vehicle is observed 
 flies on, distances are those until then. With --write, the tables go into docs/fly-a-real-one.md.
 """
 
-import io
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -21,26 +20,20 @@ import tyro
 
 from bench import autopilots
 from bench.harness import TextTable, refresh
-from skytether.autopilot.endpoint import Autopilot
-from skytether.autopilot.faults import FaultName, Script, ScriptedFault
+from skytether.autopilot.faults import FaultName, ScriptedFault
 from skytether.autopilot.flavours import FlavourName, FlightMode
-from skytether.client import vehicles
-from skytether.client.endpoint import Client
+from skytether.autopilot.flight import PilotedVehicle
 from skytether.lab.commands.pool import Flags, study
-from skytether.netem.proxy import Proxy
-from skytether.server.endpoint import Server
 from skytether.shared.base import files
-from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import Event, Flying, ModeChanged
+from skytether.shared.core.events import ModeChanged
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
+from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command
-from skytether.sim import straight
-from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, plan_changes
-from skytether.sim.world import Clock, World
+from skytether.sim import flight
+from skytether.sim.world import World
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "fly-a-real-one.md"
 FAULT_S, WATCHED_S, FOR_A_WHILE_S = 15.0, 40.0, 5.0
@@ -48,8 +41,6 @@ FAULT_S, WATCHED_S, FOR_A_WHILE_S = 15.0, 40.0, 5.0
 fault that ends by itself [s]."""
 DURATION_S = FAULT_S + WATCHED_S + 5.0
 """Length of the flight [s], so long that its regular end is not observed."""
-LAUNCH_S = 60.0
-"""Longest time until the flight begins [s]."""
 TRACK = str(Mode.TRACK).upper()
 STILL_MPS = 0.1
 """Horizontal speed below which the vehicle is at rest [m/s]."""
@@ -113,133 +104,88 @@ def scenario_of(flavour: FlavourName, seed: int) -> Scenario:
     return msgspec.structs.replace(autopilots.scenario_of(cell), duration=DURATION_S)
 
 
-class Watched:
-    """Flight that is observed after a fault.
-
-    Args:
-        scenario: scenario that is flown.
-        flavour: flavour of the autopilot.
-    """
-
-    def __init__(self, scenario: Scenario, flavour: FlavourName) -> None:
-        self.scenario = scenario
-        self.truth = io.BytesIO()
-        """True states: rows of TRUTH_COLUMNS."""
-        self.autopilot = Autopilot(
-            scenario,
-            flavour,
-            ready_s=straight.READY_S,
-            recorder=Recorder(TRUTH_COLUMNS, self.truth),
-        )
-        for name, value in autopilots.SAFE[flavour].items():
-            self.autopilot.flight.set(name, value)
-        self.began_ns: int | None = None
-        """Time at which the first step began [ns]."""
-        self.modes: list[tuple[str, int]] = []
-        """Modes of the client's failsafe, and the time at which each began [ns]."""
-        self.flown: list[tuple[str, int]] = []
-        """Modes of the autopilot, and the time at which each began [ns]."""
-        self.down_ns: int | None = None
-        """Time at which the motors were switched off [ns]."""
-        self.netem = Proxy(scenario, server=("server", 0), flows=1)
-        client = Client(
-            scenario, vehicles.make(scenario, 1), server=("netem", 0), vehicle=1, boot_id=BOOT_ID
-        )
-        entropy = stream(scenario.seed, "entropy").bytes
-        self.world = world = World(self._hear)
-        world.add("netem", self.netem)
-        start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
-        world.add("client", client, clock=Clock(MIDNIGHT_NS), start_ns=start_ns)
-        world.add("autopilot", self.autopilot)
-        server = Server(scenario, boot_id=BOOT_ID, entropy=entropy)
-        world.add("server", server, clock=Clock(MIDNIGHT_NS))
-
-    def _hear(self, time_ns: int, _: str, event: Event) -> None:
-        if isinstance(event, Flying):
-            self.began_ns = time_ns
-        elif isinstance(event, ModeChanged) and event.before != event.after:
-            self.modes.append((event.after.upper(), time_ns))
-
-    def run(self, until: Callable[[], bool], limit_ns: int) -> None:
-        """Run until a condition holds, or until a time of the world."""
-        flight = self.autopilot.flight
-
-        def over() -> bool:
-            if not self.flown or self.flown[-1][0] != flight.mode_name:
-                self.flown.append((flight.mode_name, self.world.now_ns))
-            if flight.armed_ns is not None and not flight.armed and self.down_ns is None:
-                self.down_ns = self.world.now_ns
-            return until()
-
-        self.world.run(over, limit_ns=limit_ns)
-
-    def fail(self, case: CaseName) -> None:
-        """Inject the fault now."""
-        for_ns = seconds_to_ns(FOR_A_WHILE_S) if case in ENDING else None
-        if case == "client killed":
-            self.world.stop("client")
-        elif case == "server killed":
-            self.world.stop("server")
-        elif case in SCRIPTED:
-            flight = self.autopilot.flight
-            assert flight.armed_ns is not None
-            past_ns = flight.now_ns - flight.armed_ns
-            until_ns = None if for_ns is None else past_ns + for_ns
-            self.autopilot.script = Script([ScriptedFault(SCRIPTED[case], past_ns, until_ns)])
-        else:
-            self._cut(for_ns)
-
-    def _cut(self, for_ns: int | None) -> None:
-        """Make netem lose all packets from now on, for ever or for a while."""
-        loss, both = self.scenario.network.uplink.loss, ("uplink", "downlink")
-        now_s = self.world.now_ns / SECOND_NS
-        changes = [(now_s, {f"network.{way}.loss": 1.0 for way in both})]
-        if for_ns is not None:
-            healed_s = now_s + for_ns / SECOND_NS
-            changes.append((healed_s, {f"network.{way}.loss": loss for way in both}))
-        plan_changes(self.world, self.scenario, {"netem": self.netem}, changes)
+@cache
+def beginning(flavour: FlavourName, seed: int) -> tuple[float, float]:
+    """Times at which the motors are switched on and the first step begins, without a fault [s]."""
+    scenario = msgspec.structs.replace(scenario_of(flavour, seed), duration=1.0, settle=0.0)
+    autopilot, _ = autopilots.autopilot_of(scenario, flavour)
+    flown = flight.fly(scenario, beside={"autopilot": autopilot})
+    assert autopilot.flight.armed_ns is not None
+    return autopilot.flight.armed_ns / SECOND_NS, autopilots.began_ns(flown) / SECOND_NS
 
 
 def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
     """Fly with a fault, and return the vehicle's behaviour."""
-    scenario = scenario_of(flavour, seed)
-    watched = Watched(scenario, flavour)
-    world = watched.world
-    watched.run(lambda: watched.began_ns is not None, seconds_to_ns(LAUNCH_S))
-    assert watched.began_ns is not None
-    fault_ns = watched.began_ns + seconds_to_ns(FAULT_S)
-    end_ns = fault_ns + seconds_to_ns(WATCHED_S)
-    world.at(fault_ns, partial(watched.fail, case))
-    world.at(end_ns, lambda: None)
-    watched.run(lambda: world.now_ns >= end_ns, end_ns)
+    scenario, (armed_s, began_s) = scenario_of(flavour, seed), beginning(flavour, seed)
+    fault_s = began_s + FAULT_S
+    end_s = fault_s + FOR_A_WHILE_S if case in ENDING else None
+    changes: list[tuple[float, Mapping[str, Any]]] = []
+    actions: list[tuple[float, Callable[[World], None]]] = []
+    faults: list[ScriptedFault] = []
+    if case in SCRIPTED:
+        since, until = (
+            None if time_s is None else seconds_to_ns(time_s - armed_s)
+            for time_s in (fault_s, end_s)
+        )
+        faults.append(ScriptedFault(SCRIPTED[case], since or 0, until))
+    elif case.startswith("link cut"):
+        losses = [(fault_s, 1.0)]
+        if end_s is not None:
+            losses.append((end_s, scenario.network.uplink.loss))
+        changes += [
+            (time_s, {f"network.{way}.loss": loss for way in ("uplink", "downlink")})
+            for time_s, loss in losses
+        ]
+    else:
+        host = "server" if case == "server killed" else f"client {seed}.1"
+        actions.append((fault_s, lambda world: world.stop(host)))
+    autopilot, truth = autopilots.autopilot_of(scenario, flavour, faults)
+    aboard, modes_aboard, down_s = autopilot.flight, list[tuple[str, float]](), np.inf
 
-    def since(changes: Sequence[tuple[str, int]]) -> Changes:
-        later = [(name, (time_ns - fault_ns) / SECOND_NS) for name, time_ns in changes]
+    def watch() -> bool:
+        nonlocal down_s
+        now_s = aboard.now_ns / SECOND_NS
+        if not modes_aboard or modes_aboard[-1][0] != aboard.mode_name:
+            modes_aboard.append((aboard.mode_name, now_s))
+        if aboard.armed_ns is not None and not aboard.armed:
+            down_s = min(down_s, now_s - fault_s)
+        return now_s >= fault_s + WATCHED_S
+
+    flown = flight.fly(
+        scenario, beside={"autopilot": autopilot}, changes=changes, actions=actions, stopped=watch
+    )
+
+    def since_fault(changes: Sequence[tuple[str, float]]) -> Changes:
+        later = [(name, time_s - fault_s) for name, time_s in changes]
         return tuple((name, time_s) for name, time_s in later if time_s >= 0.0)
 
-    modes = since(watched.modes)
+    modes = since_fault(
+        [
+            (event.after.upper(), time_ns / SECOND_NS)
+            for time_ns, _, event in flown.events
+            if isinstance(event, ModeChanged) and event.before != event.after
+        ]
+    )
     on_s = next((time_s for name, time_s in modes if name == TRACK), WATCHED_S)
-    rows = parse(watched.truth.getvalue())
-    times_s = (rows["time_ns"] - fault_ns) / SECOND_NS
+    rows = parse(truth.getvalue())
+    times_s = rows["time_ns"] / SECOND_NS - fault_s
     seen = (times_s >= 0.0) & (times_s <= on_s)
     speeds = np.linalg.norm(rows["state"][seen, :2, 1], axis=1)
     positions = rows["state"][seen, :2, 0]
     still = np.flatnonzero(speeds < STILL_MPS)
-    down_ns = watched.down_ns
-    down_s = np.inf if down_ns is None else (down_ns - fault_ns) / SECOND_NS
     return FaultOutcome(
         case,
         flavour,
         seed,
         modes=modes,
         # On the ground PX4 is in the mode again that was asked for last.
-        autopilot=tuple(change for change in since(watched.flown) if change[1] < down_s),
+        autopilot=tuple(change for change in since_fault(modes_aboard) if change[1] < down_s),
         moved_m=_largest(positions - positions[0]),
         off_path_m=_off_path(scenario, positions),
         off_reference_m=_largest(positions - _reference(scenario, times_s[seen] + FAULT_S)),
         still_s=float(times_s[seen][still[0]]) if len(still) else np.nan,
         down_s=down_s if np.isfinite(down_s) else np.nan,
-        ending=_ending(watched, speeds[-1], modes),
+        ending=_ending(aboard, speeds[-1], modes),
     )
 
 
@@ -259,18 +205,17 @@ def _off_path(scenario: Scenario, positions: Array) -> float:
     return float(max(each))
 
 
-def _ending(watched: Watched, speed: float, modes: Changes) -> Ending:
+def _ending(aboard: PilotedVehicle, speed: float, modes: Changes) -> Ending:
     """End state of the vehicle, in words.
 
     Args:
-        watched: the flight.
+        aboard: the autopilot's flight.
         speed: its horizontal speed at the end [m/s].
         modes: modes of the client after the fault.
     """
-    flight = watched.autopilot.flight
-    if not flight.armed:
+    if not aboard.armed:
         return "has landed"
-    if flight.mode is FlightMode.PILOT:
+    if aboard.mode is FlightMode.PILOT:
         return "pilot has it"
     if modes and modes[-1][0] == TRACK:
         return "flies on"

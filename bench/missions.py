@@ -28,6 +28,7 @@ constant, over a network that is near (20 ms, no loss) and over the paper's with
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -48,19 +49,18 @@ from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.routes import Routes
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
-from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Event
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
 from skytether.shared.scenario.zones import Zones
+from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command
 from skytether.sim import flight
+from skytether.sim.world import World
 
 C = TypeVar("C")
 
@@ -196,14 +196,13 @@ def fly_mission(
     Args:
         scenario: mission to fly.
         vehicles: number of vehicles.
-        deaths: when the server dies and begins anew, see `MortalServer`.
+        deaths: when the server dies and begins anew [s].
         goal_at_s: time from which on the goals hold, on each vehicle's clock [s]; with 0 the
             vehicles' clocks are aligned.
         arrived_m: distance from its goal at which a vehicle has arrived [m].
     """
-    server = MortalServer(scenario, vehicles, deaths) if deaths else None
     with timed() as spent:
-        record = flight.fly(scenario, vehicles=vehicles, server=server)
+        record, lives = fly_with_deaths(scenario, vehicles, deaths)
     goals, dt_s, client = scenario.make_reference(), scenario.control.dt, record.client
     assert isinstance(goals, Mission)
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
@@ -221,7 +220,9 @@ def fly_mission(
         flown = rows["state"][int(np.argmax(rows["mode"] == Mode.TRACK)) :, :, 0]
         clear_m.append(float(scenario.zones.clearance(flown).min(initial=np.inf)))
     packets = sum(record.figures["netem"][way]["packets"] for way in ("uplink", "downlink"))
-    counts = record.figures["server"]["counts"]
+    counts = Counter[str]()
+    for life in lives:
+        counts.update(life.figures()["counts"])
     return MissionFlight(
         seed=scenario.seed,
         vehicles=len(each),
@@ -230,10 +231,10 @@ def fly_mission(
         clear_m=min(clear_m) if scenario.zones else None,
         late=late,
         arrived_s=None if late else max(arrived_s),
-        left=counts.get("left_tube", 0),
+        left=counts["left_tube"],
         landed=sum(bool((rows["mode"] == Mode.LAND).any()) for rows in each),
         packets=packets / (vehicles * scenario.duration),
-        plan_ms=1e3 * sum(spent) / max(counts.get("events", 0), 1),
+        plan_ms=1e3 * sum(spent) / max(counts["events"], 1),
     )
 
 
@@ -254,77 +255,29 @@ def timed() -> Iterator[list[float]]:
         MissionPlanner.plan = real  # type: ignore[method-assign]
 
 
-class MortalServer(Endpoint):
-    """A server that is not there at some times, and begins anew after each without its memory.
+def fly_with_deaths(
+    scenario: Scenario, vehicles: int, deaths: Sequence[tuple[float, float]]
+) -> tuple[Record, list[Server]]:
+    """Flight in which the server dies and begins anew without its memory, and all its lives.
 
     Args:
         scenario: what is flown.
-        room: number of vehicles.
-        deaths: when it dies and begins anew, since it began [s], in order.
+        vehicles: number of vehicles.
+        deaths: when it dies and begins anew [s], in order.
     """
+    lives: list[Server] = []
 
-    def __init__(
-        self, scenario: Scenario, room: int, deaths: Sequence[tuple[float, float]]
-    ) -> None:
-        super().__init__()
-        self._scenario, self._room = scenario, room
-        self._deaths = [(seconds_to_ns(from_s), seconds_to_ns(to_s)) for from_s, to_s in deaths]
-        self._epoch_ns: int | None = None
-        self._lives = 0
-        self._left = 0
-        """Observations outside a tube in lives that are over."""
-        self._server: Server | None = self._begin()
+    def live(world: World | None = None) -> None:
+        entropy = stream(scenario.seed, "mortal", len(lives)).bytes
+        lives.append(Server(scenario, boot_id=1 + len(lives), entropy=entropy, capacity=vehicles))
+        if world is not None:
+            world.restart(flight.SERVER[0], lives[-1])
 
-    def _begin(self) -> Server:
-        self._lives += 1
-        entropy = stream(self._scenario.seed, "mortal", self._lives).bytes
-        return Server(self._scenario, boot_id=self._lives, entropy=entropy, capacity=self._room)
-
-    def _alive(self, now_ns: int) -> Server | None:
-        """The server that lives now; None while there is none."""
-        if self._epoch_ns is None:
-            self._epoch_ns = now_ns
-        while self._deaths and now_ns >= self._epoch_ns + self._deaths[0][0]:
-            if self._server:
-                self._left += self._server.figures()["counts"].get("left_tube", 0)
-            self._server = None
-            if now_ns < self._epoch_ns + self._deaths[0][1]:
-                return None
-            self._deaths.pop(0)
-            self._server = self._begin()
-        return self._server
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
-        if server := self._alive(now_ns):
-            server.receive(datagram, now_ns=now_ns)
-
-    def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
-        if server := self._alive(now_ns):
-            server.wake(now_ns=now_ns)
-
-    def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
-        due_ns = self._server.next_wake_ns() if self._server else None
-        if not self._deaths or self._epoch_ns is None:
-            return due_ns
-        changes_ns = self._epoch_ns + self._deaths[0][self._server is None]
-        return changes_ns if due_ns is None else min(due_ns, changes_ns)
-
-    def outbox(self) -> list[Datagram]:
-        """See `Endpoint`."""
-        return self._server.outbox() if self._server else []
-
-    def events(self) -> Sequence[Event]:
-        """See `Endpoint`."""
-        return self._server.events() if self._server else ()
-
-    def figures(self) -> dict[str, Any]:
-        """See `Endpoint`; observations outside a tube are those of all lives."""
-        told = self._server.figures() if self._server else {"counts": {}}
-        told["counts"]["left_tube"] = self._left + told["counts"].get("left_tube", 0)
-        return told
+    live()
+    actions: list[tuple[float, Callable[[World], None]]] = []
+    for from_s, to_s in deaths:
+        actions += [(from_s, lambda world: world.stop(flight.SERVER[0])), (to_s, live)]
+    return flight.fly(scenario, vehicles=vehicles, server=lives[0], actions=actions), lives
 
 
 def deaths(seed: int, duration: float) -> list[tuple[float, float]]:

@@ -1,41 +1,29 @@
-"""Cost of keeping vehicles apart: a motion's QP beside other solvers, and the planning of a tick.
+"""Cost of keeping vehicles apart: the planning of a tick beside OSQP.
 
-    python -m bench.motions
-
-The QPs are those of a flight of the scenario `swap`, with the constraints that were taken in. All
-solvers get them one after the other, in turns. OSQP is set up once for each shape of problem and
-given what changes, with tolerances of 1e-4, which leave a millimetre, and no polishing. quadprog,
-where it is installed, is given the Hessian's factor, DAQP the dense problem. HPIPM takes no part:
-it wants the problem in stages, each with its own half-planes, whose number differs in each problem.
-
-The section `motions` of `make bench` has ticks of fleets of which a share is near others: pairs
-that change places again and again, 20 m from the next pair, beside vehicles that fly to and fro
-alone. The planning of each tick (everything, from the motions that may be flown to the one that is
-sent) is compared with OSQP on one QP for each vehicle planned for in that tick, the last of its
-rounds. Both are CPU time.
+Fleets of which a share is near others: pairs that change places again and again, 20 m from the next
+pair, beside vehicles that fly to and fro alone. The planning of each tick (everything, from the
+motions that may be flown to the one that is sent) is compared with OSQP on one QP for each vehicle
+planned for in that tick, the last of its rounds, with the constraints that were taken in. OSQP is
+set up once for each shape of problem and given what changes, with tolerances of 1e-4, which leave a
+millimetre, and no polishing. Both are CPU time.
 """
 
 import itertools
 import math
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import daqp
 import msgspec
 import numpy as np
 import osqp
-import tyro
 from scipy import sparse
 
 from bench.harness import TextTable, progress
-from bench.problems import derive
 from skytether.server.missions.dual_active_set import DualActiveSet
 from skytether.server.missions.half_planes import HalfPlanes
 from skytether.server.missions.mission_planner import MissionPlanner
@@ -59,15 +47,6 @@ LEG_S = 5.0
 """Time from one goal to the next there [s]."""
 RIVALS = 60
 """Number of ticks that OSQP solves the problems of."""
-
-
-@dataclass(frozen=True)
-class MotionsOptions:
-    """Amount to measure."""
-
-    problems: int = 2000
-    duration: float = 30.0
-    """Length of a flight [s]."""
 
 
 @dataclass(frozen=True)
@@ -158,75 +137,6 @@ class MotionOsqp:
             solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
         found: Array = np.asarray(solver.solve(raise_error=False).x)
         return found
-
-
-def rivals(hessian: Array) -> dict[str, Callable[[MotionProblem], Array]]:
-    """Solvers by name, each of problems with this Hessian."""
-    found: dict[str, Callable[[MotionProblem], Array]] = {"OSQP": MotionOsqp(hessian).solve}
-
-    def of_daqp(problem: MotionProblem) -> Array:
-        least, free = problem.least, np.full(len(problem.least), 1e30)
-        most = np.where(np.arange(len(least)) < problem.equal, least, free)
-        kind = np.where(np.arange(len(least)) < problem.equal, 5, 0).astype(np.int32)
-        rows = np.ascontiguousarray(problem.columns.T)
-        result: Array = daqp.solve(hessian, -problem.linear, rows, most, least, kind)[0]
-        return result
-
-    found["DAQP"] = of_daqp
-    if find_spec("quadprog"):
-        import quadprog
-
-        factor = np.linalg.inv(np.linalg.cholesky(hessian).T)
-
-        def of_quadprog(problem: MotionProblem) -> Array:
-            given = factor, problem.linear, problem.columns, problem.least, problem.equal, True
-            result: Array = quadprog.solve_qp(*given)[0]
-            return result
-
-        found["quadprog"] = of_quadprog
-    return found
-
-
-def solvers(options: MotionsOptions) -> TextTable:
-    """All solvers on the QPs of a flight."""
-    problems: list[MotionProblem] = []
-    with kept(problems):
-        flight.fly(derive("swap", duration=options.duration, settle=1.0), vehicles=16)
-    step = max(1, len(problems) // options.problems)
-    problems = problems[::step][: options.problems]
-    root = problems[0].solver.root
-    hessian = np.linalg.inv(root.T @ root).astype(np.float64)
-    solve: dict[str, Callable[[MotionProblem], Any]] = {
-        "ours, dual active set": lambda problem: problem.solver.solve(*problem[1:]),
-        **rivals(hessian),
-    }
-    spent: dict[str, list[float]] = {name: [] for name in solve}
-    off: dict[str, float] = dict.fromkeys(solve, 0.0)
-    for _ in range(2):  # the first time warms up
-        for each in spent.values():
-            each.clear()
-        for problem in progress(problems, "QPs"):
-            ours = None
-            for name, solver in solve.items():
-                began = time.perf_counter_ns()
-                found = solver(problem)
-                spent[name].append((time.perf_counter_ns() - began) / 1e3)
-                ours = found if ours is None else ours
-                off[name] = max(off[name], float(np.abs(found - ours).max()))
-    p50, p99 = ({n: float(np.quantile(x, q)) for n, x in spent.items()} for q in (0.5, 0.99))
-    rows = [
-        [
-            name,
-            f"{p50[name]:.0f}, {p99[name]:.0f}",
-            f"{p50['OSQP'] / p50[name]:.1f}, {p99['OSQP'] / p99[name]:.1f}",
-            f"{off[name]:.1e}",
-        ]
-        for name in spent
-    ]
-    constraints = np.median([len(problem.least) for problem in problems])
-    title = f"solver; {len(problems)} QPs, 24 variables, {constraints:.0f} constraints (median)"
-    headings = [title, "p50, p99 [µs]", "OSQP over it", "largest difference\n[m/s²]"]
-    return TextTable(headings, rows)
 
 
 def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> Scenario:
@@ -361,13 +271,3 @@ def _beside_osqp(
 def _quantiles(numbers: list[float]) -> dict[str, float]:
     p50, p99 = np.quantile(numbers, (0.5, 0.99)).tolist()
     return {"p50": p50, "p99": p99}
-
-
-def main() -> int:
-    """Measure the solvers as the command line says, and print a table."""
-    solvers(tyro.cli(MotionsOptions, description=__doc__)).show("one QP")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -17,8 +17,6 @@ import multiprocessing
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -28,18 +26,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.children import HOST, ChildProcess
 from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.events import Counted, Listening
+from skytether.shared.core.events import Counted
 from skytether.shared.telemetry.record import DOWNLINK, read
-from skytether.shell.log import LogLine
 from skytether.shell.udp import kernel_drops, open_socket
 
-HOST = "127.0.0.1"
 HEAD = struct.Struct("<qq")
 """Header of a packet: its number and time of sending [ns]; the rest is zeros."""
 BATCH_NS = MILLISECOND_NS // 4
@@ -175,23 +171,23 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
-        netem, port = start_netem(stack, answer(receiver), seed, record)
+        netem = start_netem(stack, answer(receiver), seed, record)
+        port = netem.address[1]
         sender, sleeper = start(stack, send, options, port), start(stack, sleep, options)
         answer(sender), answer(sleeper)
 
-        used_ns, start_ns = scheduled_ns(netem.pid), time.monotonic_ns() + SECOND_NS // 10
+        used_ns, start_ns = scheduled_ns(netem.process.pid), time.monotonic_ns() + SECOND_NS // 10
         for pipe in (receiver, sleeper, sender):
             pipe.send(start_ns)
         sent = answer(sender)
-        used_ns = scheduled_ns(netem.pid) - used_ns
+        used_ns = scheduled_ns(netem.process.pid) - used_ns
         (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
 
-        netem.send_signal(signal.SIGTERM)
-        log, _ = netem.communicate(timeout=PATIENCE_S)
+        netem.stop()
         drawn_ns = drawn_delays_ns(record, sent)
 
     numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
-    counted = msgspec.json.decode(log.splitlines()[-1], type=LogLine).event
+    counted = netem.all(Counted)[-1].event
     assert isinstance(counted, Counted)
     downlink = counted.figures["downlink"]
     taken = downlink["packets"]
@@ -228,21 +224,10 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
     return ours
 
 
-def start_netem(
-    stack: ExitStack, server_port: int, seed: int, record: Path
-) -> tuple[subprocess.Popen[str], int]:
-    """Run netem with the paper's delays and without loss; returns process and port."""
-    # -P: without it, a folder `netem` in the working directory would be run.
-    command = [sys.executable, "-P", "-m", "skytether.netem", "paper", f"--seed={seed}"]
-    command += [f"--bind={HOST}:0", f"--server={HOST}:{server_port}", "--log=json"]
-    command += ["--network.downlink.loss=0", f"--record={record}"]
-    netem = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    stack.callback(netem.wait)
-    stack.callback(netem.kill)
-    assert netem.stdout is not None
-    listening = msgspec.json.decode(netem.stdout.readline(), type=LogLine).event
-    assert isinstance(listening, Listening)
-    return netem, listening.port
+def start_netem(stack: ExitStack, server_port: int, seed: int, record: Path) -> ChildProcess:
+    """Run netem with the paper's delays and without loss."""
+    at = f"--bind={HOST}:0", f"--server={HOST}:{server_port}", f"--record={record}"
+    return ChildProcess(stack, "netem", "paper", f"--seed={seed}", *at, "--network.downlink.loss=0")
 
 
 def answer(pipe: Connection) -> Any:

@@ -4,9 +4,6 @@ A command that ends is measured to its end, with the most memory that it had; a 
 says that it listens, and a client until its first packet arrives. *Warm* starts find bytecode and
 the machine code of kernels on disk, *cold* ones find neither, as after an installation. Starts take
 turns, and CPU time stands beside the time that passed: on a busy machine it says more.
-
-`python -m bench.starting OTHER/.venv/bin/python` measures another checkout by
-turns with this one, and writes nothing.
 """
 
 import os
@@ -22,8 +19,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import tyro
 
 from bench.children import HOST, PATIENCE_S
 from bench.harness import TextTable, median, progress
@@ -85,36 +80,26 @@ class StartCost(NamedTuple):
 
 
 def measure(counts: StartingCounts) -> dict[str, Any]:
-    """Costs of each start, medians."""
-    return {"starts": by_turns({"": sys.executable}, counts)[""]}
-
-
-def by_turns(pythons: Mapping[str, str], counts: StartingCounts) -> dict[str, dict[str, Any]]:
-    """Costs of each start in each environment, medians of warm and of cold ones.
-
-    Args:
-        pythons: Python interpreter of each environment.
-        counts: number of starts.
-    """
+    """Costs of each start, medians of warm and of cold ones."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    found: dict[tuple[str, str, str], list[StartCost]] = {}
+    found: dict[tuple[str, str], list[StartCost]] = {}
     # The first warm start leaves on disk what the others find there, and does not count.
     turns = [("warm", turn) for turn in range(counts.warm + 1)]
     turns += [("cold", turn + 1) for turn in range(counts.cold)]
-    for (kind, turn), name, where in progress([*product(turns, STARTS, pythons)], "starting"):
+    for (kind, turn), name in progress([*product(turns, STARTS)], "starting"):
         with tempfile.TemporaryDirectory() as folder:
             nothing = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": folder}
             environment = kept | (nothing if kind == "cold" else {})
-            cost = started(pythons[where], STARTS[name].command, environment)
+            cost = started(STARTS[name].command, environment)
         if turn:
-            found.setdefault((where, name, kind), []).append(cost)
-    costs: dict[str, dict[str, Any]] = {where: {name: {} for name in STARTS} for where in pythons}
-    for (where, name, kind), each in found.items():
-        costs[where][name][kind] = StartCost(*map(median, zip(*each, strict=True)))._asdict()
-    return costs
+            found.setdefault((name, kind), []).append(cost)
+    costs: dict[str, dict[str, Any]] = {name: {} for name in STARTS}
+    for (name, kind), each in found.items():
+        costs[name][kind] = StartCost(*map(median, zip(*each, strict=True)))._asdict()
+    return {"starts": costs}
 
 
-def started(python: str, command: str, environment: Mapping[str, str]) -> StartCost:
+def started(command: str, environment: Mapping[str, str]) -> StartCost:
     """Cost of one start.
 
     Raises:
@@ -134,7 +119,7 @@ def started(python: str, command: str, environment: Mapping[str, str]) -> StartC
             more = ["--server", address_text(*sink.getsockname())]
         began_ns = time.monotonic_ns()
         process = subprocess.Popen(
-            [python, "-P", "-m", "skytether", name, *rest, *more],
+            [sys.executable, "-P", "-m", "skytether", name, *rest, *more],
             env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -201,28 +186,3 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 
 def _shown(figure: str, target: float | None) -> str:
     return figure if target is None else f"{figure} (≤ {target:g})"
-
-
-@dataclass(frozen=True)
-class StartingOptions:
-    """Options of a comparison."""
-
-    pythons: tyro.conf.Positional[tuple[Path, ...]]
-    """Python interpreters of the environments to measure by turns with this one."""
-    warm: int = FULL.warm
-    """Number of warm starts of each command."""
-    cold: int = 0
-    """Number of cold starts of each command."""
-
-
-def main() -> None:
-    """Print the costs of each start in several environments."""
-    options = tyro.cli(StartingOptions, description=__doc__)
-    pythons = {str(each): str(each) for each in (*options.pythons, Path(sys.executable))}
-    for where, starts in by_turns(pythons, StartingCounts(options.warm, options.cold)).items():
-        for table in tables({"starts": starts}).values():
-            table.show(where)
-
-
-if __name__ == "__main__":
-    main()

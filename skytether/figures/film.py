@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skytether.figures.page import blank
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
@@ -74,14 +75,13 @@ def _frames(
 ) -> Iterator["Image"]:
     """Frames of the film, one after the other."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from PIL import Image
 
     dt_s, steps = scenario.control.dt, client["step"]
     shown = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
     tracks = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
 
-    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    figure = blank(6.4, 3.2)
     canvas: Any = FigureCanvasAgg(figure)
     plane, nearest = figure.subplots(1, 2) if separations else (figure.subplots(), None)
     everywhere = client["state"][:, :2, 0]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skytether.figures.page import blank
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
@@ -60,9 +61,7 @@ def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
     Args:
         flown: scenario and record of each flight, by title.
     """
-    from matplotlib.figure import Figure  # takes half a second to import
-
-    figure = Figure(figsize=(5.2 * len(flown), 5.6), layout="constrained")
+    figure = blank(5.2 * len(flown), 5.6)
     grid = figure.subplots(
         2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(6, 1)
     )
@@ -123,9 +122,7 @@ def fleet(
         server: rows of the server; only they have the positions of a live point.
         separations: times and distances of a mission, see `summary.separations`.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+    figure = blank(10.4, 4.8)
     plane, spread = figure.subplots(1, 2)
     flights = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
     for rows in flights:

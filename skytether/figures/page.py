@@ -1,10 +1,17 @@
-"""Page of a report: tables and figures in one file that opens offline."""
+"""Page of a report: tables and figures in one file that opens offline; and empty figures."""
 
 import base64
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from skytether.figures.tables import rows_csv
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +46,58 @@ class Picture:
     """Drawing as PNG."""
 
 
+def blank(width: float, height: float) -> "Figure":
+    """Empty figure of a size [inch]."""
+    from matplotlib.figure import Figure  # takes half a second to import
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+@contextmanager
+def lettered(width: float, height: float, size: float) -> "Iterator[Figure]":
+    """Empty figure of a page, of a size [inch], while letters have a size [points]."""
+    import matplotlib as mpl
+
+    letters: Any = {"font.size": size, "axes.titlesize": size, "legend.fontsize": 8}
+    grid: Any = {"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}
+    with mpl.rc_context(letters | grid):
+        yield blank(width, height)
+
+
+def as_png(figure: "Figure", dpi: int) -> bytes:
+    """Figure as the content of a PNG file."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=dpi)
+    return png.getvalue()
+
+
 def as_text(value: Any, spec: str) -> str:
     """Number as shown in a table, with a dash for an unknown one."""
     return "–" if value is None else format(value, spec)
+
+
+Row = Mapping[str, Any]
+"""Numbers of a row, by the name of their column."""
+Cell = tuple[str, str] | Callable[[Row], str]
+"""How a cell is shown: name and format of a number, or a function of the row."""
+
+
+def table_of(
+    name: str, title: str, says: str, rows: Sequence[Row], shown: Mapping[str, Cell]
+) -> Table:
+    """Table of some numbers.
+
+    Args:
+        name, title, says: see `Table`.
+        rows: all numbers; they go into the CSV.
+        shown: what is shown in each column, by its heading.
+    """
+
+    def text(row: Row, cell: Cell) -> str:
+        return cell(row) if callable(cell) else as_text(row[cell[0]], cell[1])
+
+    lines = [[text(row, cell) for cell in shown.values()] for row in rows]
+    return Table(name, title, says, rows_csv(rows), list(shown), lines)
 
 
 def rendered(template: str, **values: Any) -> str:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from skytether.figures.page import blank
 from skytether.probe.outcome import ProbeOutcome
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.scenario.air.delays import Delay
@@ -21,9 +22,7 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
 
     The best model is drawn over each distribution.
     """
-    from matplotlib.figure import Figure  # takes half a second to import
-
-    figure = Figure(figsize=(10.0, 5.6), layout="constrained")
+    figure = blank(10.0, 5.6)
     grid = figure.subplots(2, 2, width_ratios=(5, 3))
     for (name, delays), (over_time, shares) in zip(outcome.delays.items(), grid, strict=True):
         told = getattr(outcome.told, name)

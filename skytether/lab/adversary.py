@@ -10,10 +10,8 @@ at single packets of the nearest two, shortly before they are nearest. Moves are
 they give the same distance to the last bit.
 """
 
-import io
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -24,35 +22,21 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
-from skytether.client.endpoint import Client
-from skytether.client.memory import recall
-from skytether.client.simulated.sensor import Sensor
-from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
-from skytether.client.vehicle import Measurement
 from skytether.lab.faults import shrink
-from skytether.server.endpoint import Server
+from skytether.lab.lives import CLOCK, Lives, world_s
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.scenario import mission
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
-from skytether.shared.telemetry.record import Recorder, client_columns, parse
-from skytether.shared.telemetry.summary import Track, nearest, track
-from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER
-from skytether.sim.world import Clock, World
+from skytether.shared.telemetry.summary import Track, nearest
+from skytether.sim.flight import SERVER
 
-AIR: Address = ("air", 0)
-CLOCK = Clock(MIDNIGHT_NS)
-"""Clock of all hosts: the map of clocks does not depend on what they show."""
 BASE_NS = 50 * MILLISECOND_NS
 """Delay of every packet before any move [ns]."""
-HOLD_NS = SECOND_NS
-"""Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
 ARRIVED_M, RESTS_MPS = 0.3, 0.1
 """Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
 AIMED_NS = 10 * SECOND_NS
@@ -153,15 +137,20 @@ class Packet(NamedTuple):
 class Near(msgspec.Struct, frozen=True):
     """Smallest distance in a flight."""
 
-    distance_m: float
-    """Infinite where there is none."""
-    at_s: float
+    distance_m: float | None = None
+    """None where there is none."""
+    at_s: float = 0.0
     """Time of the world [s]."""
-    vehicles: tuple[int, ...]
+    vehicles: tuple[int, ...] = ()
     """Numbers of those that were so near."""
 
+    @property
+    def away_m(self) -> float:
+        """Distance, infinite where there is none [m]."""
+        return math.inf if self.distance_m is None else self.distance_m
 
-NOWHERE = Near(math.inf, 0.0, ())
+
+NOWHERE = Near()
 
 
 class Approach(msgspec.Struct, frozen=True, kw_only=True):
@@ -237,49 +226,6 @@ class Air(Endpoint):
         return self._held[0][0] if self._held else None
 
 
-class Body(SimulatedVehicle):
-    """Simulated vehicle that outlives its clients: without one it keeps its last velocity.
-
-    Args:
-        scenario: what is flown.
-        number: number of the vehicle.
-    """
-
-    def __init__(self, scenario: Scenario, number: int) -> None:
-        made = simulated(scenario, number)
-        super().__init__(scenario.dt_ns, made.plant, made.sensor)
-        self._lost_ns: int | None = None
-        """Time at which its client went down, until there is another."""
-        self.unflown: list[tuple[float, list[float]]] = []
-        """Times [s; client's clock] and positions [m] of steps without a client."""
-
-    def lose_client(self, sensor: Sensor) -> None:
-        """Fly without a client from the present step on, and then by one with another sensor."""
-        if self._step >= 0:
-            self._lost_ns, self._step = self._began_ns + self._step * self._dt_ns, -1
-        self.sensor = sensor
-
-    def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """See `Vehicle`."""
-        if self._lost_ns is not None:
-            at_ns = self._lost_ns
-            while at_ns + self._dt_ns <= now_ns:
-                is_held = at_ns < self._lost_ns + HOLD_NS
-                self.plant.advance(self._velocity if is_held else 0.0 * self._velocity)
-                at_ns += self._dt_ns
-                self.unflown.append((at_ns / SECOND_NS, self.plant.state()[:, 0].tolist()))
-            self._lost_ns = None
-        return super().measurements(now_ns=now_ns)
-
-
-class Life(NamedTuple):
-    """Run of a vehicle's client."""
-
-    client: Client
-    sink: io.BytesIO
-    """Record of its steps."""
-
-
 class Raid:
     """Flight of a mission against the adversary.
 
@@ -289,102 +235,36 @@ class Raid:
     """
 
     def __init__(self, scenario: Scenario, moves: Moves) -> None:
-        made = scenario.make_reference()
-        assert isinstance(made, Mission)
-        self._scenario, self._moves, self._goals = scenario, moves, made
-        self._world, self._air = World(), Air(moves, scenario.seed)
-        self._world.add(AIR[0], self._air)
-        self._lives: dict[int, list[Life]] = {number: [] for number in made.vehicles}
+        self._scenario, self._moves, self._air = scenario, moves, Air(moves, scenario.seed)
         mortal = {move.vehicle for move in moves if move.kind is Kind.CLIENT}
-        is_mortal = {number: number in mortal or 0 in mortal for number in made.vehicles}
-        make = {True: Body, False: simulated}
-        self._bodies = {n: make[each](scenario, n) for n, each in is_mortal.items()}
-        phase_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
-        for number in made.vehicles:
-            start_ns = phase_ns + number * scenario.dt_ns
-            client = self._new_client(number)
-            self._world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
-        self._servers = 0
-        self._kept = scenario
-        """Scenario with all that was set, as the journal of the server keeps it."""
-        self._running: Running | None = None
-        """Server and its scenario, while it is up."""
-        self._world.add(SERVER[0], self._new_server(), clock=CLOCK)
+        self._lives = Lives(scenario, self._air, None if 0 in mortal else mortal)
+        self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
         self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
         """Zones that the operator has set, and since when [s; the hosts' clocks]."""
         for move in moves:
             if move.kind not in NETWORK:
                 self._plan(move)
 
-    def _new_server(self) -> Server:
-        """The next life of the server."""
-        self._servers += 1
-        entropy = stream(self._scenario.seed, "entropy", self._servers).bytes
-        boot_id, room = BOOT_ID + self._servers, len(self._goals.vehicles)
-        self._server = Server(self._kept, boot_id=boot_id, entropy=entropy, capacity=room)
-        self._running = Running(self._server, self._kept)
-        return self._server
-
-    def _new_client(self, number: int) -> Client:
-        """The next life of a vehicle's client."""
-        lives, sink, world = self._lives[number], io.BytesIO(), self._world
-        keeps = isinstance(self._bodies[number], Body) and self._scenario.vehicle.memory != "none"
-        before, now_ns = None, CLOCK.local(world.now_ns)
-        if lives and (kept := world.memory(f"client {number}")):
-            before = recall(*kept, now_ns, self._scenario.terms())
-        client = Client(
-            self._scenario,
-            self._bodies[number],
-            server=AIR,
-            vehicle=number,
-            boot_id=BOOT_ID + len(lives),
-            recorder=Recorder(client_columns(self._scenario.model.axes), sink),
-            keeps=keeps,
-            before=before,
-        )
-        lives.append(Life(client, sink))
-        return client
-
     def _plan(self, move: Move) -> None:
         """Schedule a move that is not of the network."""
+        lives = self._lives
+        hit = [number for number in self._vehicles if move.vehicle in (0, number)]
+        begin: list[Callable[[], None]] = [self._set]
+        end: list[Callable[[], None]] = [self._set]
         match move.kind:
             case Kind.SERVER:
-                begin, end = self._stop_server, self._start_server
+                begin, end = [lives.stop_server], [partial(lives.start_server, {})]
             case Kind.CLIENT:
-                begin = partial(self._stop_clients, move.vehicle)
-                end = partial(self._start_clients, move.vehicle)
-            case _:
-                begin = end = self._set
-        self._world.at(move.start_ns, begin)
-        self._world.at(move.end_ns, end)
-
-    def _stop_server(self) -> None:
-        self._running = None
-        self._world.stop(SERVER[0])
-
-    def _start_server(self) -> None:
-        self._world.restart(SERVER[0], self._new_server())
-
-    def _stop_clients(self, vehicle: int) -> None:
-        for number in self._hit(vehicle):
-            self._world.stop(f"client {number}")
-
-    def _start_clients(self, vehicle: int) -> None:
-        for number in self._hit(vehicle):
-            body, lives = self._bodies[number], len(self._lives[number])
-            assert isinstance(body, Body)
-            noise = stream(self._scenario.seed, "sensor", number, lives)
-            body.lose_client(Sensor(self._scenario, noise))
-            self._world.restart(f"client {number}", self._new_client(number))
-
-    def _hit(self, vehicle: int) -> list[int]:
-        """Numbers of the vehicles that a move is against."""
-        return [number for number in self._lives if vehicle in (0, number)]
+                begin = [partial(lives.stop_client, number) for number in hit]
+                end = [partial(lives.start_client, number) for number in hit]
+        for time_ns, actions in ((move.start_ns, begin), (move.end_ns, end)):
+            for action in actions:
+                self._world.at(time_ns, action)
 
     def _set(self) -> None:
         """Set goals and zones as the moves of now say; the server may refuse them."""
-        running, now_ns, given = self._running, self._world.now_ns, self._scenario.mission
-        if running is None:
+        lives, now_ns, given = self._lives, self._world.now_ns, self._scenario.mission
+        if lives.running is None:
             return
         now = [move for move in self._moves if move.is_on(now_ns)]
         goals = {move.vehicle: np.array(move.amounts) for move in now if move.kind is Kind.GOALS}
@@ -398,10 +278,8 @@ class Raid:
             "mission.zones": " & ".join(filter(None, [given.zones, *more])),
         }
         for key, text in texts.items():
-            with suppress(ConfigError):
-                self._world.act(SERVER[0], partial(running.change, {key: text}))
-        self._kept = running.scenario
-        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, self._kept.zones))
+            lives.set({key: text})
+        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, lives.running.scenario.zones))
 
     # -- what is flown -----------------------------------------------------------------------------
 
@@ -418,8 +296,8 @@ class Raid:
             return self._has_arrived()
 
         self._world.run(over, limit_ns=seconds_to_ns(scenario.duration + scenario.link.connect_s))
-        tracks = {number: self._track(number) for number in self._lives}
-        left = self._server.figures()["counts"].get("left_tube", 0)
+        tracks = self._lives.tracks()
+        left = self._lives.server.figures()["counts"].get("left_tube", 0)
         apart, clear = self._apart(tracks), self._clear(tracks)
         return Approach(moves=self._moves, apart=apart, clear=clear, left=left)
 
@@ -430,33 +308,12 @@ class Raid:
 
     def _has_arrived(self) -> bool:
         """Whether all vehicles are at rest at their last goals."""
-        for number, body in self._bodies.items():
-            goal = self._goals.of(number)(np.array(self._scenario.duration))[:, 0]
+        for number, body in self._lives.bodies.items():
+            goal = self._lives.mission.of(number)(np.array(self._scenario.duration))[:, 0]
             p, v = body.plant.state().T
             if math.dist(p, goal) > ARRIVED_M or math.hypot(*v) > RESTS_MPS:
                 return False
         return True
-
-    def _track(self, number: int) -> Track:
-        """Track of a vehicle, from its first step on a mission on, through all its lives."""
-        dt_s, scale = self._scenario.control.dt, self._scenario.mission.height_scale
-        tracks: list[Track] = []
-        for client, sink in self._lives[number]:
-            rows = parse(sink.getvalue())
-            if tracks or (rows["mode"] == Mode.TRACK).any():
-                began_s = client.began_ns / SECOND_NS
-                tracks.append(track(rows, began_s, dt_s, scale, whole=bool(tracks)))
-        body = self._bodies[number]
-        if tracks and isinstance(body, Body) and body.unflown:
-            times, at = (np.array(each) for each in zip(*body.unflown, strict=True))
-            at[:, 2:] *= scale
-            since = times > tracks[0][0][0]
-            tracks.append((times[since], at[since]))
-        if not tracks:
-            return np.zeros(0), np.zeros((0, self._scenario.model.axes))
-        times, at = (np.concatenate(each) for each in zip(*tracks, strict=True))
-        order = np.argsort(times, kind="stable")
-        return times[order], at[order]
 
     def _apart(self, tracks: Mapping[int, Track]) -> Near:
         """Smallest distance between two vehicles."""
@@ -471,7 +328,7 @@ class Raid:
         }
         by_m = {pair: math.dist(*map(places.__getitem__, pair)) for pair in combinations(places, 2)}
         pair = min(by_m, key=lambda each: (math.isnan(by_m[each]), by_m[each]))
-        return Near(float(apart_m[least]), _world_s(times[least]), pair)
+        return Near(float(apart_m[least]), world_s(times[least]), pair)
 
     def _clear(self, tracks: Mapping[int, Track]) -> Near:
         """Smallest distance of a vehicle from a zone, while there was that zone."""
@@ -484,14 +341,9 @@ class Raid:
                     points = at[here] / np.array([1.0, 1.0, scale])[: at.shape[1]]
                     clear_m = zones.clearance(points).min(axis=1)
                     i = int(clear_m.argmin())
-                    if clear_m[i] < found.distance_m:
-                        found = Near(float(clear_m[i]), _world_s(times[here[i]]), (number,))
+                    if clear_m[i] < found.away_m:
+                        found = Near(float(clear_m[i]), world_s(times[here[i]]), (number,))
         return found
-
-
-def _world_s(time_s: float) -> float:
-    """Time of the world, of one of the hosts' clocks [s]."""
-    return float(time_s) - MIDNIGHT_NS / SECOND_NS
 
 
 # -- search --------------------------------------------------------------------------------------
@@ -535,7 +387,7 @@ def fly(scenario: Scenario, moves: Moves) -> Approach:
 
 def spare_m(scenario: Scenario, found: Approach) -> float:
     """Distance beyond what is asked for, between vehicles or from zones [m]; negative: not kept."""
-    return min(found.apart.distance_m - scenario.mission.separation_m, found.clear.distance_m)
+    return min(found.apart.away_m - scenario.mission.separation_m, found.clear.away_m)
 
 
 def climb(task: Climb) -> Climbed:
@@ -547,7 +399,7 @@ def climb(task: Climb) -> Climbed:
     drawn, since, packets = 0, 0, list[Packet]()
 
     def value(found: Approach) -> float:
-        return (found.clear if task.seeks_zones else found.apart).distance_m
+        return (found.clear if task.seeks_zones else found.apart).away_m
 
     for _ in range(task.tries):
         if since >= task.patience:

@@ -6,18 +6,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
-from skytether.figures.page import Table, as_text
+from skytether.figures.page import Cell, Row, Table, as_text, lettered, table_of
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab import plates
-from skytether.lab.beside import Baselines, Floor
 from skytether.lab.budgets import BUDGETS, EVERY, SOUGHT, Chosen, FlownContender, Plan
-from skytether.lab.contenders import ABOARD, CONTENDERS, Case, Contender
+from skytether.lab.contenders import ABOARD, CASES, CONTENDERS, Case, Contender
+from skytether.lab.floor import Baselines, Floor
+from skytether.lab.intervals import Estimate, interval, jackknife
 from skytether.lab.plates import Plate
 from skytether.lab.report import Drawn
-from skytether.lab.sweep import Estimate, Results, Sweep, by_name, interval
-from skytether.shared.base.chance import stream
+from skytether.lab.sweep import Results, Sweep, by_name
 from skytether.shared.telemetry.summary import Summary
 
 RMSE, SHARE, EFFORT = "rmse_xy", "event_ratio", "effort_mps"
@@ -145,10 +144,9 @@ def compared(
 
 
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
-    """Ratio of the mean RMSE xy of ours to theirs, and its 95 % interval.
+    """Ratio of the mean RMSE xy of ours to theirs, and its 95 % interval, see `jackknife`.
 
-    The interval is a bootstrap over pairs of the same seed. The result is None if fewer than two
-    seeds have flown in both.
+    The result is None if fewer than two seeds have flown in both.
     """
     errors = [
         (one.rmse_xy, other.rmse_xy)
@@ -157,15 +155,8 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
     ]
     if len(errors) < 2:
         return None
-
-    def of_means(one: Any, other: Any, axis: int = -1) -> Any:
-        return np.mean(one, axis=axis) / np.mean(other, axis=axis)
-
-    pair = np.array(errors, dtype=np.float64).T
-    low, high = stats.bootstrap(
-        pair, of_means, paired=True, method="percentile", random_state=stream(1, "bootstrap")
-    ).confidence_interval
-    return float(of_means(*pair)), float(low), float(high)
+    value, half = jackknife(lambda pairs: float(np.divide(*pairs.mean(axis=0))), np.array(errors))
+    return value, value - half, value + half
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +231,8 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
     return Drawn(TITLE, ABOUT, tables, list(map(curves, results)), verdict)
 
 
+TITLES = {each.name: each.title for each in CONTENDERS}
+CASE_TITLES = {each.name: each.title for each in CASES}
 TITLE = "Schemes and triggers compared"
 ABOUT = (
     "What only the server knows is sent over the paper's network, in virtual time: all contenders "
@@ -288,7 +281,7 @@ def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
     """Table of the ratio of our contender to the best of the others within each budget."""
-    rows, lines = [], []
+    rows = []
     for each in results:
         for budget in BUDGETS:
             ours = each.bought.get((OURS, budget))
@@ -297,48 +290,36 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
                 for runs in _ranked(each, budget)
                 if runs is not ours and runs.what.contender is not ABOARD
             ]
-            if ours is None or not others:
-                continue
-            value, low, high = ratio(ours, others[0]) or (None, None, None)
-            best = others[0].what.contender
-            rows.append(
-                {
-                    "case": each.case.name,
-                    "budget": budget,
-                    "rmse_xy": ours.mean(RMSE),
-                    "best_other": best.name,
+            if ours is not None and others:
+                other = {
+                    "best_other": others[0].what.contender.name,
                     "rmse_xy_other": others[0].mean(RMSE),
-                    "ratio": value,
-                    "ratio_low": low,
-                    "ratio_high": high,
                 }
-            )
-            lines.append(
-                (
-                    each.case.title,
-                    f"≤ {budget:g}/s",
-                    as_text(ours.mean(RMSE), ".4f"),
-                    best.title,
-                    as_text(others[0].mean(RMSE), ".4f"),
-                    as_text(value, ".3f"),
-                    f"{as_text(low, '.3f')} … {as_text(high, '.3f')}",
-                )
-            )
-    (title,) = (each.title for each in CONTENDERS if each.name == OURS)
+                about = {"case": each.case.name, "budget": budget, "rmse_xy": ours.mean(RMSE)}
+                rows.append(about | other | _ratio_row(ratio(ours, others[0])))
     says = (
-        f"“{title}” over the best of the others within the same budget: ratio of mean RMSE xy, "
-        "with its 95 % interval."
+        f"“{TITLES[OURS]}” over the best of the others within the same budget: ratio of mean RMSE "
+        "xy, with its 95 % interval."
     )
-    heading = (
-        "case",
-        "budget",
-        "RMSE xy [m]",
-        "best of the others",
-        "RMSE xy [m]",
-        "ratio",
-        "95 %",
-    )
-    return Table("leaders", "At equal packets", says, rows_csv(rows), heading, lines)
+    shown: dict[str, Cell] = {
+        "case": lambda row: CASE_TITLES[row["case"]],
+        "budget": lambda row: f"≤ {row['budget']:g}/s",
+        "RMSE xy [m]": ("rmse_xy", ".4f"),
+        "best of the others": lambda row: TITLES[row["best_other"]],
+        "its RMSE xy [m]": ("rmse_xy_other", ".4f"),
+        "ratio": ("ratio", ".3f"),
+        "95 %": _ratio_span,
+    }
+    return table_of("leaders", "At equal packets", says, rows, shown)
+
+
+def _ratio_row(found: tuple[float, float, float] | None) -> dict[str, float | None]:
+    """Columns of a ratio and its interval; see `ratio`."""
+    return dict(zip(("ratio", "ratio_low", "ratio_high"), found or (None,) * 3, strict=True))
+
+
+def _ratio_span(row: Row) -> str:
+    return f"{as_text(row['ratio_low'], '.3f')} … {as_text(row['ratio_high'], '.3f')}"
 
 
 def _row(each: ContenderRuns) -> dict[str, Any]:
@@ -355,20 +336,16 @@ def _row(each: ContenderRuns) -> dict[str, Any]:
 
 def ratios_table(judged: Sequence[Judged]) -> Table:
     """Table of the claimed ratios."""
-    rows, lines = [], []
+    rows = []
     for each in judged:
-        ours, theirs = each.ours.what.contender, each.theirs.what.contender
-        value, low, high = each.ratio or (None, None, None)
         packets, octets = (each.ours.mean(of) / each.theirs.mean(of) for of in (PACKETS, BYTES))
         rows.append(
             {
                 "case": each.case.name,
-                "ours": ours.name,
-                "theirs": theirs.name,
+                "ours": each.claim.ours,
+                "theirs": each.claim.theirs,
                 "share": each.claim.share,
-                "ratio": value,
-                "ratio_low": low,
-                "ratio_high": high,
+                **_ratio_row(each.ratio),
                 "ratio_of_medians": each.medians,
                 "at_most": each.at_most,
                 "holds": each.holds,
@@ -376,41 +353,26 @@ def ratios_table(judged: Sequence[Judged]) -> Table:
                 "bytes_ratio": octets,
             }
         )
-        lines.append(
-            (
-                each.case.title,
-                ours.title,
-                theirs.title,
-                as_text(value, ".3f"),
-                f"{as_text(low, '.3f')} … {as_text(high, '.3f')}",
-                as_text(each.medians, ".3f"),
-                as_text(each.at_most, ".2f"),
-                {None: "–", True: "yes", False: "no"}[each.holds],
-                f"≤ {each.claim.share:.0%}",
-                as_text(packets, ".1%"),
-                as_text(octets, ".1%"),
-            )
-        )
     says = (
-        "Mean RMSE xy of ours over theirs, with 95 % intervals (bootstrap over pairs of the same "
-        "seed), and the ratio of medians. Theirs spends what it likes, ours at most a share of "
-        "their packets; packets and bytes are what it really spent, over theirs. A ratio holds "
-        "where all of its interval is below what is asked for."
+        "Mean RMSE xy of ours over theirs, with 95 % intervals (jackknife over seeds), and the "
+        "ratio of medians. Theirs spends what it likes, ours at most a share of their packets; "
+        "packets and bytes are what it really spent, over theirs. A ratio holds where all of its "
+        "interval is below what is asked for."
     )
-    heading = (
-        "case",
-        "ours",
-        "theirs",
-        "ratio",
-        "95 %",
-        "of medians",
-        "at most",
-        "holds",
-        "share",
-        "packets",
-        "bytes",
-    )
-    return Table("ratios", "With a share of the packets", says, rows_csv(rows), heading, lines)
+    shown: dict[str, Cell] = {
+        "case": lambda row: CASE_TITLES[row["case"]],
+        "ours": lambda row: TITLES[row["ours"]],
+        "theirs": lambda row: TITLES[row["theirs"]],
+        "ratio": ("ratio", ".3f"),
+        "95 %": _ratio_span,
+        "of medians": ("ratio_of_medians", ".3f"),
+        "at most": ("at_most", ".2f"),
+        "holds": lambda row: {None: "–", True: "yes", False: "no"}[row["holds"]],
+        "share": lambda row: f"≤ {row['share']:.0%}",
+        "packets": ("packets_ratio", ".1%"),
+        "bytes": ("bytes_ratio", ".1%"),
+    }
+    return table_of("ratios", "With a share of the packets", says, rows, shown)
 
 
 def weights_table(results: Sequence[ComparedCase]) -> Table:
@@ -486,7 +448,7 @@ def curves(compared: ComparedCase) -> Plate:
             "by a clock leave to those without feedback aboard, and to all where the target is not "
             "known ahead."
         )
-    with plates.sized(plates.PAGE, 5.0) as figure:
+    with lettered(plates.PAGE, 5.0, plates.LETTERS) as figure:
         panes = figure.subplots(1, 3, sharey=True)
         for contender in compared.contenders:
             _draw_curve(panes, contender, compared.curve(contender.name))

@@ -1,23 +1,15 @@
-"""Expected inputs of a vehicle under a horizon or trajectory, computed independently and by the
-compiled rule.
+"""Inputs that a vehicle should fly under a horizon or trajectory, computed independently.
 
-A course is the motion that one message prescribes. Its inputs are computed twice: by the equations
-of `shared.law.rule` and `shared.law.spline`, written here a second time, which must agree within
-rounding; and by those functions themselves, compiled as in the server, which must agree to the last
-bit.
+A course is the motion that one message prescribes. Its inputs follow from the equations of
+`shared.law.rule` and `shared.law.spline`, written here a second time, in plain numpy: a mistake in
+the compiled functions, which both ends fly and predict by, cannot hide in their check.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.server.common.compiled import reference_at, step
-from skytether.server.schemes.trajectory import along, follow, guided_to
-from skytether.shared.base.kernel import F1, kernel
-from skytether.shared.law.model import Array, Axis
-from skytether.shared.law.rule import AxisHorizon, bounded
-from skytether.shared.law.spline import AxisSpline
+from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
     DISTURBANCE,
@@ -25,8 +17,6 @@ from skytether.shared.wire.protocol import (
     GAIN_P,
     GAIN_V,
     LED,
-    LED_P,
-    LED_V,
     Horizon,
     Trajectory,
 )
@@ -43,9 +33,7 @@ class PlannedCourse:
 
     def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:
         bound = np.array(terms.u_max)[:, None]
-        self._length, self._terms = length, terms
-        self._given = horizon.inputs.astype(float)
-        self._inputs = np.clip(self._given[:, :length], -bound, bound)
+        self._inputs = np.clip(horizon.inputs[:, :length].astype(float), -bound, bound)
         self._speed = float(np.linalg.norm(self._inputs[:, -1]))
         self._model, self._brake = terms.model, terms.brake
         feedback = horizon.feedback.astype(float)
@@ -53,7 +41,7 @@ class PlannedCourse:
         """Whether the horizon contains feedback gains."""
         if not self.feeds_back:
             feedback = np.zeros((terms.axes, FEEDBACK))
-        self._feedback, self.lag = feedback, np.zeros(terms.axes)
+        self.lag = np.zeros(terms.axes)
         self._gain, self._disturbance = feedback[:, [GAIN_P, GAIN_V]], feedback[:, DISTURBANCE]
         self._led, self._stage = feedback[:, LED], 0
 
@@ -79,39 +67,6 @@ class PlannedCourse:
         self._stage = max(self._stage, stage)
         back: Array = (self._gain * (self._led - state)).sum(axis=1)
         return back
-
-    def by_rule(
-        self,
-        stage: int,
-        state: Array,
-        found: Sequence[float],  # noqa: ARG002
-        before: Sequence[float],  # noqa: ARG002
-    ) -> list[float]:
-        """Input at a stage by the compiled rule, of each axis [m/s]; see `back`."""
-        speed = math.sqrt(sum(u * u for u in self._inputs[:, -1].tolist()))
-        return [
-            _by_inputs(
-                model,
-                inputs,
-                self._length,
-                speed,
-                self._brake,
-                bound,
-                self.feeds_back,
-                row,
-                stage,
-                p,
-                v,
-            )
-            for model, inputs, bound, row, (p, v) in zip(
-                self._model.axes(),
-                self._given,
-                self._terms.u_max,
-                self._feedback,
-                state.tolist(),
-                strict=True,
-            )
-        ]
 
 
 class FollowedCourse:
@@ -179,120 +134,5 @@ class FollowedCourse:
         back: Array = (self._gain * (led - state)).sum(axis=1) - np.array(found)
         return back
 
-    def by_rule(
-        self, stage: int, state: Array, found: Sequence[float], before: Sequence[float]
-    ) -> list[float]:
-        """Input at a stage by the compiled rule, of each axis [m/s]; see `back`.
-
-        Args:
-            before: input flown until now, of each axis [m/s].
-        """
-        terms = self._terms
-        axes = list(
-            zip(
-                self._model.axes(),
-                self._knots.reshape(terms.axes, -1),
-                terms.u_max,
-                self._gain.tolist(),
-                self.lag.tolist(),
-                state.tolist(),
-                found,
-                before,
-                strict=True,
-            )
-        )
-        last = [
-            _last_along(model, knots, self._spacing, terms.dt_s, self._length, bound)
-            for model, knots, bound, *_ in axes
-        ]
-        speed = math.hypot(*last)
-        return [
-            _by_spline(
-                model,
-                knots,
-                self._spacing,
-                terms.dt_s,
-                self._length,
-                end,
-                speed,
-                terms.brake,
-                bound,
-                gain_p,
-                gain_v,
-                lag,
-                stage,
-                p,
-                v,
-                w,
-                u,
-            )
-            for end, (model, knots, bound, (gain_p, gain_v), lag, (p, v), w, u) in zip(
-                last, axes, strict=True
-            )
-        ]
-
 
 Course = PlannedCourse | FollowedCourse
-
-
-@kernel
-def _by_inputs(
-    model: Axis,
-    inputs: F1,
-    length: int,
-    speed: float,
-    brake: float,
-    bound: float,
-    feeds_back: bool,
-    feedback: F1,
-    stage: int,
-    p: float,
-    v: float,
-) -> float:
-    """Input on one axis at a stage of a horizon [m/s]; see `shared.law.rule.step`."""
-    gain_p, gain_v, w = feedback[GAIN_P], feedback[GAIN_V], feedback[DISTURBANCE]
-    held = AxisHorizon(
-        model, inputs, length, True, speed, brake, bound, feeds_back, gain_p, gain_v, w
-    )
-    led_p, led_v = feedback[LED_P], feedback[LED_V]
-    if feeds_back:
-        led_p, led_v = reference_at(held, 0, stage, led_p, led_v)
-    u, _, _, _ = step(held, stage, led_p, led_v, p, v)
-    return u
-
-
-@kernel
-def _last_along(
-    model: Axis, knots: F1, spacing: int, dt_s: float, length: int, bound: float
-) -> float:
-    """Input ū on one axis at the last usable stage of a trajectory [m/s]."""
-    return bounded(along(model, knots, spacing, dt_s, length - 1), bound)
-
-
-@kernel
-def _by_spline(
-    model: Axis,
-    knots: F1,
-    spacing: int,
-    dt_s: float,
-    length: int,
-    last: float,
-    speed: float,
-    brake: float,
-    bound: float,
-    gain_p: float,
-    gain_v: float,
-    lag: float,
-    stage: int,
-    p: float,
-    v: float,
-    w: float,
-    before: float,
-) -> float:
-    """Input on one axis at a stage of a trajectory [m/s]; see `shared.law.spline.follow`."""
-    guide = AxisSpline(
-        model, knots, spacing, dt_s, length, last, speed, brake, bound, gain_p, gain_v, lag
-    )
-    led_p, led_v = guided_to(guide, 0, stage, knots[0], knots[1])
-    u, _ = follow(guide, stage, led_p, led_v, p, v, w, before)
-    return u

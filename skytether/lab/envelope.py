@@ -22,7 +22,7 @@ import math
 import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -88,10 +88,8 @@ def _short(value: float) -> float:
 
 
 class EnvelopePoint(msgspec.Struct, frozen=True):
-    """Outcome of a point; an entry of an envelope's journal."""
+    """Outcome of a point, or of any flight."""
 
-    number: int
-    """Number of the point, from 0 on."""
     outcome: Outcome
     error_max: float | None = None
     """Largest distance from the reference after settling [m]; None if it never settled."""
@@ -141,14 +139,14 @@ class Envelope:
         try:
             scenario = self.scenario_of(number)
         except ConfigError as error:
-            return EnvelopePoint(number, "refused", line=str(error))
+            return EnvelopePoint("refused", line=str(error))
         try:
             flown = flight.fly(scenario)
             verdict = judge(scenario, flown.client)
         except Exception as error:  # any exception is the outcome of the point
-            return EnvelopePoint(number, "crashed", line=f"{type(error).__name__}: {error}")
+            return EnvelopePoint("crashed", line=f"{type(error).__name__}: {error}")
         line = verdict.line or (str(flown.failure) if flown.failure else "")
-        return EnvelopePoint(number, *verdict._replace(line=line))
+        return msgspec.structs.replace(verdict, line=line)
 
     def command(self, number: int) -> str:
         """Command line that flies just one point again."""
@@ -159,13 +157,12 @@ class Envelope:
         return shlex.join(["skytether", "fly", self.name, "--virtual", *flags])
 
     def csv(self, points: Iterable[EnvelopePoint]) -> str:
-        """CSV table with a row for each point: drawn keys, and the outcome."""
-        names = EnvelopePoint.__struct_fields__
+        """CSV table with a row for each point: number, drawn keys, and the outcome."""
         rows = [
-            [point.number, *self.keys(point.number).values(), *msgspec.structs.astuple(point)[1:]]
-            for point in points
+            [number, *self.keys(number).values(), *msgspec.structs.astuple(point)]
+            for number, point in enumerate(points)
         ]
-        return to_csv([names[0], *self.keys(0), *names[1:]], rows)
+        return to_csv(["number", *self.keys(0), *EnvelopePoint.__struct_fields__], rows)
 
 
 def _flag(key: str, value: Any) -> Iterator[str]:
@@ -179,27 +176,16 @@ def _flag(key: str, value: Any) -> Iterator[str]:
         yield from map(str, value if isinstance(value, list | tuple) else [value])
 
 
-def worst_first(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
-    """Points that went wrong: crashes, flyaways by distance, and those astray."""
-    wrong = [point for point in points if point.outcome in WRONG]
-    return sorted(
-        wrong,
-        key=lambda point: (
-            WRONG.index(point.outcome),
-            -(point.outside_m or 0.0),
-            -(point.error_max or 0.0),
-        ),
-    )
+def worst_first(points: Iterable[EnvelopePoint]) -> list[tuple[int, EnvelopePoint]]:
+    """Points that went wrong, with their numbers: crashes, flyaways by distance, those astray."""
+    wrong = [(number, point) for number, point in enumerate(points) if point.outcome in WRONG]
 
+    def rank(numbered: tuple[int, EnvelopePoint]) -> tuple[int, float, float]:
+        _, point = numbered
+        outcome = WRONG.index(point.outcome)
+        return outcome, -(point.outside_m or 0.0), -(point.error_max or 0.0)
 
-class PointVerdict(NamedTuple):
-    """Outcome of a flight, with fields as in `EnvelopePoint`."""
-
-    outcome: Outcome
-    error_max: float | None = None
-    covered: float | None = None
-    outside_m: float | None = None
-    line: str = ""
+    return sorted(wrong, key=rank)
 
 
 def settling_s(scenario: Scenario) -> float:
@@ -223,7 +209,7 @@ def disc(scenario: Scenario) -> tuple[Array, float]:
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
-def judge(scenario: Scenario, client: Rows) -> PointVerdict:
+def judge(scenario: Scenario, client: Rows) -> EnvelopePoint:
     """Outcome of a flight.
 
     Args:
@@ -231,7 +217,7 @@ def judge(scenario: Scenario, client: Rows) -> PointVerdict:
         client: rows of its one vehicle, a row for every step.
     """
     if not len(client):
-        return PointVerdict("unanswered")
+        return EnvelopePoint("unanswered")
     covered = client["covered"]
     error_m = np.linalg.norm(position_error(scenario, client), axis=1)
     centre, radius_m = disc(scenario)
@@ -243,14 +229,14 @@ def judge(scenario: Scenario, client: Rows) -> PointVerdict:
     figures = (error_max, float(covered.mean()), max(0.0, float(outside_m.max())))
     faults = list(_faults(scenario, client, error_m, outside_m, radius_m))
     if faults:
-        return PointVerdict("flyaway", *figures, min(faults)[1])
+        return EnvelopePoint("flyaway", *figures, min(faults)[1])
     if error_max is not None and error_max < NEAR_M:
-        return PointVerdict("flown", *figures)
+        return EnvelopePoint("flown", *figures)
     if not covered[-1]:
-        return PointVerdict("hovering", *figures)
+        return EnvelopePoint("hovering", *figures)
     if error_max is None or not covered[time_s >= first_s].all():
-        return PointVerdict("interrupted", *figures)
-    return PointVerdict("astray", *figures)
+        return EnvelopePoint("interrupted", *figures)
+    return EnvelopePoint("astray", *figures)
 
 
 def _faults(

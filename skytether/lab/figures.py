@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.figures.flights import save
+from skytether.figures.page import blank
 from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
 from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
@@ -36,10 +37,9 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     Args:
         path: file to write, in one of FORMATS.
     """
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    keys = [plan.keys(point.number) for point in points]
+    keys = list(map(plan.keys, range(len(points))))
 
     def column(key: str) -> Array:
         return np.array([each[key] for each in keys])
@@ -48,7 +48,7 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     up_s, down_s = (_mean_delays_s(plan.scenario, way, keys) for way in ("uplink", "downlink"))
     loss = np.maximum(column("network.uplink.loss"), column("network.downlink.loss"))
     trip_s, covers_s = up_s + down_s, column("control.horizon") * column("control.dt")
-    figure = Figure(figsize=(10.0, 9.0), layout="constrained")
+    figure = blank(10.0, 9.0)
     (cover, bars), (ways, losses) = figure.subplots(2, 2)
     shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
     for outcome, here in shown.items():
@@ -155,9 +155,7 @@ def curve(
         means: mean at each value, NaN for none; shape (values,).
         halves: half the width of each mean's interval; shape (values,).
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    figure = blank(6.4, 4.4)
     plane = figure.subplots()
     places = _places(axis)
     if _is_scale(axis):
@@ -186,9 +184,7 @@ def heat_map(
         name: label of the figure that was measured, with its unit.
         means: mean in each cell, NaN for none; shape (values across, values up).
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+    figure = blank(6.4, 5.0)
     plane = figure.subplots()
     across, up = axes
     mesh = plane.pcolormesh(_places(across), _places(up), means.T, shading="nearest")
@@ -217,9 +213,7 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: 
         flown: points of each scheme.
         limit_m: largest error of vehicles that count as flying [m].
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 8.0), layout="constrained")
+    figure = blank(7.0, 8.0)
     panes = figure.subplots(3, 1, sharex=True)
     values: Sequence[tuple[str, Callable[[CrowdPoint], float | None]]] = (
         ("RMSE of all vehicles [m]", lambda p: p.rmse_m),

@@ -14,20 +14,29 @@ is possible if the trajectory is known before the flight.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from skytether.client.clamp import clamped
 from skytether.client.followers import Constants, SplineFollower
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
+from skytether.lab.budgets import Plan
+from skytether.lab.contenders import BESIDE, REGULATED
+from skytether.lab.journal import digests
 from skytether.shared.law.model import Array, white_acceleration
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import PACKET_COLUMNS, Reason, Rows, client_columns
+from skytether.shared.telemetry.record import PACKET_COLUMNS, UPLINK, Reason, Rows, client_columns
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
+from skytether.sim.flight import fly_batch
 
 UNKNOWN = ("target", "live")
 """Shapes of a reference that only the server knows during the flight."""
@@ -127,12 +136,80 @@ def _due(scenario: Scenario) -> Array:
     return np.stack([sample(times_s + late)[:, axis] for axis, late in enumerate(late_s)], axis=1)
 
 
-def summarise_aboard(scenario: Scenario, name: str) -> Summary:
-    """Summary of `fly_aboard`, with no packets.
+def summarise_aboard(scenario: Scenario) -> Summary:
+    """Summary of `fly_aboard`, with no packets; called in a worker."""
+    packets = np.empty(0, PACKET_COLUMNS)
+    summary = summarise(scenario, "aboard", fly_aboard(scenario), netem=packets)
+    return replace(summary, event_ratio=0.0)
+
+
+# -- beside the contenders of a case ---------------------------------------------------------------
+
+PERIODS = (1, 3, 10, 30)
+"""Steps between two packets at which the floor is computed."""
+RUNS = 4
+"""Number of flights for one point of the floor."""
+
+
+class Floor(msgspec.Struct, frozen=True):
+    """Point of a floor, for packets that are sent at fixed times."""
+
+    packets_per_s: float
+    """Packets up per second."""
+    rmse_m: float
+    """Floor of RMSE xy [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Baselines:
+    """Baselines beside the contenders of a case."""
+
+    floor: Sequence[Floor] = ()
+    """Points of the floor: for all contenders if only the server sees the target; in wind, for
+    those without feedback aboard."""
+    aboard: Sequence[Summary] = ()
+    """Flights with the reference aboard, and no packets; none if only the server knows the
+    reference."""
+
+
+class Work:
+    """Flights for the baselines of a case.
 
     Args:
-        name: of the scenario.
+        plan: plan of the contenders.
     """
-    packets = np.empty(0, PACKET_COLUMNS)
-    summary = summarise(scenario, name, fly_aboard(scenario), netem=packets)
-    return msgspec.structs.replace(summary, event_ratio=0.0)
+
+    def __init__(self, plan: Plan) -> None:
+        scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
+        self.regular = {
+            period: replace(
+                scenario, control=replace(scenario.control, trigger="periodic", period=period)
+            )
+            for period in PERIODS
+        }
+        """Scenario for each point of the floor, by the steps between packets."""
+        first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
+        self.aboard = {seed: replace(aboard, seed=seed) for seed in range(first, first + runs)}
+        """Scenarios with the reference aboard, by seed."""
+        self._tables = scenario, aboard
+
+    def settings(self) -> dict[str, Any]:
+        """Settings that determine the results, as plain values."""
+        return {
+            "files": digests(self._tables),
+            "runs": RUNS,
+            "scenarios": [reading.to_table(each) for each in self._tables],
+        }
+
+
+def _is_unknown(scenario: Scenario) -> bool:
+    return scenario.reference.shape in UNKNOWN
+
+
+def floor_of(scenario: Scenario) -> Floor:
+    """Floor of a scenario, from the ages in a few flights; called in a worker."""
+    flights = fly_batch(scenario, range(scenario.seed, scenario.seed + RUNS))
+    floor_m = target_floor_m if _is_unknown(scenario) else wind_floor_m
+    packets = sum(int((flight.netem["direction"] == UPLINK).sum()) for flight in flights)
+    floors = [floor_m(scenario, flight.client) for flight in flights]
+    return Floor(packets / RUNS / scenario.duration, float(np.mean(floors)))

@@ -233,8 +233,7 @@ class WatchedLife(Recorder):
         self.step, self.steps, self.missed = -1, 0, 0
         """Newest step, number of steps flown, and number of steps missed."""
         self.planned, self.followed = 0, 0
-        """Number of steps flown by a horizon of inputs, and along a trajectory, that equal the
-        compiled rule."""
+        """Number of steps flown by a horizon of inputs, and along a trajectory."""
         self.row_ns = -1
         """Time of the world of its newest step, or -1."""
 
@@ -433,29 +432,14 @@ class WatchedLife(Recorder):
         near = np.clip(want, before - self._change_max, before + self._change_max)
         near = np.clip(near, -bound, bound)
         for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
-            # Within rounding by an independent computation in float64; `_check_rule` then compares
-            # bit by bit.
             if abs(u - should) > 2.0 * ROUNDING:
                 raise Violation("follows", f"{u:.4f} m/s flown, {meant:.4f} planned")
         if covered:
-            self._check_rule(course.by_rule(stage, state, found, self.input), flown)
             self.followed += isinstance(course, FollowedCourse)
             self.planned += isinstance(course, PlannedCourse)
         feeds_back = course.feeds_back
         self._speed = float(np.linalg.norm(told)) if feeds_back else math.hypot(*flown)
         self._covered = covered
-
-    def _check_rule(self, wanted: list[float], flown: list[float]) -> None:
-        """Check that the input equals the compiled rule's to the last bit, within the rate
-        limit.
-        """
-        change, axes = self._change_max, zip(wanted, self.input, self._terms.u_max, strict=True)
-        should = [
-            min(max(min(max(u, last - change), last + change), -most), most)
-            for u, last, most in axes
-        ]
-        if flown != should:
-            raise Violation("rule", f"{flown} m/s flown, and {should} by the compiled rule")
 
     def _check_age(self, step: int, observed: int) -> None:
         """Check that no input is flown later after its observation than allowed."""

@@ -1,9 +1,10 @@
-"""Journal of a long computation: its settings, and finished entries, safe against crashes.
+"""Journal of a study: its settings, and the results of its cells, safe against crashes.
 
 A journal is a folder. `settings.toml` holds all settings that determine the results,
-`journal.jsonl` one line per entry: a checksum (CRC-32) and the entry itself. Each line is on disk
-before the next one is written. An incomplete last line, left by a killed writer, is overwritten; an
-altered line is an error. Files that the results depend on are in the settings by their digests.
+`journal.jsonl` one line per result: a checksum (CRC-32), the name of the cell, and the result. Each
+line is on disk before the next one is written. An incomplete last line, left by a killed writer, is
+overwritten; an altered line is an error. Files that the results depend on are in the settings by
+their digests.
 """
 
 import hashlib
@@ -12,7 +13,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, BinaryIO, Generic, TypeVar
 
 import msgspec
 
@@ -27,12 +28,12 @@ E = TypeVar("E")
 
 
 class Journal(Generic[E]):
-    """Entries of one computation, in a folder that is created if missing.
+    """Results of one study, in a folder that is created if missing.
 
     Args:
-        folder: where the journal is kept.
-        settings: all settings that determine the entries, as plain values; the version is added.
-        kind: type of an entry.
+        folder: where the journal is kept; None: nothing is kept.
+        settings: all settings that determine the results, as plain values; the version is added.
+        kind: type of a result.
 
     Raises:
         ConfigError: the folder holds another computation or an invalid line, or another process
@@ -40,28 +41,35 @@ class Journal(Generic[E]):
         OSError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
+    def __init__(self, folder: Path | None, settings: Mapping[str, Any], kind: type[E]) -> None:
+        self.files: Mapping[str, str] = {
+            file: known
+            for file, known in settings.get("files", {}).items()
+            if not file.endswith(".py") and Path(file).is_file()
+        }
+        """Digest of every file that the results depend on, by its path. Plug-ins are none: they
+        are passed to workers with their content."""
+        self.results: dict[str, E] = {}
+        """Results by the names of their cells, see `name_of`."""
+        self._file: BinaryIO | None = None
+        if folder is None:
+            return
         folder.mkdir(parents=True, exist_ok=True)
-        self.folder = folder
-        self.files: Mapping[str, str] = settings.get("files", {})
-        """Digest of every file that the entries depend on, by its path."""
-        self.entries: list[E] = []
-        """Finished entries, in order."""
-        self._file = files.appending(folder / ENTRIES)
+        self._folder, self._file = folder, files.appending(folder / ENTRIES)
         try:
-            self._agree({"version": metadata.version("skytether"), **settings})
-            self._read(msgspec.json.Decoder(kind))
+            self._agree(folder, {"version": metadata.version("skytether"), **settings})
+            self._read(msgspec.json.Decoder(tuple[str, kind]))  # type: ignore[valid-type]
         except BaseException:
             self.close()
             raise
 
-    def _agree(self, settings: Mapping[str, Any]) -> None:
+    def _agree(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Write the settings, or compare them with existing ones."""
-        path = self.folder / SETTINGS
+        path = folder / SETTINGS
         text = msgspec.toml.encode(settings)
         if not path.exists():
-            if os.fstat(self._file.fileno()).st_size:
-                raise ConfigError(f"{self.folder}: got {ENTRIES} without {SETTINGS}, expected both")
+            if (folder / ENTRIES).stat().st_size:
+                raise ConfigError(f"{folder}: got {ENTRIES} without {SETTINGS}, expected both")
             files.write(path, text)
         try:
             before = dict(flat(toml.loads(path.read_text())))
@@ -71,12 +79,13 @@ class Journal(Generic[E]):
         for key in [*now, *before]:
             if now.get(key) != before.get(key):
                 raise ConfigError(
-                    f"{self.folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
+                    f"{folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
                     f"expected {before.get(key)!r}, to go on there; or another --out"
                 )
 
-    def _read(self, decoder: msgspec.json.Decoder[E]) -> None:
-        """Read existing entries, and set the position for the next line."""
+    def _read(self, decoder: msgspec.json.Decoder[tuple[str, E]]) -> None:
+        """Read existing results, and set the position for the next line."""
+        assert self._file is not None
         whole = 0
         for number, line in enumerate(self._file, start=1):
             if not line.endswith(b"\n"):
@@ -85,28 +94,36 @@ class Journal(Generic[E]):
             try:
                 if line != sealed(content):
                     raise ValueError("its checksum is wrong")
-                self.entries.append(decoder.decode(content))
+                name, result = decoder.decode(content)
+                self.results[name] = result
             except (ValueError, msgspec.MsgspecError) as error:
-                where = f"{self.folder / ENTRIES}: line {number}"
+                where = f"{self._folder / ENTRIES}: line {number}"
                 raise ConfigError(f"{where} is not what was written: {error}") from None
             whole += len(line)
         self._file.seek(whole)
         self._file.truncate()
 
-    def append(self, entry: E) -> None:
-        """Append an entry, and write it to disk."""
-        self._file.write(sealed(msgspec.json.encode(entry)))
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self.entries.append(entry)
+    def add(self, name: str, result: E) -> None:
+        """Keep the result of a cell, on disk."""
+        self.results[name] = result
+        if self._file is not None:
+            self._file.write(sealed(msgspec.json.encode((name, result))))
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Release the folder for other commands."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
+
+
+def name_of(key: Any) -> str:
+    """Name of a cell, from its key."""
+    return msgspec.json.encode(key).decode()
 
 
 def sealed(content: bytes) -> bytes:
-    """Line of a journal: a JSON list of the checksum and the entry."""
+    """Line of a journal: a JSON list of the checksum and the result."""
     return b'["%08x",%b]\n' % (zlib.crc32(content), content)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skytether.figures.flights import save
+from skytether.figures.page import blank
 from skytether.figures.tables import to_csv
 from skytether.lab.journal import digests
 from skytether.lab.margins import Differing, growth_of, hovering, windless
@@ -173,14 +174,13 @@ def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
         points: all points of the box, by number.
     """
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     shape = (len(box.burst_s), len(box.dead_time_s), len(box.gain), len(box.tau))
     rmse = np.array([point.rmse_m or np.nan for point in points]).reshape(shape)
     cycles = np.array([point.cycles for point in points]).reshape(shape)
     grows = np.array([point.growth >= 1.0 for point in points]).reshape(shape)
-    figure = Figure(figsize=(1.2 + 2.5 * shape[1], 1.4 + 2.3 * shape[0]), layout="constrained")
+    figure = blank(1.2 + 2.5 * shape[1], 1.4 + 2.3 * shape[0])
     planes = figure.subplots(shape[0], shape[1], squeeze=False, sharex=True, sharey=True)
     known = rmse[np.isfinite(rmse)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.01, 0.1)

@@ -23,9 +23,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 from msgspec.structs import replace
-from scipy import stats
 
-from skytether.lab.sweep import interval
+from skytether.lab.intervals import interval, jackknife
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import policies
 from skytether.shared.scenario.schema import ReferenceConfig, Scenario, SensorConfig
@@ -214,11 +213,11 @@ def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float
     h = _answers(scenario, trigger, runs)
     if h.shape[1] < STEPS_MIN:
         return math.inf, None
-    growth = _growth(h.mean(axis=0))
-    if runs < 2:
-        return growth, None
-    others = np.array([_growth(np.delete(h, run, axis=0).mean(axis=0)) for run in range(runs)])
-    return growth, float(stats.t.ppf(0.975, runs - 1)) * math.sqrt((runs - 1) * others.var())
+
+    def growth(h: Array) -> float:
+        return _growth(h.mean(axis=0))
+
+    return (growth(h), None) if runs < 2 else jackknife(growth, h)
 
 
 def _answers(scenario: Scenario, trigger: str, runs: int) -> Array:

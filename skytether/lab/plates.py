@@ -5,8 +5,7 @@ vehicle black, as in the paper.
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from skytether.figures.flights import draw_reference
-from skytether.figures.page import Picture
+from skytether.figures.page import Picture, as_png, lettered
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab.studies import (
     EVENT,
@@ -38,9 +37,8 @@ if TYPE_CHECKING:
 
 COLUMN, PAGE = 3.5, 7.16
 """Width of a figure over one column and over the page [inch]."""
-LETTERS: Any = {"font.size": 8, "axes.titlesize": 8, "legend.fontsize": 8}
-LETTERS |= {"axes.grid": True, "grid.alpha": 0.3}
-"""Settings of matplotlib for every figure."""
+LETTERS = 8
+"""Size of letters in every figure [points]."""
 STYLES: Mapping[str, Mapping[str, Any]] = {
     NONE: {"color": "0.5", "linestyle": ":", "marker": "s"},
     EVERY: {"color": "black", "linestyle": "-", "marker": "o"},
@@ -69,23 +67,12 @@ class Plate(Picture):
         return {".png": self.png, ".pdf": self.pdf, ".csv": self.csv.encode()}
 
 
-@contextmanager
-def sized(width: float, height: float) -> "Iterator[Figure]":
-    """Empty figure of a size [inch]."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(LETTERS):
-        yield Figure(figsize=(width, height), layout="constrained")
-
-
 def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
     """Figure in all written formats."""
-    png, pdf = io.BytesIO(), io.BytesIO()
-    figure.savefig(png, format="png", dpi=220)
+    png, pdf = as_png(figure, 220), io.BytesIO()
     figure.set_layout_engine("none")  # keep the figure's exact size
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
-    return Plate(name, title, says, png.getvalue(), pdf.getvalue(), csv)
+    return Plate(name, title, says, png, pdf.getvalue(), csv)
 
 
 def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
@@ -105,7 +92,7 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
     cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), direction.slots_mean)
     took_cdf = np.searchsorted(np.sort(took_ms), fine_ms, side="right") / len(took_ms)
-    with sized(PAGE, 2.4) as figure:
+    with lettered(PAGE, 2.4, LETTERS) as figure:
         left, right = figure.subplots(1, 2)
         left.bar(lattice_ms, share, 0.7 * slot_ms, color="0.75", label="over UDP")
         left.plot(lattice_ms, pdf, "r_", markersize=10, markeredgewidth=1.5, label="(17)")
@@ -135,7 +122,7 @@ def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
 def paths(samples: Samples) -> Plate:
     """Fig. 3: path without and with compensation, with a packet at every step."""
     rmse, positions = [], []
-    with sized(PAGE, 3.9) as figure:
+    with lettered(PAGE, 3.9, LETTERS) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
         for plane, letter, method in zip(planes, "ab", (NONE, EVERY), strict=True):
             scenario, flights = samples[method]
@@ -161,7 +148,7 @@ def events(samples: Samples) -> Plate:
     flight, dt = flights[0], scenario.control.dt
     step, wanted, position = _path(scenario, flight)
     sent = np.isin(step, flight.server["step"][flight.server["event"]])
-    with sized(COLUMN, 4.4) as figure:
+    with lettered(COLUMN, 4.4, LETTERS) as figure:
         plane, below = figure.subplots(2, 1, height_ratios=(5, 1))
         _draw_path(plane, scenario, flight)
         plane.legend(loc="center")
@@ -209,7 +196,7 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
         here: the paper's own λ and ε, which a cross marks.
     """
     decay, epsilon, rmse, ratio = _grid(flown)
-    with sized(PAGE, 2.8) as figure:
+    with lettered(PAGE, 2.8, LETTERS) as figure:
         panes = figure.subplots(1, 2)
         names = ("RMSE xy [m]", "event ratio")
         for plane, values, name in zip(panes, (rmse, ratio), names, strict=True):
@@ -257,7 +244,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
         np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
         for name in ("event_ratio", "rmse_xy")
     )
-    with sized(COLUMN, 3.0) as figure:
+    with lettered(COLUMN, 3.0, LETTERS) as figure:
         from matplotlib import colormaps
 
         plane = figure.subplots()
@@ -303,7 +290,7 @@ def curve(study: Study, cells: Cells) -> Plate:
         for method in methods
     }
     places = np.array(study.axis.values)
-    with sized(COLUMN, 3.2) as figure:
+    with lettered(COLUMN, 3.2, LETTERS) as figure:
         plane = figure.subplots()
         for method in methods:
             means, halves = table[method].T
@@ -360,7 +347,7 @@ def estimates(samples: Samples) -> Plate:
         for method, (_, flights) in samples.items()
     }
     quantiles = {method: np.quantile(error, shares, axis=0) for method, error in errors.items()}
-    with sized(PAGE, 2.6) as figure:
+    with lettered(PAGE, 2.6, LETTERS) as figure:
         panes = figure.subplots(1, 2, sharey=True)
         for part, (plane, unit) in enumerate(zip(panes, ("m", "m/s"), strict=True)):
             for method, values in quantiles.items():
@@ -401,7 +388,7 @@ def intervals(samples: Samples) -> Plate:
     steps = np.arange(1, int(gaps.max()) + 1)
     counts = np.array([np.sum(gaps == step) for step in steps])
     regular = samples[PERIODIC][0].control.period
-    with sized(COLUMN, 2.4) as figure:
+    with lettered(COLUMN, 2.4, LETTERS) as figure:
         plane = figure.subplots()
         dt = scenario.control.dt
         plane.bar(steps * dt, counts / len(gaps), 0.8 * dt, color="0.4", label="event trigger (16)")
@@ -434,7 +421,7 @@ def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
     everything = np.concatenate(list(solve_ms.values()))
     edges = np.geomspace(max(1e-3, everything.min()), everything.max() * 1.01, 40)
     counts = {name: np.histogram(values, edges)[0] for name, values in solve_ms.items()}
-    with sized(COLUMN, 2.4) as figure:
+    with lettered(COLUMN, 2.4, LETTERS) as figure:
         plane = figure.subplots()
         for name, values in counts.items():
             plane.stairs(values, edges, color=STYLES[name]["color"], label=name)

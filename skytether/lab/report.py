@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from msgspec.structs import asdict
 
-from skytether.figures.page import Table, as_text, rendered
-from skytether.figures.tables import rows_csv
+from skytether.figures.page import Row, Table, as_text, rendered, table_of
 from skytether.lab import plates
 from skytether.lab.calibration import within
+from skytether.lab.intervals import Estimate
 from skytether.lab.plates import Plate, Samples
 from skytether.lab.studies import (
     EVENT,
@@ -24,7 +25,7 @@ from skytether.lab.studies import (
     periodic_wins,
     table_1,
 )
-from skytether.lab.sweep import Estimate, by_name
+from skytether.lab.sweep import by_name
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
@@ -111,17 +112,6 @@ def draw(measured: Reproduction) -> Drawn:
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
     """Table 1, the paper's figures beside the reproduced ones."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
-    rows = [
-        (
-            each.column,
-            each.entry,
-            as_text(each.paper, ".4f"),
-            as_text(each.here, ".4f"),
-            as_text(each.ci95, ".4f"),
-            as_text(each.deviation, "+.1%"),
-        )
-        for each in entries
-    ]
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
     loss = f"{abs(ours / theirs - 1.0):.0%} {'more' if ours > theirs else 'less'}"
@@ -131,19 +121,22 @@ def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFligh
         f"every {steps} steps, the rate nearest to the trigger's: against it the event trigger has "
         f"{loss} RMSE xy{', though the intervals meet' if meet else ''}."
     )
-    text = rows_csv([asdict(entry) for entry in entries])
-    heading = ("column", "entry", "paper", "here", "± 95 %", "deviation")
-    return Table("table1", "Table 1: RMSE to the desired trajectory", says, text, heading, rows)
+    shown = {
+        "column": ("column", ""),
+        "entry": ("entry", ""),
+        "paper": ("paper", ".4f"),
+        "here": ("here", ".4f"),
+        "± 95 %": ("ci95", ".4f"),
+        "deviation": ("deviation", "+.1%"),
+    }
+    title = "Table 1: RMSE to the desired trajectory"
+    return table_of("table1", title, says, list(map(asdict, entries)), shown)
 
 
 def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
     """Table of the packets and bytes that entered the network, by method."""
-    text = rows_csv(
-        [{"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()]
-    )
     rows = [
-        [method, *(as_interval(cell.estimate(name), ",.0f") for name in TRAFFIC)]
-        for method, cell in columns.items()
+        {"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()
     ]
     share = [
         (columns[EVENT].estimate(name)[0] or 0.0) / (columns[EVERY].estimate(name)[0] or 1.0)
@@ -154,26 +147,31 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
         f"uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
         f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes."
     )
-    heading = ("column", *(name.replace("_", " ") for name in TRAFFIC))
-    return Table("traffic", "Packets and bytes (UDP payload)", says, text, heading, rows)
+
+    def cell(name: str, row: Row) -> str:
+        return as_interval((row[name], row[f"{name}_ci95"]), ",.0f")
+
+    shown = {name.replace("_", " "): partial(cell, name) for name in TRAFFIC}
+    title = "Packets and bytes (UDP payload)"
+    return table_of("traffic", title, says, rows, {"column": ("column", ""), **shown})
 
 
 REAL = {
     "column": ("column", ""),
-    "rmse_xy_udp": ("UDP", ".4f"),
-    "rmse_xy_same_seed": ("same seed", ".4f"),
-    "rmse_xy_virtual": ("virtual", ".4f"),
-    "rmse_xy_virtual_ci95": ("± 95 %", ".4f"),
-    "rmse_xy_least": ("least", ".4f"),
-    "rmse_xy_most": ("most", ".4f"),
-    "event_ratio_udp": ("events, UDP", ".3f"),
-    "event_ratio_virtual": ("virtual", ".3f"),
-    "solve_ms_p50": ("solve p50 [ms]", ".2f"),
-    "solve_ms_p99": ("p99 [ms]", ".2f"),
-    "deadline_misses": ("misses", "d"),
-    "netem_late_ms_p99": ("netem late p99 [ms]", ".2f"),
+    "UDP": ("rmse_xy_udp", ".4f"),
+    "same seed": ("rmse_xy_same_seed", ".4f"),
+    "virtual": ("rmse_xy_virtual", ".4f"),
+    "± 95 %": ("rmse_xy_virtual_ci95", ".4f"),
+    "least": ("rmse_xy_least", ".4f"),
+    "most": ("rmse_xy_most", ".4f"),
+    "events, UDP": ("event_ratio_udp", ".3f"),
+    "events, virtual": ("event_ratio_virtual", ".3f"),
+    "solve p50 [ms]": ("solve_ms_p50", ".2f"),
+    "p99 [ms]": ("solve_ms_p99", ".2f"),
+    "misses": ("deadline_misses", "d"),
+    "netem late p99 [ms]": ("netem_late_ms_p99", ".2f"),
 }
-"""Columns of `real_table`: heading and format."""
+"""Columns of `real_table`: name and format of the number, by heading."""
 
 
 def real_table(measured: Reproduction) -> Table:
@@ -209,7 +207,6 @@ def real_table(measured: Reproduction) -> Table:
                 "netem_late_ms_p99": late_ms,
             }
         )
-    shown = [[as_text(row[name], spec) for name, (_, spec) in REAL.items()] for row in rows]
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
@@ -217,9 +214,8 @@ def real_table(measured: Reproduction) -> Table:
         f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
         f"give equal flights."
     )
-    heading = [heading for heading, _ in REAL.values()]
     title = "RMSE xy [m] over real UDP and in virtual time"
-    return Table("real", title, says, rows_csv(rows), heading, shown)
+    return table_of("real", title, says, rows, REAL)
 
 
 def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> str:

@@ -1,19 +1,17 @@
-"""Search for values of some keys of a scenario by CMA-ES, resumable from its journal.
+"""Search for values of some keys of a scenario by CMA-ES.
 
 Free keys are searched on logarithmic scales between bounds. Each generation of points is proposed,
 flown by a function passed in, and scored by an objective. The proposals depend only on the settings
-and the earlier scores: given these again, from the journal, an interrupted search continues.
+and the earlier scores: given these again, from a journal, an interrupted search continues.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
-import msgspec
 import numpy as np
 
-from skytether.lab.journal import Journal, digests
+from skytether.lab.journal import digests
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -178,21 +176,22 @@ class Objective(Protocol):
         """Score of a point with these figures; smaller is better."""
 
 
-class SearchPoint(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class SearchPoint:
     """Point that was flown."""
 
-    keys: dict[str, float]
+    keys: Mapping[str, float]
     """Values of the free keys."""
-    values: dict[str, dict[str, float | None]]
+    values: Values
     """Figures, by column and name; None if a flight failed."""
     score: float
     """Score; smaller is better."""
 
 
-Generation = list[SearchPoint]
-"""Entry of a search's journal."""
-FlyAll = Callable[[Callable[[Scenario], Values], Sequence[Scenario]], Sequence[Values]]
-"""Function that calls a function with each of some scenarios, and returns the results in order."""
+Point = tuple[float, ...]
+"""Values of the free keys, in order: the name of a point in the journal."""
+FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
+"""Function that returns the figures of scenarios, after flying those that were not flown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,39 +221,35 @@ class Search:
             "scenario": reading.to_table(self.start),
         }
 
-    def points(
-        self, journal: Journal[Generation], generations: int, fly_all: FlyAll
-    ) -> Iterator[list[SearchPoint]]:
-        """All points so far after each generation, including those of the journal.
-
-        Raises:
-            ConfigError: the journal has points that this search would not propose.
-        """
+    def fly(self, scenario: Scenario) -> Values:
+        """Figures of a point; called in a worker."""
         seed = self.start.seed
+        return self.objective.fly(scenario, range(seed, seed + self.runs))
+
+    def points(self, generations: int, fly_all: FlyAll) -> Iterator[list[SearchPoint]]:
+        """All points so far, after each generation."""
         optimiser = Optimiser(
-            self.start, self.free, population=self.population, sigma=self.sigma, seed=seed
+            self.start,
+            self.free,
+            population=self.population,
+            sigma=self.sigma,
+            seed=self.start.seed,
         )
-        fly = partial(self.objective.fly, seeds=range(seed, seed + self.runs))
+        cells: dict[Point, Scenario] = {}
         points: list[SearchPoint] = []
-        for number in range(generations):
+        for _ in range(generations):
             proposed = optimiser.ask()
             keys = [optimiser.values(each) for each in proposed]
-            if number == len(journal.entries):
-                flown = zip(keys, fly_all(fly, proposed), strict=True)
-                journal.append([self._point(here, values) for here, values in flown])
-            generation = journal.entries[number]
-            if [point.keys for point in generation] != keys:
-                raise ConfigError(
-                    f"{journal.folder}: got other points in generation {number + 1}, "
-                    "expected those of this search; or another --out"
-                )
-            points += generation
+            here = [tuple(each.values()) for each in keys]
+            cells.update(zip(here, proposed, strict=True))
+            flown = fly_all(cells)
+            generation = [
+                SearchPoint(own, flown[point], self.objective.score(flown[point]))
+                for own, point in zip(keys, here, strict=True)
+            ]
             optimiser.tell([point.score for point in generation])
+            points += generation
             yield points
-
-    def _point(self, keys: dict[str, float], values: Values) -> SearchPoint:
-        figures = {column: dict(found) for column, found in values.items()}
-        return SearchPoint(keys, figures, self.objective.score(values))
 
     def scenario(self, point: SearchPoint) -> Scenario:
         """Scenario of a point."""

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from skytether.lab.calibration import COLUMNS, TABLE_1, deviations
-from skytether.lab.sweep import Estimate, GridAxis, Results, Sweep, estimate, interval
+from skytether.lab.intervals import Estimate, interval
+from skytether.lab.sweep import GridAxis, Results, Sweep, estimate
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary
 

@@ -13,11 +13,10 @@ from functools import partial
 from typing import Any
 
 import msgspec
-import numpy as np
 from msgspec.structs import astuple, replace
-from scipy import stats
 
 from skytether.figures.tables import rows_csv, to_csv
+from skytether.lab.intervals import Estimate, interval
 from skytether.lab.journal import digests
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
@@ -127,32 +126,18 @@ class FlightTask(msgspec.Struct, frozen=True):
     """Seed of each run."""
 
 
-class Done(msgspec.Struct, frozen=True):
-    """Results of a task; an entry of a sweep's journal."""
-
-    cell: int
-    """Number of the task's cell."""
-    chunk: int
-    """Number of the task in its cell."""
-    runs: tuple[Summary, ...]
-    """Summary of each run, in order of the seeds."""
+Runs = tuple[Summary, ...]
+"""Results of a task: summary of each run, in order of the seeds."""
+Results = Mapping[tuple[int, int], Runs]
+"""Results of a sweep, by cell and chunk."""
 
 
-Results = Mapping[tuple[int, int], Done]
-"""Results of a sweep so far, by cell and chunk."""
-
-
-def results(entries: Iterable[Done]) -> Results:
-    """Results of a sweep so far, from the entries of its journal."""
-    return {(done.cell, done.chunk): done for done in entries}
-
-
-def fly(task: FlightTask) -> Done:
+def fly(task: FlightTask) -> Runs:
     """Fly all runs of a task in virtual time."""
-    return Done(task.cell, task.chunk, summaries(task.name, task.scenario, task.seeds))
+    return summaries(task.name, task.scenario, task.seeds)
 
 
-def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> tuple[Summary, ...]:
+def summaries(name: str, scenario: Scenario, seeds: Sequence[int]) -> Runs:
     """Summaries of flights of a scenario in virtual time, one per seed."""
     flown = zip(seeds, fly_batch(scenario, seeds), strict=True)
     return tuple(
@@ -213,10 +198,6 @@ class Sweep:
                 seeds = tuple(first + run for run in runs)
                 yield FlightTask(cell, chunk, self.name, scenario, seeds)
 
-    def todo(self, done: Results) -> list[FlightTask]:
-        """Tasks that are not finished yet."""
-        return [task for task in self.tasks() if (task.cell, task.chunk) not in done]
-
     def settings(self) -> dict[str, Any]:
         """Settings that determine the results, as plain values."""
         return {
@@ -254,7 +235,7 @@ class Sweep:
 
     def of_cell(self, done: Results, cell: int) -> list[Summary]:
         """Summaries of a cell's runs, by seed."""
-        return [run for chunk in range(self.chunks) for run in done[cell, chunk].runs]
+        return [run for chunk in range(self.chunks) for run in done[cell, chunk]]
 
 
 FIGURES = (
@@ -285,26 +266,10 @@ FIGURES = (
 )
 """Figures of a summary that can be averaged."""
 
-Estimate = tuple[float | None, float | None]
-"""Mean, and half-width of its 95 % interval; None with too few values."""
-
 
 def estimate(runs: Iterable[Summary], figure: str) -> Estimate:
     """Mean of a figure over the runs that have it, and half-width of its 95 % interval."""
     return interval([value for run in runs if (value := getattr(run, figure)) is not None])
-
-
-def interval(values: Sequence[float]) -> Estimate:
-    """Mean of some values, and half-width of its 95 % interval (Student's t).
-
-    The mean is None without values, the interval with fewer than two.
-    """
-    if not values:
-        return None, None
-    mean, n = float(np.mean(values)), len(values)
-    if n < 2:
-        return mean, None
-    return mean, float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
 def by_name(figures: Iterable[str], estimate_of: Callable[[str], Estimate]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from skytether.lab import sweep as lab
+from skytether.lab.intervals import Estimate
 from skytether.library.flying import Given, named, prepare
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
@@ -27,7 +28,7 @@ class Swept:
     runs: tuple[Summary, ...]
     """Summary of each flight, by seed."""
 
-    def mean(self, figure: str) -> lab.Estimate:
+    def mean(self, figure: str) -> Estimate:
         """Mean of a figure over the flights, and half the width of its 95 % confidence interval.
 
         The mean is None where no flight has the figure, the interval where fewer than two have it.
@@ -74,12 +75,13 @@ def sweep(
     tasks = list(plan.tasks())
     prepare()
     if workers == 1:
-        done = lab.results(map(lab.fly, tasks))
+        results = list(map(lab.fly, tasks))
     else:
         # not fork: the child could inherit a lock that nobody releases
         spawned = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, spawned) as pool:
-            done = lab.results(pool.map(lab.fly, tasks))
+            results = list(pool.map(lab.fly, tasks))
+    done = {(task.cell, task.chunk): runs for task, runs in zip(tasks, results, strict=True)}
     names = [axis.key for axis in axes]
     return [
         Swept(

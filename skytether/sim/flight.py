@@ -76,6 +76,7 @@ def fly(
     server: Endpoint | None = None,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    actions: Sequence[tuple[float, Callable[[World], None]]] = (),
     stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
@@ -94,6 +95,7 @@ def fly(
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
         changes: times [s, counted as in `Record.events`] and the keys and values that change then,
             as in `shared.core.change`; a refused change is an event, and the flight goes on.
+        actions: times [s], and functions that act on the world then, such as to stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.
         stopped: called often; once it returns true, the flight is ended.
@@ -113,6 +115,7 @@ def fly(
         plans,
         server,
         beside,
+        actions,
     )
     return replace(flight, plan=parse(sink.getvalue()))
 
@@ -302,6 +305,7 @@ def _fly(
     plans: Recorder | None = None,
     own_server: Endpoint | None = None,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
+    actions: Sequence[tuple[float, Callable[[World], None]]] = (),
 ) -> list[Record]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host == SERVER[0]:
@@ -351,6 +355,8 @@ def _fly(
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     hosts = {host: endpoint for run in runs for host, endpoint in run.hosts.items()}
     plan_changes(world, scenario, {SERVER[0]: server, **hosts, **beside}, changes)
+    for time_s, act in actions:
+        world.at(seconds_to_ns(time_s), partial(act, world))
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
 
     error_ns = seconds_to_ns(scenario.simulation.time_error_s)

@@ -1,8 +1,6 @@
 """Report of a recorded flight: a page that opens offline, with figures, summary and events."""
 
-import io
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import MODE_COLOURS, PALETTE, css
 from skytether.figures.flights import draw_reference
-from skytether.figures.page import Picture, Table, rendered
+from skytether.figures.page import Picture, Table, as_png, lettered, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
@@ -30,9 +28,8 @@ EVENTS_MAX = 400
 """Most events on a page."""
 WIDTH = 9.0
 """Width of a figure [inch]."""
-LETTERS: Any = {"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8}
-LETTERS |= {"axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}
-"""Settings of matplotlib for every figure."""
+LETTERS = 9
+"""Size of letters in every figure [points]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +129,7 @@ def _colour(mode: Mode) -> str:
 
 def path(flown: ReportedFlight) -> Picture:
     """Path from above, coloured by mode."""
-    with _figure(6.0) as figure:
+    with lettered(WIDTH, 6.0, LETTERS) as figure:
         plane = figure.subplots()
         draw_reference(plane, flown.scenario, flown.client, flown.server)
         position = flown.client["state"][:, :2, 0]
@@ -146,12 +143,12 @@ def path(flown: ReportedFlight) -> Picture:
         plane.legend(loc="upper right")
         _name_modes(figure, flown)
         says = "Red and dashed where the vehicle should be, in colour where it was."
-        return Picture("path", "Path from above", says, _png(figure))
+        return Picture("path", "Path from above", says, as_png(figure, 140))
 
 
 def timeline(flown: ReportedFlight) -> Picture:
     """Figures over time, with the modes as background."""
-    with _figure(10.5) as figure:
+    with lettered(WIDTH, 10.5, LETTERS) as figure:
         axes = figure.subplots(5, 1, sharex=True)
         for draw, below in zip((_positions, _error, _trigger, _ages, _packets), axes, strict=True):
             draw(below, flown)
@@ -174,7 +171,7 @@ def timeline(flown: ReportedFlight) -> Picture:
             "packets in each second, by when they entered the network, but for those still under "
             "way at the end. The colour behind is what the vehicle did."
         )
-        return Picture("timeline", "What happened", says, _png(figure))
+        return Picture("timeline", "What happened", says, as_png(figure, 140))
 
 
 def with_gaps(steps: NDArray[np.int64], values: Array) -> Array:
@@ -250,16 +247,6 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
     below.set_ylim(bottom=0.0)
 
 
-@contextmanager
-def _figure(height: float) -> "Iterator[Figure]":
-    """Empty figure of a height [inch]."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(LETTERS):
-        yield Figure(figsize=(WIDTH, height), layout="constrained")
-
-
 def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
     """Legend of the modes that occur."""
     from matplotlib.patches import Patch
@@ -269,9 +256,3 @@ def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
         names.setdefault(_colour(mode), []).append(str(mode))
     patches = [Patch(color=color, label=", ".join(each)) for color, each in names.items()]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), frameon=False)
-
-
-def _png(figure: "Figure") -> bytes:
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=140)
-    return png.getvalue()

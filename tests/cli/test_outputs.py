@@ -43,6 +43,9 @@ LINES = {
     "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
     "torture --json": "torture --replay SCHEDULES OUT",
     "adversary --json": "adversary swap --attack ATTACK OUT",
+    "adversary --out": (
+        "adversary swap --reference.shape mission --reference.file MISSION OUT/journal.jsonl"
+    ),
     "reproduce --out": "reproduce --quick --plugin PLUGIN OUT/report.html",
     "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
     "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",

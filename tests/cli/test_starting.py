@@ -1,6 +1,6 @@
 """Commands import what they need and no more: imports are most of what a start takes.
 
-`python -m bench.starting` measures the time; here no module is imported that a
+`python -m bench --only starting` measures the time; here no module is imported that a
 command can do without.
 """
 

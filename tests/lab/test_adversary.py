@@ -2,8 +2,8 @@
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ import skytether.lab.commands.adversary as commands
 from skytether.__main__ import main
 from skytether.lab.adversary import (
     Air,
-    Body,
     Climb,
+    Climbed,
     Kind,
     Move,
     climb,
@@ -27,8 +27,9 @@ from skytether.lab.adversary import (
     shrunk,
     spare_m,
 )
+from skytether.lab.commands import pool
 from skytether.lab.commands.adversary import Kept
-from skytether.lab.commands.pool import Interrupted
+from skytether.lab.lives import Body
 from skytether.server.common.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
@@ -45,29 +46,6 @@ from skytether.sim.world import World
 
 Patch = Callable[[pytest.MonkeyPatch], None]
 replaced = msgspec.structs.replace
-
-
-class Alone:
-    """Crew of this process: what is patched here is patched for it, too."""
-
-    def advance(self, amount: float, text: str = "") -> None:
-        """Count nothing."""
-
-    def share(
-        self,
-        function: Callable[[Any], Any],
-        items: Sequence[Any],
-        on_done: Callable[[int, Any], None],
-    ) -> None:
-        """Run a function for all items, one after the other."""
-        for number, item in enumerate(items):
-            on_done(number, function(item))
-
-
-@contextmanager
-def alone(*_: object) -> Iterator[Alone]:
-    """Crew without workers."""
-    yield Alone()
 
 
 def scenario(shape: str, duration: float = 30.0) -> Scenario:
@@ -137,8 +115,7 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
     body.fly(np.array([0.5, 0.0]))
     body.measurements(now_ns=4 * SECOND_NS)
     began = body.plant.state()[0, 0]
-    body.lose_client(body.sensor)
-    body.measurements(now_ns=14 * SECOND_NS)
+    body.fly_alone(14 * SECOND_NS)
     assert len(body.unflown) == 200
     times = np.array([at_s for at_s, _ in body.unflown])
     x = np.array([place[0] for _, place in body.unflown])
@@ -278,12 +255,12 @@ def test_what_is_no_list_of_moves_is_refused() -> None:
 SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "15")
 
 
+@pytest.mark.usefixtures("here")
 def test_the_command_prints_what_flies_it_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """The line with the fewest moves, and the file with the nearest flight."""
     heedless(monkeypatch)
-    monkeypatch.setattr(commands, "crew", alone)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
     kept = tmp_path / "found.json"
     search = (*SHORT, "--with", "zones", "--tries", "4", "--json", str(kept))
@@ -303,35 +280,37 @@ def test_the_command_prints_what_flies_it_again(
         assert shown in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("here")
 def test_the_command_ends_well_where_all_distances_are_kept(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(commands, "crew", alone)
     assert main(["adversary", *SHORT, "--with", "losses,copies", "--tries", "2", "--random"]) == 0
     assert "2, losses,copies" in capsys.readouterr().out
 
 
-def test_a_search_that_is_interrupted_shows_and_keeps_what_was_flown(
+@pytest.mark.usefixtures("here")
+def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    @contextmanager
-    def one_climb(*_: object) -> Iterator[Any]:
-        with alone() as flyers:
-            share = flyers.share
-
-            def stopped(function: Callable[[Any], Any], tasks: Sequence[Any], keep: Any) -> None:
-                share(function, tasks[:1], keep)
-                raise Interrupted(1, 2, "flights")
-
-            flyers.share = stopped
-            yield flyers
-
-    monkeypatch.setattr(commands, "crew", one_climb)
     monkeypatch.setattr(commands, "CLIMB", 1)
-    kept = tmp_path / "found.json"
+    monkeypatch.setattr(pool, "UNDER_WAY_MAX", 1)
+    kept, climbed = tmp_path / "found.json", list[int]()
+
+    def interrupt(task: Climb) -> Climbed:
+        climbed.append(task.number)
+        if climbed == [0]:
+            signal.raise_signal(signal.SIGINT)
+        return climb(task)
+
+    monkeypatch.setattr(commands, "climb", interrupt)
     search = (*SHORT, "--with", "losses", "--tries", "2", "--json", str(kept))
+    search += ("--out", str(tmp_path / "climbs"))
     assert main(["adversary", *search]) == command.INTERRUPTED
-    assert len(msgspec.json.decode(kept.read_bytes())["spares_m"]) == 1
+    one = msgspec.json.decode(kept.read_bytes(), type=Kept)
+    assert main(["adversary", *search]) == 0
+    both = msgspec.json.decode(kept.read_bytes(), type=Kept)
+    assert climbed == [0, 1]
+    assert both.spares_m[:1] == one.spares_m
     assert main(["adversary", *SHORT, "--attack", str(kept)]) == 0
 
 

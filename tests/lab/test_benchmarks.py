@@ -15,14 +15,11 @@ import numpy as np
 import pytest
 
 from bench import (
-    accuracy,
     flood,
-    growth,
     link,
     motions,
     netem,
     restarts,
-    sockets,
     solvers,
     starting,
     tick,
@@ -53,10 +50,7 @@ TINY = MappingProxyType(
         "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000),
         "solvers": solvers.SolversCounts(hot=6, paced=2, tuning=3),
         "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
-        "growth": growth.GrowthCounts((10, 20), (2,), (1, 4), 2),
         "wire": wire.WireCounts(each=10),
-        "sockets": sockets.SocketCounts(datagrams=1, turns=2),
-        "accuracy": accuracy.AccuracyCounts(ticks=3, random=2, horizons=(1, 30)),
         "link": link.LinkCounts(
             packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1
         ),
@@ -111,21 +105,9 @@ def test_the_tables_of_the_document_are_written(results: Mapping[str, Any], tmp_
     assert {**after, "wire": 0} == {**before, "wire": 0}
 
 
-def test_a_line_is_fitted_through_the_costs_of_horizons() -> None:
-    """Costs on a line give that line; one that is off says by what share of itself."""
-    line = growth.fit([10, 20, 40], [7.0, 9.0, 13.0])
-    assert line == pytest.approx((5.0, 0.2, 0.0), abs=1e-9)
-    assert growth.fit([10, 20, 40], [7.0, 18.0, 13.0]).off > 0.1
-
-
 def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
-    """On both cores and over all kinds of problems."""
-    found = results["accuracy"]["all"]
-    assert found["problems"] == 2 * 6 * (2 * 3 * 4 + 5 * 2 * 2)
-    assert found["error"] < accuracy.TARGET
-    assert (found["outside"], found["other_bits"], found["unproved"]) == (0, 0, 0)
     for flight in solvers.flights():
-        assert results["solvers"][flight]["contestants"][OURS]["error"] < accuracy.TARGET
+        assert results["solvers"][flight]["contestants"][OURS]["error"] < 1e-6
 
 
 def test_the_flights_are_what_they_are_called(

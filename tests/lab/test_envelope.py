@@ -19,7 +19,6 @@ from skytether.client.simulated.weather import Weather
 from skytether.lab.envelope import (
     Envelope,
     EnvelopePoint,
-    PointVerdict,
     disc,
     draw,
     judge,
@@ -138,7 +137,7 @@ def until(*ends: int) -> Flags:
 def test_a_flight_near_the_reference_is_flown() -> None:
     """Its largest error is that after settling, when it started a metre and a half away."""
     rows = record(PATH, PATH[..., 1], YES)
-    assert judge(SCENARIO, rows) == PointVerdict("flown", 0.0, 1.0, pytest.approx(0.0))
+    assert judge(SCENARIO, rows) == EnvelopePoint("flown", 0.0, 1.0, pytest.approx(0.0))
     late = rows.copy()
     late["state"][settling_s(SCENARIO) - 1.0 > TIME_S, 0, 0] += 1.5
     assert judge(SCENARIO, late).outcome == "flown"
@@ -148,7 +147,7 @@ def test_a_flight_near_the_reference_is_flown() -> None:
 def test_what_never_got_a_plan_and_stood_still_is_hovering() -> None:
     """Nothing is settled, and nothing is wrong."""
     verdict = judge(SCENARIO, along(lambda *_: [0.0, 0.0], NO))
-    assert verdict == PointVerdict("hovering", None, 0.0, 0.0)
+    assert verdict == EnvelopePoint("hovering", None, 0.0, 0.0)
 
 
 def test_a_flight_that_brakes_along_the_curve_is_hovering() -> None:
@@ -189,7 +188,7 @@ def test_a_flight_beside_the_reference_is_astray() -> None:
 
 
 def test_a_flight_without_a_step_is_unanswered() -> None:
-    assert judge(SCENARIO, np.zeros(0, client_columns(2))) == PointVerdict("unanswered")
+    assert judge(SCENARIO, np.zeros(0, client_columns(2))) == EnvelopePoint("unanswered")
 
 
 def held(step: int, state: Array) -> Array:
@@ -382,7 +381,7 @@ def _able_whatever_the_delay(
 
 def test_no_point_of_the_demo_flies_away() -> None:
     points = [DEMO.fly(number) for number in range(40)]
-    assert [DEMO.command(point.number) for point in worst_first(points) if point.line] == []
+    assert [number for number, point in worst_first(points) if point.line] == []
     outcomes = [point.outcome for point in points]
     assert {"flown", "hovering", "refused"} <= {*outcomes}
 
@@ -400,20 +399,20 @@ def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> Non
         raise ZeroDivisionError("division by zero")
 
     monkeypatch.setattr(flight, "fly", fail)
-    assert DEMO.fly(1) == EnvelopePoint(1, "crashed", line="ZeroDivisionError: division by zero")
+    assert DEMO.fly(1) == EnvelopePoint("crashed", line="ZeroDivisionError: division by zero")
 
 
 def test_the_worst_come_first() -> None:
     """Crashes, then who flew furthest, then who was furthest from the reference."""
     points = [
-        EnvelopePoint(0, "astray", 1.2),
-        EnvelopePoint(1, "flyaway", None, 0.0, 3.0),
-        EnvelopePoint(2, "flown", 0.1),
-        EnvelopePoint(3, "flyaway", None, 0.0, 50.0),
-        EnvelopePoint(4, "crashed"),
-        EnvelopePoint(5, "astray", 2.2),
+        EnvelopePoint("astray", 1.2),
+        EnvelopePoint("flyaway", None, 0.0, 3.0),
+        EnvelopePoint("flown", 0.1),
+        EnvelopePoint("flyaway", None, 0.0, 50.0),
+        EnvelopePoint("crashed"),
+        EnvelopePoint("astray", 2.2),
     ]
-    assert [point.number for point in worst_first(points)] == [4, 3, 1, 5, 0]
+    assert [number for number, _ in worst_first(points)] == [4, 3, 1, 5, 0]
 
 
 # -- the command ---------------------------------------------------------------------------------
@@ -450,10 +449,10 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
 ) -> None:
     """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
-    lost = EnvelopePoint(0, "flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
-    with closing(Journal(tmp_path, plan.settings(), tuple[int, EnvelopePoint])) as journal:
-        journal.append((1, EnvelopePoint(1, "astray", 1.25, 1.0, 0.0)))
-        journal.append((0, lost))
+    lost = EnvelopePoint("flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
+    with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
+        journal.add("1", EnvelopePoint("astray", 1.25, 1.0, 0.0))
+        journal.add("0", lost)
     assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()
     assert f"flyaway: {lost.line}\n    {plan.command(0)}\nastray: 1.25 m from the" in said.out

@@ -59,7 +59,7 @@ def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
     (_, hovers_s), (_, lands_s) = outcome.modes[1:]
     assert lands_s - hovers_s == pytest.approx(10.0, abs=0.1)
     assert [name for name, _ in outcome.autopilot] == ["LAND"]
-    assert outcome.moved_m == pytest.approx(3.9, abs=0.3)
+    assert outcome.moved_m == pytest.approx(3.6, abs=0.3)
     assert outcome.down_s == pytest.approx(lands_s + 12.4, abs=1.0)
 
 

@@ -74,7 +74,7 @@ def test_steps_without_a_plan_lower_a_floor() -> None:
 
 def test_a_reference_aboard_needs_no_packets() -> None:
     """In calm air it flies the circle to the tenth of a millimetre."""
-    summary = summarise_aboard(packaged("paper", duration=30.0, settle=20.0), "aboard")
+    summary = summarise_aboard(packaged("paper", duration=30.0, settle=20.0))
     assert summary.rmse_xy is not None
     assert summary.rmse_xy < 1e-4
     assert (summary.uplink_packets, summary.downlink_bytes, summary.event_ratio) == (0, 0, 0.0)
@@ -88,7 +88,7 @@ def test_feedback_aboard_comes_as_near_as_no_packets_at_all() -> None:
     sent = {"scheme": "committed", "feedback": True, "trigger": "cost_gap(6e-4)"}
     flown = packaged("paper", duration=30.0, control=tight | sent, vehicle={"wind": 0.1})
     planned = summarise(flown, "planned", fly(flown).client)
-    aboard = summarise_aboard(flown, "aboard")
+    aboard = summarise_aboard(flown)
     assert aboard.rmse_xy == pytest.approx(planned.rmse_xy, rel=0.05)
     assert aboard.effort_mps == pytest.approx(planned.effort_mps, rel=0.05)
 
@@ -102,7 +102,7 @@ def test_a_vehicle_with_its_reference_aboard_measures_itself_with_noise() -> Non
     assert np.abs(rows["measured"] - rows["state"]).max() > 0.1
     error = (rows["estimate"] - rows["state"])[200:, :, 0]
     assert 0.005 < error.std() < 0.05
-    assert summarise_aboard(noisy, "noisy").rmse_xy == pytest.approx(0.03, abs=0.025)
+    assert summarise_aboard(noisy).rmse_xy == pytest.approx(0.03, abs=0.025)
 
 
 def test_what_only_the_server_knows_is_not_aboard() -> None:

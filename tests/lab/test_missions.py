@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import missions, motions
+from bench import missions
 from bench.missions import MissionFlight, RandomOptions, SwapOptions
-from bench.motions import MotionsOptions
 from skytether.lab.commands.pool import Flags, study
 from skytether.server.missions import yielding
 from skytether.server.missions.waypoints import Waypoints
@@ -73,14 +72,3 @@ def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:
     again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(1)) for _ in range(2)]
     assert again[0] == again[1]
     assert again[1][0].clear_m is None
-
-
-def test_solvers_agree_on_the_problems_of_a_flight() -> None:
-    """As far as their tolerances go; those that are not installed take no part."""
-    table = motions.solvers(MotionsOptions(problems=5, duration=4.0))
-    found = {row[0]: float(row[3]) for row in table.rows}
-    assert {"ours, dual active set", "OSQP", "DAQP"} <= set(found)
-    assert found.pop("ours, dual active set") == 0.0
-    # OSQP stops at 1e-4 of its residuals.
-    assert max(found.values()) < 0.5
-    assert found["DAQP"] == pytest.approx(0.0, abs=1e-2)

@@ -20,9 +20,9 @@ from msgspec.structs import replace
 from helpers import refusal, refused_before_writing, until
 from skytether.__main__ import main
 from skytether.lab import figures
-from skytether.lab.commands.pool import Crew, pinned, work
-from skytether.lab.journal import Journal, digests, sealed
-from skytether.lab.sweep import CHUNK, Done, GridAxis, Sweep, estimate, fly, parse_axis
+from skytether.lab.commands.pool import Crew, _work
+from skytether.lab.journal import Journal, sealed
+from skytether.lab.sweep import CHUNK, FlightTask, GridAxis, Runs, Sweep, estimate, fly, parse_axis
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -142,9 +142,7 @@ def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
 
 def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
     (task,) = Sweep("paper", PAPER, [parse_axis("control.trigger=periodic")], 3).tasks()
-    done = fly(task)
-    assert (done.cell, done.chunk) == (0, 0)
-    for seed, run in zip((1, 2, 3), done.runs, strict=True):
+    for seed, run in zip((1, 2, 3), fly(task), strict=True):
         flown = replace(task.scenario, seed=seed)
         alone = flight.fly(flown)
         assert run == summarise(flown, "paper", alone.client, alone.server, alone.netem)
@@ -228,9 +226,9 @@ OTHERS = {
 }
 
 
-def journal_of(plan: Sweep, folder: Path) -> Journal[Done]:
+def journal_of(plan: Sweep, folder: Path) -> Journal[Runs]:
     """The journal of a sweep."""
-    return Journal(folder, plan.settings(), Done)
+    return Journal(folder, plan.settings(), Runs)
 
 
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
@@ -262,35 +260,30 @@ def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None
         journal_of(ONE, tmp_path)
 
 
-def done(cell: int) -> Done:
-    """A task, done without flying."""
-    return Done(cell, 0, ())
-
-
 @pytest.mark.parametrize("cut", [1, 8, 20])
 def test_half_a_line_at_the_end_is_overwritten(cut: int, tmp_path: Path) -> None:
     """A killed writer's last; everything before it is kept."""
     with closing(journal_of(ONE, tmp_path)) as journal:
-        journal.append(done(0))
-        journal.append(done(1))
+        journal.add("one", ())
+        journal.add("two", ())
     file = tmp_path / "journal.jsonl"
     whole = file.read_bytes()
     file.write_bytes(whole[:-cut])
     with closing(journal_of(ONE, tmp_path)) as journal:
-        assert journal.entries == [done(0)]
-        journal.append(done(1))
+        assert journal.results == {"one": ()}
+        journal.add("two", ())
     assert file.read_bytes() == whole
     with closing(journal_of(ONE, tmp_path)) as journal:
-        assert journal.entries == [done(0), done(1)]
+        assert journal.results == {"one": (), "two": ()}
 
 
-def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
+def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:
     """No kill leaves one behind: somebody has been there."""
     with closing(journal_of(ONE, tmp_path)) as journal:
-        journal.append(done(0))
+        journal.add("one", ())
     with (tmp_path / "journal.jsonl").open("ab") as file:
-        file.write(sealed(b"{}"))
-    said = r"journal.jsonl: line 2 is not what was written: Object missing required field `cell`"
+        file.write(sealed(b'["one", {}]'))
+    said = r"journal.jsonl: line 2 is not what was written: Expected `array`, got `object`"
     with pytest.raises(ConfigError, match=said):
         journal_of(ONE, tmp_path)
 
@@ -299,8 +292,8 @@ def test_a_line_that_is_no_task_is_named(tmp_path: Path) -> None:
 def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
     """Wherever it is but in the last line's end, which a killed writer may have left out."""
     with closing(journal_of(ONE, tmp_path)) as journal:
-        journal.append(done(0))
-        journal.append(done(1))
+        journal.add("one", ())
+        journal.add("two", ())
     file = tmp_path / "journal.jsonl"
     whole = file.read_bytes()
     for place in range(len(whole) - 1):
@@ -349,32 +342,34 @@ def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> No
 def test_a_task_whose_trajectory_was_edited_since_the_sweep_began_is_not_flown(
     tmp_path: Path,
 ) -> None:
-    """Its result is not kept either. With the file restored, the sweep goes on."""
+    """With the file restored, the sweep goes on."""
     path = tmp_path / "path.csv"
     plan = Sweep("mine", along(path), [], CHUNK + 1)
     first, second = plan.tasks()
     with closing(journal_of(plan, tmp_path / "out")) as journal:
-        journal.append(work(first, journal.files)[0])
-        path.write_text(OTHER_LINE)
-        with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
-            work(second, journal.files)
-        path.write_text(LINE)
-        journal.append(work(second, journal.files)[0])
-        assert len(journal.entries) == 2
-
-
-def test_a_flight_under_way_does_not_see_edits_of_its_trajectory(tmp_path: Path) -> None:
-    """Each task flies along a copy of its own, however often somebody saves the file meanwhile."""
-    path = tmp_path / "path.csv"
-    scenario = along(path)
-    with pinned(scenario, digests([scenario])) as flown:
-        path.write_text(OTHER_LINE)
-        at_the_end = flown.make_reference()(np.array([5.0]))[0, :, 0]
-        terms = flown.terms()
-    assert at_the_end.tolist() == [1.0, 1.0]
+        files = journal.files
+    assert set(files) == {str(path)}
+    _work(fly, files, first)
+    path.write_text(OTHER_LINE)
+    with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
+        _work(fly, files, second)
     path.write_text(LINE)
-    assert terms == scenario.terms()
-    assert not Path(flown.reference.file).exists()
+    _work(fly, files, second)
+
+
+def test_a_flight_during_which_its_trajectory_was_edited_does_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "path.csv"
+    plan = Sweep("mine", along(path), [], 1)
+    with closing(journal_of(plan, tmp_path / "out")) as journal:
+        files = journal.files
+
+    def edited(task: FlightTask) -> Runs:
+        flown = fly(task)
+        path.write_text(OTHER_LINE)
+        return flown
+
+    with pytest.raises(ConfigError, match=r"path\.csv: got the content .*, with which"):
+        _work(edited, files, next(plan.tasks()))
 
 
 @pytest.mark.long
@@ -389,15 +384,15 @@ def test_a_trajectory_edited_while_a_sweep_runs_ends_the_command_in_one_line(
     )
     argv = ["sweep", str(tmp_path / "mine.toml"), "--duration", "2", "--settle", "0"]
     argv += ["--runs", "2", "--workers", "1", "--out", str(out)]
-    fly_sweep = Crew.fly
+    fly_all = Crew.share
 
     def edited(*arguments: Any) -> None:
         """Fly, after somebody has saved another trajectory."""
         path.write_text(OTHER_LINE)
-        fly_sweep(*arguments)
+        fly_all(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Crew, "fly", edited)
+        patch.setattr(Crew, "share", edited)
         assert main(argv) == 2
     said = capsys.readouterr().err
     assert re.fullmatch(rf"sweep: {path}: got the content \w+, expected \w+, with .*\n", said)
@@ -509,7 +504,7 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
     )
     assert said
     kept = map(json.loads, (tmp_path / "journal.jsonl").read_text().splitlines())
-    assert sum(len(task["runs"]) for _, task in kept) == int(said[1])
+    assert sum(len(runs) for _, (_, runs) in kept) == int(said[1])
 
 
 @pytest.mark.parametrize(

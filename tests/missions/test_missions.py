@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from bench import missions
-from bench.missions import MortalServer, PublishedOptions
+from bench.missions import PublishedOptions, fly_with_deaths
 from helpers import packaged, refusal
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
@@ -650,8 +650,7 @@ def impatient(swaps: Scenario) -> Scenario:
 def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
     """It reckons with motions that it does not know, and with vehicles that hover meanwhile."""
     swaps = impatient(scenario(8, duration=80.0))
-    server = MortalServer(swaps, 8, [(6.0, 7.5), (14.0, 30.0), (36.0, 38.0)])
-    flown = flight.fly(swaps, vehicles=8, server=server)
+    flown, _ = fly_with_deaths(swaps, 8, [(6.0, 7.5), (14.0, 30.0), (36.0, 38.0)])
     assert separation_m(flown) > 0.5
     assert max(left_m(flown, swaps)) < 0.3
 
@@ -697,7 +696,7 @@ def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch
     swaps = impatient(scenario(2, duration=60.0))
 
     def drift_m() -> float:
-        flown = flight.fly(swaps, vehicles=2, server=MortalServer(swaps, 2, [(4.0, 58.0)]))
+        flown, _ = fly_with_deaths(swaps, 2, [(4.0, 58.0)])
         hovering = [rows[rows["mode"] == Mode.HOVER]["state"][:, :, 0] for rows in each_of(flown)]
         assert min(map(len, hovering)) > 700
         return max(float(np.linalg.norm(at - at[0], axis=1).max()) for at in hovering)

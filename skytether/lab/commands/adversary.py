@@ -2,7 +2,7 @@
 
 import shlex
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -26,9 +26,11 @@ from skytether.lab.adversary import (
     spare_m,
 )
 from skytether.lab.commands import tables
-from skytether.lab.commands.pool import Flags, Interrupted, crew
+from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
+from skytether.lab.journal import ENTRIES, digests
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
@@ -47,21 +49,9 @@ class Kept(msgspec.Struct, frozen=True):
     """Spare distance of each flight, see `spare_m` [m]."""
 
 
-class Attack(msgspec.Struct, frozen=True):
-    """Part of an `Approach` that is read again: an infinite distance is null in JSON."""
-
-    moves: Moves
-
-
-class Attacked(msgspec.Struct, frozen=True):
-    """Part of `Kept` that is read again."""
-
-    nearest: Attack
-
-
 ATTACK_BYTES_MAX = 16_000_000
 """Largest size of a file of moves [B]."""
-OWN = ("with", "tries", "moves", "first", "workers", "json")
+OWN = ("with", "tries", "moves", "first", "workers", "out", "json")
 """Options with a value that are about the search, and not about a flight."""
 
 
@@ -83,6 +73,9 @@ class AdversaryOptions:
     """Number of the first climb: another number begins elsewhere."""
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
+    out: Path | None = None
+    """Folder that keeps the climbs of a search: after Ctrl-C, or with more tries, the same command
+    goes on there."""
     attack: Annotated[str | None, Argument(metavar="JSON|FILE")] = None
     """Moves to fly once: as printed by a search, or the file of its --json."""
     json: Path | None = None
@@ -123,37 +116,44 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
         CommandError: interrupted before any climb was done.
     """
     command.check_count("--tries", options.tries, TRIES_MAX)
+    command.claim_folder("--out", options.out, ENTRIES)
     command.check_count("--moves", options.moves, MOVES_MAX)
     pool, patience = Flags(workers=options.workers), 0 if options.random else PATIENCE
     pool.check()
-    numbers = range(-(-options.tries // CLIMB))
-    tasks = [
-        Climb(
-            options.config,
-            _kinds(options.kinds),
-            options.first + number,
-            min(CLIMB, options.tries - number * CLIMB),
-            options.moves,
-            patience,
-        )
-        for number in numbers
-    ]
-    done: dict[int, Climbed] = {}
-    with crew(pool, f"against {title}", options.tries, "flights") as flyers:
+    kinds = _kinds(options.kinds)
+    sizes = [min(CLIMB, options.tries - begun) for begun in range(0, options.tries, CLIMB)]
+    tasks = {
+        (number, tries): Climb(options.config, kinds, number, tries, options.moves, patience)
+        for number, tries in enumerate(sizes, start=options.first)
+    }
+    settings = {
+        "kinds": [*kinds],
+        "moves": options.moves,
+        "patience": patience,
+        "files": digests([options.config]),
+        "scenario": reading.to_table(options.config),
+    }
 
-        def keep(number: int, climbed: Climbed) -> None:
-            done[number] = climbed
-            least_m = min(min(each.spares_m) for each in done.values())
-            flyers.advance(len(climbed.spares_m), f"{least_m:.3f} m left")
+    def least(done: Collection[Climbed]) -> str:
+        spares_m = (min(each.spares_m) for each in done)
+        return f"{min(spares_m):.3f} m left" if done else ""
 
-        try:
-            flyers.share(climb, tasks, keep)
-        except Interrupted:
-            if not done:
-                raise
-    spares_m = [each for number in sorted(done) for each in done[number].spares_m]
-    bests = [done[number].best for number in sorted(done)]
-    return min(bests, key=lambda each: spare_m(options.config, each)), spares_m
+    try:
+        with (
+            writing(options.out),
+            crew(pool, f"against {title}", options.tries, "flights") as flyers,
+        ):
+            results = flyers.study(
+                climb, tasks, Climbed, settings, options.out, size=lambda t: t.tries, tell=least
+            )
+            done = list(results.values())
+    except Interrupted as interrupted:
+        done = [interrupted.results[number] for number in sorted(interrupted.results)]
+        if not done:
+            raise
+    spares_m = [each for climbed in done for each in climbed.spares_m]
+    best = min((each.best for each in done), key=lambda each: spare_m(options.config, each))
+    return best, spares_m
 
 
 def _moves(text: str) -> Moves:
@@ -167,7 +167,7 @@ def _moves(text: str) -> Moves:
         return loads(text)
     try:
         content = files.read(Path(text), ATTACK_BYTES_MAX)
-        return msgspec.json.decode(content, type=Attacked).nearest.moves
+        return msgspec.json.decode(content, type=Kept).nearest.moves
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
     except msgspec.DecodeError as error:
@@ -208,7 +208,7 @@ def _finish(
         rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
         rows.append(("in which a distance was not kept", failed))
     # With all digits: the same moves give the same distance.
-    rows.append(("least separation, asked for [m]", f"{apart.distance_m!r}, {asked_m:g}"))
+    rows.append(("least separation, asked for [m]", f"{apart.away_m!r}, {asked_m:g}"))
     rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
     if clear.vehicles:
         rows.append(("least distance from a zone [m]", clear.distance_m))

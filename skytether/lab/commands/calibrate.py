@@ -4,9 +4,8 @@ ones.
 
 import math
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +16,6 @@ from skytether.lab import calibration
 from skytether.lab.calibration import HERE, Rmse, SearchLimits, Table1
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
-from skytether.lab.journal import Journal
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
@@ -99,16 +97,14 @@ def calibrate(argv: Sequence[str]) -> None:
     )
     command.claim_folder("--out", options.out, BEST)
     title = f"searching from {options.scenario}"
-    with (
-        writing(options.out),
-        closing(Journal(options.out, search.settings(), list[SearchPoint])) as journal,
-    ):
+    points: list[SearchPoint] = []
+    with writing(options.out):
         with (
             crew(options.pool, title, options.generations, "generations") as flyers,
             suppress(Interrupted),
         ):
-            flyers.search(search, journal, options.generations)
-        points = list(chain.from_iterable(journal.entries[: options.generations]))
+            for flown in flyers.search(search, options.out, options.generations):
+                points = flown
         if not points:
             raise CommandError("ended before the first generation was flown")
         files.write(options.out / BEST, to_toml(search.scenario(best(points))))

@@ -1,7 +1,6 @@
 """`skytether compare`: schemes and triggers on the same seeds, each at its own best weights."""
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,17 +9,17 @@ import tyro
 
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
-from skytether.lab.beside import Baselines, Work, floor_of, fly_aboard
 from skytether.lab.budgets import Plan
 from skytether.lab.calibration import HERE, Rmse, SearchLimits
 from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
-from skytether.lab.journal import Journal
-from skytether.lab.search import Search, SearchPoint, best
+from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
+from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
+from skytether.shared.telemetry.summary import Summary
 from skytether.shell import command
 from skytether.shell.options import read
 
@@ -83,10 +82,10 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
     results = []
     with crew(options.pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
         for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
-            done = flyers.flown(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
+            done = flyers.sweep(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
             beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
             results.append(comparison.compared(plan, points, sweep, done, beside))
-        runs += flyers.spent.runs
+        runs += flyers.runs
     drawn = comparison.draw(results)
     report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
     for table in drawn.tables:
@@ -109,20 +108,21 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
         for plan, points, sweep in zip(plans, asked, sweeps, strict=True):
             if points:
                 folder = options.out / "scouts" / plan.case.name / f"round-{number}"
-                plan.scouted(points, sweep, flyers.flown(sweep, folder, plan.case.title))
-        return flyers.spent.runs
+                plan.scouted(points, sweep, flyers.sweep(sweep, folder, plan.case.title))
+        return flyers.runs
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
     """Baselines beside the contenders of a case that has its own weights."""
     if plan.case.weights:
         return Baselines()
-    work = Work(plan)
-    with closing(Journal(folder, work.settings(), Baselines)) as journal:
-        if not journal.entries:
-            floor = flyers.map(floor_of, work.regular)
-            journal.append(Baselines(floor, flyers.map(fly_aboard, work.aboard)))
-        return journal.entries[0]
+    work, no_work = Work(plan), lambda _: 0.0
+    settings = work.settings()
+    floor = flyers.study(floor_of, work.regular, Floor, settings, folder / "floor", size=no_work)
+    aboard = flyers.study(
+        summarise_aboard, work.aboard, Summary, settings, folder / "aboard", size=no_work
+    )
+    return Baselines(list(floor.values()), list(aboard.values()))
 
 
 def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
@@ -143,8 +143,7 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
             )
             name = contenders.entry(contender, case)
             folder = options.out / "searches" / name
-            with closing(Journal(folder, search.settings(), list[SearchPoint])) as journal:
-                points = flyers.search(search, journal, scale.generations, f"{name}: ")
+            *_, points = flyers.search(search, folder, scale.generations, f"{name}: ")
             point = best(points)
             here = point.values[HERE]
             says = (

@@ -1,9 +1,10 @@
 """`skytether crowd`: number of vehicles that can share one network, scheme by scheme."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -12,15 +13,14 @@ import tyro
 from skytether.cli import processes
 from skytether.lab import figures
 from skytether.lab.commands import tables
-from skytether.lab.commands.pool import Interrupted, writing
+from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
 from skytether.lab.journal import Journal
-from skytether.shared.base import files, kernel
+from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
-from skytether.shell import command, temporary, terminal
+from skytether.shell import command, temporary
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.shell.terminal import Bar
 from skytether.sim import flight
 
 VEHICLES_MAX = 4096
@@ -71,87 +71,77 @@ def crowd(argv: Sequence[str]) -> None:
     for scheme in options.schemes:
         plan.of(scheme)
     command.claim_folder("--out", options.out, "crowd.csv", "crowd.png")
-    terminal.prepare(kernel.missing())
-    with (
-        writing(options.out),
-        closing(Journal(options.out, plan.settings(), CrowdPoint)) as journal,
-    ):
-        with (
-            command.interruptible() as interrupted,
-            terminal.progress(f"flying {options.scenario}", len(options.schemes), "schemes") as bar,
-        ):
-            done = 0
-            for scheme in options.schemes:
-                if not _fly_all(
-                    options, plan, scheme, journal, partial_bar(bar, done), interrupted
-                ):
-                    break
-                done += 1
-        if journal.entries:
-            _finish(options, journal.entries)
-    if done < len(options.schemes):
-        raise Interrupted(done, len(options.schemes), "schemes")
+    early: Interrupted | None = None
+    with writing(options.out):
+        with closing(Journal(options.out, plan.settings(), CrowdPoint)) as journal:
+            points = {(each.scheme, each.vehicles): each for each in journal.results.values()}
+        try:
+            with crew(
+                # over UDP one after the other: they would share the machine
+                Flags(1 if options.udp else None),
+                f"flying {options.scenario}",
+                len(options.schemes),
+                "schemes",
+            ) as flyers:
+                while cells := _missing(options, list(points.values())):
+                    left = len({scheme for scheme, _ in cells})
+                    flyers.advance(len(options.schemes) - left - flyers.done, _doing(cells))
+                    points |= flyers.study(
+                        partial(_fly, plan),
+                        {cell: cell for cell in cells},
+                        CrowdPoint,
+                        plan.settings(),
+                        options.out,
+                        size=lambda _: 0.0,
+                        tell=partial(_doing, cells),
+                    )
+        except Interrupted as interrupted:
+            early = interrupted
+            points |= interrupted.results
+        if points:
+            _finish(options, list(points.values()))
+    if early:
+        raise early
 
 
-def partial_bar(bar: Bar, done: int) -> Callable[[str], None]:
-    """Function that shows a text in a bar at a number of finished schemes."""
-    return lambda text: bar(done, text)
+Cell = tuple[Scheme, int]
+"""Scheme, and number of vehicles."""
 
 
-def _fly_all(
-    options: CrowdOptions,
-    plan: Crowd,
-    scheme: Scheme,
-    journal: Journal[CrowdPoint],
-    tell: Callable[[str], None],
-    interrupted: Callable[[], bool],
-) -> bool:
-    """Fly the missing points of a scheme; returns False if interrupted."""
-    while True:
-        flown = FlownScheme.of(journal.entries, scheme, options.limit)
-        known = {point.vehicles for point in flown.points}
-        left = [number for number in options.vehicles if number not in known]
-        number = next(iter(left), None) if options.vehicles else flown.next(options.most)
-        if number is None:
-            return True
-        point = _fly(plan, scheme, number, tell, interrupted)
-        if point is None:
-            return False
-        journal.append(point)
+def _missing(options: CrowdOptions, points: Sequence[CrowdPoint]) -> list[Cell]:
+    """Flights to fly next; none when all is known."""
+    cells: list[Cell] = []
+    for scheme in options.schemes:
+        flown = FlownScheme.of(points, scheme, options.limit)
+        numbers = options.vehicles or (flown.next(options.most),)
+        known = {None, *(point.vehicles for point in flown.points)}
+        cells += [(scheme, number) for number in numbers if number and number not in known]
+    return cells
 
 
-def _fly(
-    plan: Crowd,
-    scheme: Scheme,
-    vehicles: int,
-    tell: Callable[[str], None],
-    interrupted: Callable[[], bool],
-) -> CrowdPoint | None:
-    """Fly a number of vehicles; returns None if interrupted."""
+def _doing(cells: Sequence[Cell], _: object = None) -> str:
+    """Flights under way, in words."""
+    return ", ".join(f"{scheme} {vehicles}" for scheme, vehicles in cells)
+
+
+def _fly(plan: Crowd, cell: Cell) -> CrowdPoint:
+    """Fly a number of vehicles; called in a worker."""
+    scheme, vehicles = cell
     scenario = plan.of(scheme)
-
-    def on_second(time_s: float) -> None:
-        tell(f"{scheme}, {vehicles} vehicles, {min(time_s, scenario.duration):.0f} s")
-
-    on_second(0.0)
     if not plan.udp:
-        kernel.load()
-        flown = flight.fly(scenario, vehicles=vehicles, on_second=on_second, stopped=interrupted)
-        client, netem = flown.client, flown.figures["netem"]
-    else:
-        with temporary.folder() as parts:
-            processes.run(
-                scenario,
-                parts,
-                on_second=on_second,
-                interrupted=interrupted,
-                vehicles=vehicles,
-                watched=False,
-            )
-            client = record.read(parts / "client")
-            netem = json.loads((parts / "netem.json").read_bytes())
-    if interrupted():
-        return None
+        flown = flight.fly(scenario, vehicles=vehicles)
+        return judge(scenario, scheme, vehicles, flown.client, flown.figures["netem"])
+    with temporary.folder() as parts:
+        processes.run(
+            scenario,
+            parts,
+            on_second=lambda _: None,
+            interrupted=lambda: False,  # it ends with its worker
+            vehicles=vehicles,
+            watched=False,
+        )
+        client = record.read(parts / "client")
+        netem = json.loads((parts / "netem.json").read_bytes())
     return judge(scenario, scheme, vehicles, client, netem)
 
 

@@ -98,7 +98,7 @@ def margins(argv: Sequence[str]) -> None:
             ]
             runs = min(options.runs, lab.LIMIT_RUNS)
             parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
-            results = flyers.map(_fly, parts, 1)
+            results = flyers.study(_fly, dict(enumerate(parts))).values()
     except Interrupted as interrupted:  # nothing is kept of what was flown
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
     flown = [each for each in results if isinstance(each, Margin)]

@@ -1,15 +1,16 @@
-"""Core of every study: flights in workers, kept in a journal, with a bar, Ctrl-C and resuming.
+"""Core of every study: cells are flown in workers, and their results kept in a journal.
 
-A study of numbered cells is `study`: cells and a function that flies and judges one. Sweeps and
-searches (`Crew.fly`, `Crew.search`) pin their files besides. The workers are processes of this
-machine, or a Dask cluster.
+A study is data and one judge: cells, and a function that flies and judges one (`Crew.study`). What
+is kept is not flown again, Ctrl-C ends in order, and a bar shows how far it is. A sweep is a study
+of its tasks, a search one of its points, generation by generation. The workers are processes of
+this machine, or a Dask cluster.
 """
 
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -25,19 +26,19 @@ from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from msgspec.structs import replace
 
 import skytether.lab.sweep
-from skytether.lab.journal import Journal, digest
-from skytether.lab.search import Generation, Search, SearchPoint, Values, best
-from skytether.lab.sweep import Done, FlightTask, Results, Sweep
-from skytether.shared.base import files, kernel
+from skytether.lab.journal import Journal, digest, name_of
+from skytether.lab.search import Point, Search, SearchPoint, Values, best
+from skytether.lab.sweep import Results, Runs, Sweep
+from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.schema import TABLES, Scenario
-from skytether.shell import command, plugins, temporary, terminal
+from skytether.shared.scenario.schema import Scenario
+from skytether.shell import command, plugins, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
 from skytether.shell.terminal import Bar
@@ -50,6 +51,7 @@ POLL_S = 0.2
 CONNECT_S = 10.0
 """Time that a scheduler may take to answer [s]."""
 
+K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -92,18 +94,8 @@ class Interrupted(CommandError):
     def __init__(self, done: float, total: float, unit: str) -> None:
         said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
         super().__init__(f"{said}; the same command goes on from here", command.INTERRUPTED)
-
-
-@dataclass(slots=True)
-class Spent:
-    """Resources used by this command."""
-
-    cpu_s: float = 0.0
-    """CPU time of the workers [s]."""
-    steps: int = 0
-    """Number of steps flown, of all vehicles."""
-    runs: int = 0
-    """Number of flights."""
+        self.results: Mapping[Any, Any] = {}
+        """Results of the study so far."""
 
 
 @dataclass(slots=True)
@@ -119,85 +111,110 @@ class Crew:
     interrupted: Callable[[], bool]
     done: float = 0.0
     """Amount of finished work."""
-    spent: Spent = field(default_factory=Spent)
+    cpu_s: float = 0.0
+    """CPU time of the workers [s]."""
+    runs: int = 0
+    """Number of flights of sweeps, without those that were kept before."""
+    fresh: list[Any] = field(default_factory=list)
+    """Results of this command, without those that were kept before."""
 
     def advance(self, amount: float, text: str = "") -> None:
         """Count finished work, and show it."""
         self.done += amount
         self.bar(self.done, text)
 
-    def fly(self, plan: Sweep, journal: Journal[Done], text: str = "") -> None:
-        """Fly the missing tasks of a sweep.
+    def study(
+        self,
+        fly: Callable[[T], R],
+        cells: Mapping[K, T],
+        kind: Any = None,
+        settings: Mapping[str, Any] = MappingProxyType({}),
+        out: Path | None = None,
+        *,
+        size: Callable[[T], float] = lambda _: 1.0,
+        tell: Callable[[Collection[R]], str] = lambda _: "",
+    ) -> dict[K, R]:
+        """Results of all cells of a study, in order, after flying the missing ones.
+
+        Args:
+            fly: flies a cell, and judges the flight; called in a worker.
+            cells: what is flown, each with the key of its result in the journal.
+            kind: type of a result; needed with a folder alone.
+            settings: all that the results follow from, but for the cells.
+            out: folder of the journal; None: nothing is kept.
+            size: amount of work that a cell is, in the unit.
+            tell: text of the bar, from all results so far.
+
+        Raises:
+            CommandError: interrupted (with the results so far), or a worker has died.
+            ConfigError: the folder has the results of other settings, or a file on which they
+                depend has changed since the study began.
+            OSError: the folder cannot be written.
+        """
+        with closing(Journal(out, settings, kind)) as journal:
+            names = {key: name_of(key) for key in cells}
+            results = {
+                k: journal.results[name] for k, name in names.items() if name in journal.results
+            }
+            self.advance(sum(size(cells[key]) for key in results), tell(results.values()))
+            todo = [key for key in cells if key not in results]
+
+            def keep(number: int, result: tuple[R, float]) -> None:
+                key = todo[number]
+                results[key], cpu_s = result
+                journal.add(names[key], results[key])
+                self.cpu_s += cpu_s
+                self.fresh.append(results[key])
+                self.advance(size(cells[key]), tell(results.values()))
+
+            try:
+                if todo:
+                    work = partial(_work, fly, journal.files)
+                    self.share(work, [cells[key] for key in todo], keep)
+            except Interrupted as interrupted:
+                interrupted.results = results
+                raise
+        return {key: results[key] for key in cells}
+
+    def map(self, fly: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        """Results of a function for all items, in order, which count as no work."""
+        return list(self.study(fly, dict(enumerate(items)), size=lambda _: 0.0).values())
+
+    def sweep(self, plan: Sweep, out: Path, text: str = "") -> Results:
+        """Results of all tasks of a sweep; see `study`.
 
         Args:
             text: text of the bar.
-
-        Raises:
-            CommandError: interrupted, or a worker has died.
-            ConfigError: the trajectory's file has changed since the sweep began.
         """
-        todo = plan.todo(skytether.lab.sweep.results(journal.entries))
-        before = plan.flights - sum(len(task.seeds) for task in todo)
-        self.advance(before, text)
-
-        def keep(_: int, result: tuple[Done, float]) -> None:
-            done, cpu_s = result
-            journal.append(done)
-            self.spent.cpu_s += cpu_s
-            self.spent.steps += sum(run.steps for run in done.runs)
-            self.spent.runs += len(done.runs)
-            self.advance(len(done.runs), text)
-
-        self.share(partial(work, pins=journal.files), todo, keep)
-
-    def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
-        """All results of a sweep, after flying the missing tasks; see `fly`.
-
-        Args:
-            folder: folder of the sweep's journal.
-        """
-        with closing(Journal(folder, plan.settings(), Done)) as journal:
-            self.fly(plan, journal, text)
-            return skytether.lab.sweep.results(journal.entries)
+        tasks, before = {(task.cell, task.chunk): task for task in plan.tasks()}, len(self.fresh)
+        results = self.study(
+            skytether.lab.sweep.fly,
+            tasks,
+            Runs,
+            plan.settings(),
+            out,
+            size=lambda task: len(task.seeds),
+            tell=lambda _: text,
+        )
+        self.runs += sum(map(len, self.fresh[before:]))
+        return results
 
     def search(
-        self, search: Search, journal: Journal[Generation], generations: int, text: str = ""
-    ) -> list[SearchPoint]:
-        """All points of a search, after flying the missing ones.
+        self, search: Search, out: Path, generations: int, text: str = ""
+    ) -> Iterator[list[SearchPoint]]:
+        """All points of a search so far, after each generation; see `study`.
 
         Args:
             text: text of the bar, before the best score.
-
-        Raises:
-            CommandError: interrupted, or a worker has died.
-            ConfigError: the journal is another search's, or the trajectory's file has changed since
-                the search began.
         """
 
-        def fly_all(
-            fly: Callable[[Scenario], Values], proposed: Sequence[Scenario]
-        ) -> Sequence[Values]:
-            return self.map(partial(_fly_point, fly, journal.files), proposed)
+        def fly_all(cells: Mapping[Point, Scenario]) -> Mapping[Point, Values]:
+            kind, settings = dict[str, dict[str, float | None]], search.settings()
+            return self.study(search.fly, cells, kind, settings, out, size=lambda _: 0.0)
 
-        points: list[SearchPoint] = []
-        for points in search.points(journal, generations, fly_all):
+        for points in search.points(generations, fly_all):
             self.advance(1, f"{text}best {best(points).score:.4f}")
-        return points
-
-    def map(self, function: Callable[[T], R], items: Sequence[T], amount: float = 0.0) -> list[R]:
-        """Results of a function for all items, in order; see `share`.
-
-        Args:
-            amount: amount of work that an item is, in the unit.
-        """
-        results: dict[int, R] = {}
-
-        def keep(number: int, result: R) -> None:
-            results[number] = result
-            self.advance(amount)
-
-        self.share(function, items, keep)
-        return [results[number] for number in range(len(items))]
+            yield points
 
     def share(
         self, function: Callable[[T], R], items: Sequence[T], on_done: Callable[[int, R], None]
@@ -221,7 +238,7 @@ class Crew:
                 if not under_way:
                     return
                 ready, _ = wait(under_way, POLL_S, FIRST_COMPLETED)
-                for future in ready:
+                for future in sorted(ready, key=under_way.__getitem__):
                     on_done(under_way.pop(future), future.result())
             except BrokenExecutor:
                 died = "a worker has died; the same command goes on from here"
@@ -260,39 +277,22 @@ def study(
     title: str = "flying",
     unit: str = "flights",
 ) -> list[R]:
-    """Results of all cells of a study, in order, after flying the missing ones.
+    """Results of all cells of a study that is a whole command, in order; see `Crew.study`.
 
     Args:
-        fly: flies a cell, and judges the flight; called in a worker.
-        cells: what is flown; the same folder may be given more cells later, at the end.
-        kind: type of a result.
-        settings: all that the results follow from, but for the number of a cell.
-        out: folder of the journal; None: nothing is kept.
+        cells: what is flown, each its own key; the same folder may be given more later.
         title, unit: for the bar.
 
     Raises:
         CommandError: interrupted, a worker has died, or the folder cannot be written.
         ConfigError: the folder has the results of other settings.
     """
-    with temporary.folder() as folder:
-        place = out or folder / "study"
-        with writing(place), closing(Journal(place, settings, tuple[int, kind])) as journal:  # type: ignore[valid-type]
-            done = {number for number, _ in journal.entries}
-            todo = [number for number in range(len(cells)) if number not in done]
-            with crew(flags, title, len(cells), unit) as flyers:
-                flyers.advance(len(cells) - len(todo))
-
-                def keep(index: int, result: R) -> None:
-                    journal.append((todo[index], result))
-                    flyers.advance(1)
-
-                flyers.share(fly, [cells[number] for number in todo], keep)
-            results = dict(journal.entries)
-            return [results[number] for number in range(len(cells))]
+    with writing(out), crew(flags, title, len(cells), unit) as flyers:
+        return list(flyers.study(fly, {cell: cell for cell in cells}, kind, settings, out).values())
 
 
 @contextmanager
-def writing(out: Path) -> Iterator[None]:
+def writing(out: Path | None) -> Iterator[None]:
     """Turn an OSError within the block into one line that names the file or folder.
 
     Raises:
@@ -324,51 +324,26 @@ def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) 
     return function(item)
 
 
-def work(task: FlightTask, pins: Mapping[str, str]) -> tuple[Done, float]:
-    """Result of a task, and its CPU time [s]; called in a worker.
+def _work(fly: Callable[[T], R], pins: Mapping[str, str], item: T) -> tuple[R, float]:
+    """Result of a cell, and its CPU time [s]; called in a worker.
 
     Args:
-        pins: see `pinned`.
+        pins: digest of each file that the result depends on, by its path.
+
+    Raises:
+        ConfigError: a file has changed since the work began, or differs on this machine.
     """
     kernel.load()
     began_s = time.thread_time()
-    with pinned(task.scenario, pins) as scenario:
-        done = skytether.lab.sweep.fly(replace(task, scenario=scenario))
-    return done, time.thread_time() - began_s
-
-
-def _fly_point(
-    fly: Callable[[Scenario], Values], pins: Mapping[str, str], scenario: Scenario
-) -> Values:
-    """Figures of a point of a search; called in a worker."""
-    with pinned(scenario, pins) as flown:
-        return fly(flown)
-
-
-@contextmanager
-def pinned(scenario: Scenario, pins: Mapping[str, str]) -> Iterator[Scenario]:
-    """Scenario that refers to a copy of its trajectory's file, so that later edits have no effect.
-
-    Args:
-        pins: expected digest of each file, by its path; other files are not copied.
-
-    Raises:
-        ConfigError: the file has changed since the work began, or differs on this machine.
-    """
-    reference = scenario.reference
-    if reference.shape not in TABLES or reference.file not in pins:
-        yield scenario
-        return
-    content, expected = Path(reference.file).read_bytes(), pins[reference.file]
-    if digest(content) != expected:
-        raise ConfigError(
-            f"{reference.file}: got the content {digest(content)}, expected {expected}, "
-            "with which the work began; or another --out"
-        )
-    with temporary.folder() as folder:
-        copy = folder / "trajectory.csv"
-        files.write(copy, content)
-        yield replace(scenario, reference=replace(reference, file=str(copy)))
+    result = fly(item)
+    spent_s = time.thread_time() - began_s
+    for file, expected in pins.items():  # afterwards: it may have been saved during the flight
+        if (found := digest(Path(file).read_bytes())) != expected:
+            raise ConfigError(
+                f"{file}: got the content {found}, expected {expected}, "
+                "with which the work began; or another --out"
+            )
+    return result, spent_s
 
 
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:

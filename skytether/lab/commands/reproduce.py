@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -17,9 +17,10 @@ from skytether.lab.commands import delays, report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.journal import Journal
+from skytether.lab.plates import Samples
 from skytether.lab.report import Reproduction
 from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
-from skytether.lab.sweep import Done
+from skytether.lab.sweep import Runs
 from skytether.shared.base import files, kernel
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -84,7 +85,7 @@ def _measure(
     total += maps.flights + periods.flights
     sweeps = options.out / "sweeps"
     # A folder of another reproduction is refused before anything is flown.
-    Journal(sweeps / table.name, table.first().settings(), Done).close()
+    Journal(sweeps / table.name, table.first().settings(), Runs).close()
     terminal.prepare(kernel.missing())
     # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)
@@ -92,8 +93,8 @@ def _measure(
     with crew(options.pool, "reproducing", total) as flyers:
         table_cells = _fly_study(flyers, sweeps, table, "Table 1")
         curve_cells = [_fly_study(flyers, sweeps, study, f"RMSE, {study.name}") for study in curves]
-        map_cells = flyers.flown(maps, sweeps / "fig5", "Fig. 5")
-        period_cells = flyers.flown(periods, sweeps / "fig5-periodic", "Fig. 5, periodic")
+        map_cells = flyers.sweep(maps, sweeps / "fig5", "Fig. 5")
+        period_cells = flyers.sweep(periods, sweeps / "fig5-periodic", "Fig. 5, periodic")
     measured = Reproduction(
         table=(table, table_cells),
         curves=list(zip(curves, curve_cells, strict=True)),
@@ -101,17 +102,17 @@ def _measure(
         periods=studies.flown(periods, period_cells),
         delay_ms=delay_ms,
         real=real,
-        samples=_samples(options.out, table, table_cells, scale),
+        samples=_samples(table, table_cells, scale),
     )
-    return measured, flyers.spent.runs
+    return measured, flyers.runs
 
 
 def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
     """Fly both sweeps of a study."""
     first = study.first()
-    firstly = flyers.flown(first, out / study.name, title)
+    firstly = flyers.sweep(first, out / study.name, title)
     second = study.second(studies.flown(first, firstly))
-    secondly = flyers.flown(second, out / f"{study.name}-periodic", f"{title}, periodic")
+    secondly = flyers.sweep(second, out / f"{study.name}-periodic", f"{title}, periodic")
     return studies.cells(study, first, firstly, second, secondly)
 
 
@@ -156,37 +157,16 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
     return report.Real(scenario, Record(client, server, netem), figures)
 
 
-def _samples(
-    out: Path, table: Study, table_cells: Cells, scale: ReproductionSize
-) -> Mapping[str, tuple[Scenario, Sequence[Record]]]:
+def _samples(table: Study, table_cells: Cells, scale: ReproductionSize) -> Samples:
     """Scenario and some complete records of flights in virtual time, by method."""
     steps = table_cells[table.here, PERIODIC].period
-    samples = {}
+    plan, samples = table.first(), {}
     for method in (*studies.METHODS.values, PERIODIC):
-        plan = table.first()
         scenario = plan.scenario_of(table.here, EVENT if method == PERIODIC else method)
         if method == PERIODIC:
             keys = {"trigger": "periodic", "period": steps}
             control = msgspec.structs.replace(scenario.control, **keys)
             scenario = msgspec.structs.replace(scenario, control=control)
-        file = out / "samples" / f"{method.replace(' ', '-')}.npz"
-        if not file.exists():
-            file.parent.mkdir(exist_ok=True)
-            seeds = range(scenario.seed, scenario.seed + scale.sample_runs)
-            rows = {
-                f"{part}{number}": getattr(flight, part)
-                for number, flight in enumerate(fly_batch(scenario, seeds))
-                for part in processes.NAMES
-            }
-            content = io.BytesIO()
-            np.savez_compressed(content, **rows)
-            files.write(file, content.getvalue())
-        with np.load(file) as kept:
-            samples[method] = (
-                scenario,
-                [
-                    Record(**{part: kept[f"{part}{number}"] for part in processes.NAMES})
-                    for number in range(scale.sample_runs)
-                ],
-            )
+        seeds = range(scenario.seed, scenario.seed + scale.sample_runs)
+        samples[method] = scenario, fly_batch(scenario, seeds)
     return samples

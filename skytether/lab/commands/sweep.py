@@ -1,7 +1,6 @@
 """`skytether sweep`: many flights over a grid, on all cores or on a Dask cluster."""
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,9 +10,8 @@ import tyro
 
 from skytether.lab import figures
 from skytether.lab.commands import tables
-from skytether.lab.commands.pool import Flags, PoolFlags, Spent, crew, writing
-from skytether.lab.journal import Journal
-from skytether.lab.sweep import Done, Sweep, estimate, parse_axis, results
+from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
+from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
@@ -65,19 +63,15 @@ def sweep(argv: Sequence[str]) -> None:
     plan = Sweep(options.scenario, options.config, axes, options.runs)
     command.claim_folder("--out", options.out, "runs.csv", "cells.csv")
     title = f"sweeping {options.scenario}, {len(plan.cells)} cells"
-    with (
-        writing(options.out),
-        closing(Journal(options.out, plan.settings(), Done)) as journal,
-    ):
+    with writing(options.out):
         with crew(options.pool, title, plan.flights) as flyers:
-            flyers.fly(plan, journal)
-        _finish(options, plan, journal, flyers.spent)
+            done = flyers.sweep(plan, options.out)
+        _finish(options, plan, done, flyers)
 
 
-def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: Spent) -> None:
+def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> None:
     """Write and print the tables and pictures of a complete sweep."""
     written = ["runs.csv", "cells.csv"]
-    done = results(journal.entries)
     files.write(options.out / "runs.csv", plan.runs_csv(done).encode())
     files.write(options.out / "cells.csv", plan.cells_csv(done).encode())
     cells = [plan.of_cell(done, cell) for cell in range(len(plan.cells))]
@@ -109,9 +103,9 @@ def _finish(options: SweepOptions, plan: Sweep, journal: Journal[Done], spent: S
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
         print(f"{failed} runs found no server and count in no mean of the error")
-    if spent.cpu_s:
-        rate = spent.steps / spent.cpu_s
-        print(f"{spent.steps} vehicle-steps, {rate:.0f} per core-second")
+    if flyers.cpu_s:
+        steps = sum(run.steps for runs in flyers.fresh for run in runs)
+        print(f"{steps} vehicle-steps, {steps / flyers.cpu_s:.0f} per core-second")
     print(f"{options.out}: {', '.join(written)}")
 
 

@@ -4,7 +4,7 @@ import math
 import secrets
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -68,21 +68,15 @@ def torture(argv: Sequence[str]) -> None:
     pool = Flags(workers=options.jobs)
     pool.check()
     trials, title = _trials(options)
-    done: list[TrialOutcome] = []
+    done: Collection[TrialOutcome] = ()
     interrupted = ""
     try:
         with crew(pool, title, len(trials), "flights") as flyers:
-
-            def keep(_: int, outcome: TrialOutcome) -> None:
-                done.append(outcome)
-                failed = sum(bool(each.failure) for each in done)
-                flyers.advance(1, f"{failed} failed" if failed else "")
-
-            flyers.share(fly, trials, keep)
+            done = flyers.study(fly, dict(enumerate(trials)), tell=_failures).values()
             failed = [each for each in done if each.failure]
-            failed.sort(key=lambda outcome: outcome.trial.seed)
             failed[:TOLD_MAX] = flyers.map(shrunk, failed[:TOLD_MAX])
-    except Interrupted:
+    except Interrupted as early:
+        done = done or early.results.values()
         interrupted = f"interrupted with {len(done)} of {len(trials)} flights done"
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
@@ -91,6 +85,12 @@ def torture(argv: Sequence[str]) -> None:
         raise CommandError(f"{interrupted}, and {said}" if interrupted else said)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
+
+
+def _failures(done: Collection[TrialOutcome]) -> str:
+    """Number of failures, in words; nothing without any."""
+    failed = sum(bool(each.failure) for each in done)
+    return f"{failed} failed" if failed else ""
 
 
 def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
@@ -142,7 +142,7 @@ def _read(path: Path) -> list[Trial]:
 
 
 def _finish(
-    options: TortureOptions, title: str, done: Sequence[TrialOutcome], failed: list[TrialOutcome]
+    options: TortureOptions, title: str, done: Collection[TrialOutcome], failed: list[TrialOutcome]
 ) -> None:
     """Write and print the counters and the failures."""
     counts: Counter[str] = Counter()

@@ -15,14 +15,13 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize
 
+from skytether.lab.intervals import students
 from skytether.shared.law.model import Array
 
 STEPS_MIN = 2
 """Smallest number of steps for a fit with intervals."""
-CONFIDENCE = 0.95
-"""Confidence level of the intervals."""
 DEAD_MAX_S = 2.0
 """Longest dead time that a scenario allows [s]."""
 TAU_MIN_S = 1e-3
@@ -221,7 +220,7 @@ def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
     freedom = max(1, samples - count - len(numbers))
     white = inverse * (sum(float(each @ each) for each in left) / freedom)
     variance = np.maximum(np.diag(clustered), np.diag(white))
-    half = stats.t.ppf(0.5 + CONFIDENCE / 2.0, count - 1) * np.sqrt(variance)
+    half = students(count - 1) * np.sqrt(variance)
     return Numbers(*half.tolist())
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skytether.figures.page import blank
 from skytether.lab.identify.fit import GOOD, Fit, binned, differences, unit_response
 from skytether.lab.identify.outcome import AXES, AxisOutcome
 
@@ -18,9 +19,7 @@ WORDS = {True: "sets out", False: "stops"}
 
 def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
     """Steps of each axis over its model, scaled to height 1, and the residuals below."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.2 * len(axes), 5.0), layout="constrained")
+    figure = blank(4.2 * len(axes), 5.0)
     grid = figure.subplots(2, len(axes), squeeze=False, sharex="col", height_ratios=(3, 2))
     for name, axis, (above, below) in zip(AXES, axes, grid.T, strict=False):
         title = f"{name}, steps of {axis.speed:g} m/s"

@@ -1,0 +1,48 @@
+"""Confidence intervals of everything that the laboratory says, at 95 %.
+
+There are two kinds. A mean over independent flights has Student's interval. Anything else that
+follows from a sample of flights (a ratio of means, a rate of growth) has the jackknife's: it asks
+only how much the statistic moves when one flight is left out, and needs no formula of its own. The
+fit of `identify` has the robust interval that goes with least squares, see `lab.identify.fit`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import stats
+
+from skytether.shared.law.model import Array
+
+Estimate = tuple[float | None, float | None]
+"""Mean, and half-width of its 95 % interval; None with too few values."""
+
+
+def students(freedom: int) -> float:
+    """Half-width of a 95 % interval in standard errors, with so many degrees of freedom."""
+    return float(stats.t.ppf(0.975, freedom))
+
+
+def interval(values: Sequence[float]) -> Estimate:
+    """Mean of some values, and half-width of its 95 % interval (Student's t).
+
+    The mean is None without values, the interval with fewer than two.
+    """
+    if not values:
+        return None, None
+    mean, n = float(np.mean(values)), len(values)
+    if n < 2:
+        return mean, None
+    return mean, students(n - 1) * float(np.std(values, ddof=1)) / math.sqrt(n)
+
+
+def jackknife(statistic: Callable[[Array], float], sample: Array) -> tuple[float, float]:
+    """Statistic of a sample, and half-width of its 95 % interval (jackknife, Student's t).
+
+    Args:
+        statistic: function of a sample.
+        sample: an independent row for each flight, at least two; shape (n, …).
+    """
+    n = len(sample)
+    others = np.array([statistic(np.delete(sample, row, axis=0)) for row in range(n)])
+    return statistic(sample), students(n - 1) * math.sqrt((n - 1) * others.var())

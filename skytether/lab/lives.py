@@ -1,0 +1,240 @@
+"""Flights of a mission in virtual time in which processes die and begin anew.
+
+A life is one run of a process. A vehicle outlives its clients, as with an autopilot: without one it
+keeps its last velocity for a while and then rests. What the operator has set outlives the server.
+"""
+
+import io
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skytether.client.endpoint import Client
+from skytether.client.memory import recall
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.sensor import Sensor
+from skytether.client.simulated.vehicle import SimulatedVehicle
+from skytether.client.simulated.weather import Weather
+from skytether.client.vehicle import Measurement
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.change import Running, with_values
+from skytether.shared.core.endpoint import Address, Endpoint
+from skytether.shared.core.events import Event
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.summary import Track, track
+from skytether.shared.wire.protocol import Mode
+from skytether.sim.flight import SERVER
+from skytether.sim.world import Clock, World
+
+NETWORK: Address = ("netem", 0)
+CLOCK = Clock(10**6 * SECOND_NS)
+"""Clock of all hosts: the map of clocks does not depend on what they show."""
+HOLD_NS = SECOND_NS
+"""Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
+
+
+class Body(SimulatedVehicle):
+    """Simulated vehicle that outlives its clients.
+
+    Args:
+        scenario: what is flown.
+        number: number of the vehicle.
+    """
+
+    def __init__(self, scenario: Scenario, number: int) -> None:
+        weather = Weather(scenario, stream(scenario.seed, "wind", number))
+        plant = FirstOrderPlant(scenario, weather, number)
+        super().__init__(scenario.dt_ns, plant, _sensor(scenario, number, 0))
+        self.unflown: list[tuple[float, list[float]]] = []
+        """Times [s; client's clock] and positions [m] of steps without a client."""
+
+    def fly_alone(self, now_ns: int) -> None:
+        """Fly the steps that have begun by now without a client."""
+        told, lost, velocity = list[Measurement](), self._step, self._velocity
+        while lost >= 0 and self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
+            is_held = (self._step - lost) * self._dt_ns < HOLD_NS
+            self.plant.advance(velocity if is_held else 0.0 * velocity)
+            self._step += 1
+            self._measure(told)
+            time_s = (self._began_ns + self._step * self._dt_ns) / SECOND_NS
+            self.unflown.append((time_s, self.plant.state()[:, 0].tolist()))
+
+    def begin_anew(self, sensor: Sensor) -> None:
+        """Rest until a client flies it, which counts steps of its own."""
+        self.sensor, self._step, self._velocity = sensor, -1, 0.0 * self._velocity
+
+
+def _sensor(scenario: Scenario, number: int, life: int) -> Sensor:
+    return Sensor(scenario, stream(scenario.seed, "sensor", number, life))
+
+
+class Life(NamedTuple):
+    """Run of a vehicle's client."""
+
+    client: Client
+    sink: io.BytesIO
+    """Record of its steps."""
+
+
+class Lives:
+    """Mission, and the lives of the processes that fly it.
+
+    Args:
+        scenario: what is flown; a mission.
+        network: endpoint between clients, whose host it is to, and server; that of the scenario
+            unless given.
+        mortal: numbers of vehicles whose clients may die: only these keep what the next life is to
+            find.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        network: Endpoint | None = None,
+        mortal: Collection[int] | None = None,
+    ) -> None:
+        mission = scenario.make_reference()
+        assert isinstance(mission, Mission)
+        self.scenario, self.mission = scenario, mission
+        self.events: list[tuple[float, str, Event]] = []
+        """Time of the world [s], host and event."""
+        self.world = World(self._hear)
+        flows = 2 * len(mission.vehicles)
+        self.world.add(NETWORK[0], network or Proxy(scenario, server=SERVER, flows=flows))
+        self._mortal = mission.vehicles if mortal is None else mortal
+        self._lives: dict[int, list[Life]] = {number: [] for number in mission.vehicles}
+        self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
+        """Vehicles by number."""
+        for number in mission.vehicles:
+            start_ns = int(stream(scenario.seed, "phase", number).integers(scenario.dt_ns))
+            client = self._client(number, remembers=False)
+            self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
+        self._servers = 0
+        self.running: Running | None = None
+        """Server and its scenario, while it is up."""
+        self._settings: Mapping[str, Any] = {}
+        """What was set, as the journal of the server keeps it."""
+        self.world.add(SERVER[0], self._server(scenario), clock=CLOCK)
+
+    def _hear(self, time_ns: int, host: str, event: Event) -> None:
+        self.events.append((time_ns / SECOND_NS, host, event))
+
+    def _server(self, scenario: Scenario) -> Server:
+        """The next life of the server."""
+        self._servers += 1
+        entropy = stream(scenario.seed, "entropy", self._servers).bytes
+        count = len(self.mission.vehicles)
+        self.server = Server(scenario, boot_id=self._servers, entropy=entropy, capacity=count)
+        self.running = Running(self.server, scenario, self._settings)
+        return self.server
+
+    def _client(self, number: int, *, remembers: bool) -> Client:
+        """The next life of a vehicle's client."""
+        lives, before, sink = self._lives[number], None, io.BytesIO()
+        if remembers and (kept := self.world.memory(f"client {number}")):
+            before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
+        client = Client(
+            self.scenario,
+            self.bodies[number],
+            server=NETWORK,
+            vehicle=number,
+            boot_id=number * 1000 + len(lives),
+            recorder=Recorder(client_columns(self.scenario.model.axes), sink),
+            keeps=self._keeps(number),
+            before=before,
+        )
+        lives.append(Life(client, sink))
+        return client
+
+    def _keeps(self, number: int) -> bool:
+        """Whether a vehicle's client keeps anything for its next life."""
+        return number in self._mortal and self.scenario.vehicle.memory != "none"
+
+    # -- what dies and begins anew -----------------------------------------------------------------
+
+    def stop_client(self, number: int) -> None:
+        """End a vehicle's client."""
+        self.world.stop(f"client {number}")
+
+    def start_client(self, number: int, *, remembers: bool = True) -> None:
+        """Begin the next life of a vehicle's client.
+
+        Args:
+            number: number of the vehicle.
+            remembers: whether it finds what the life before has kept.
+        """
+        body, remembers = self.bodies[number], remembers and self._keeps(number)
+        body.fly_alone(CLOCK.local(self.world.now_ns))
+        if not remembers:
+            body.begin_anew(_sensor(self.scenario, number, len(self._lives[number])))
+        self.world.restart(f"client {number}", self._client(number, remembers=remembers))
+
+    def stop_server(self) -> None:
+        """End the server."""
+        if self.running is not None:
+            self._settings, self.running = self.running.settings, None
+        self.world.stop(SERVER[0])
+
+    def start_server(self, changes: Mapping[str, Any], *, remembers: bool = True) -> None:
+        """Begin the next life of the server.
+
+        Args:
+            changes: keys with which it begins, and their values.
+            remembers: whether it takes up what was set in flight before.
+        """
+        if not remembers:
+            self._settings = {}
+        scenario = with_values(with_values(self.scenario, changes), self._settings)
+        self.world.restart(SERVER[0], self._server(scenario))
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Set keys at the server, as an operator; it may refuse them."""
+        if self.running is not None:
+            with suppress(ConfigError):  # the refusal is an event
+                self.world.act(SERVER[0], partial(self.running.change, values))
+
+    # -- what is flown -----------------------------------------------------------------------------
+
+    def track(self, number: int) -> Track:
+        """Track of a vehicle, from its first step on a mission on, through all its lives."""
+        dt_s, scale = self.scenario.control.dt, self.scenario.mission.height_scale
+        tracks: list[Track] = []
+        for client, sink in self._lives[number]:
+            rows = parse(sink.getvalue())
+            if tracks or (rows["mode"] == Mode.TRACK).any():
+                began_s = client.began_ns / SECOND_NS
+                tracks.append(track(rows, began_s, dt_s, scale, whole=bool(tracks)))
+        if not tracks:
+            return np.zeros(0), np.zeros((0, self.scenario.model.axes))
+        body = self.bodies[number]
+        # Whoever has no client, or one that is refused, is where it was left.
+        now = CLOCK.local(self.world.now_ns) / SECOND_NS, body.plant.state()[:, 0].tolist()
+        times, at = (np.array(each) for each in zip(*body.unflown, now, strict=True))
+        at[:, 2:] *= scale
+        since = times > tracks[0][0][0]
+        tracks.append((times[since], at[since]))
+        times, at = (np.concatenate(each) for each in zip(*tracks, strict=True))
+        order = np.argsort(times, kind="stable")
+        return times[order], at[order]
+
+    def tracks(self) -> dict[int, Track]:
+        """Track of every vehicle, by number."""
+        return {number: self.track(number) for number in self._lives}
+
+    def run(self, until_s: float) -> None:
+        """Fly until a time of the world [s]."""
+        self.world.run(lambda: False, limit_ns=seconds_to_ns(until_s))
+
+
+def world_s(time_s: float) -> float:
+    """Time of the world, of one of the hosts' clocks [s]."""
+    return float(time_s) - CLOCK.offset_ns / SECOND_NS
