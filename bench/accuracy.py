@@ -74,7 +74,7 @@ class AccuracyTask:
             changes["reference"] = SATURATED
         # the paper's delays are longer than so short a horizon bridges
         if self.horizon * self.dt_s < 0.5:
-            none = {"delay": "none"}
+            none = "loss(0.1)"
             changes["network"] = {"uplink": none, "downlink": none}
         return derive("paper-every-step", **changes)
 

@@ -191,7 +191,7 @@ class Watched:
 
     def _cut(self, for_ns: int | None) -> None:
         """Make netem lose all packets from now on, for ever or for a while."""
-        loss, both = self.scenario.network.uplink.loss, ("uplink", "downlink")
+        loss, both = self.scenario.uplink.loss, ("uplink", "downlink")
         now_s = self.world.now_ns / SECOND_NS
         changes = [(now_s, {f"network.{way}.loss": 1.0 for way in both})]
         if for_ns is not None:

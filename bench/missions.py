@@ -55,7 +55,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.mission import Mission
-from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
@@ -225,7 +225,7 @@ def fly_mission(
     return MissionFlight(
         seed=scenario.seed,
         vehicles=len(each),
-        network=scenario.network.uplink.text,
+        network=scenario.network.uplink,
         least_m=least,
         clear_m=min(clear_m) if scenario.zones else None,
         late=late,
@@ -524,7 +524,7 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
 def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
     """A flight of a cell."""
     swap = reading.load(options.shape)
-    way = DirectionConfig(impairments=SWAP_NETWORKS[network])
+    way = SWAP_NETWORKS[network]
     reference = msgspec.structs.replace(
         swap.reference, shape=f"{options.shape}({options.vehicles})"
     )

@@ -81,12 +81,11 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     Raises:
         ConfigError: the scenario cannot be flown with it.
     """
-    laid = options.config
+    table = reading.to_table(options.config)
     if not (options.uplink is None and options.downlink is None):
-        directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
-        laid = reading.with_directions(laid, directions)
+        table["network"] |= {"uplink": options.uplink or "", "downlink": options.downlink or ""}
     source = f"{options.scenario} and the command line"
-    return replace(options, config=reading.check(reading.to_table(laid), source))
+    return replace(options, config=reading.check(table, source))
 
 
 def _check_server(server: Address, bind: Address) -> None:

@@ -52,7 +52,7 @@ class Work:
     def __init__(self, plan: Plan) -> None:
         scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
         self.regular = [
-            replace(scenario, control=replace(scenario.control, trigger="periodic", period=period))
+            replace(scenario, control=replace(scenario.control, trigger=f"periodic({period})"))
             for period in PERIODS
         ]
         """Scenarios for the points of the floor."""

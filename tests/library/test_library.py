@@ -129,7 +129,7 @@ def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
     assert dotted == skytether.load(
         skytether.load("demo"), seed=7, control={"trigger": "always"}, network=network
     )
-    assert (dotted.seed, dotted.network.uplink.loss, dotted.control.cost_gap) == (7, 0.25, 0.05)
+    assert (dotted.seed, dotted.uplink.loss) == (7, 0.25)
     start = skytether.load("demo", **{"vehicle.start_m": np.array([1.0, 2.0])})
     assert start.vehicle.start_m == (1.0, 2.0)
 
@@ -306,7 +306,7 @@ def test_a_server_of_ones_own_is_flown() -> None:
 @pytest.mark.long
 def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
     """Sealed, with events from 0 on; it comes back from its file."""
-    at_once = {"network.uplink.delay": "none", "network.downlink.delay": "none"}
+    at_once = {"network.uplink": "loss(0.1)", "network.downlink": "loss(0.1)"}
     flown = skytether.fly("demo", udp=True, secure=True, duration=5, settle=0, **at_once)
     assert (flown.summary.duration_s, flown.summary.secure) == (5.0, True)
     times_ns = [each.time_ns for each in flown.events]
@@ -471,9 +471,9 @@ REFUSALS: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "seeds: got 1 twice, expected seeds that differ",
     ),
     "no grid": (
-        lambda: skytether.sweep("demo", ["control.epsilon"]),  # type: ignore[arg-type]
+        lambda: skytether.sweep("demo", ["control.input_weight"]),  # type: ignore[arg-type]
         TypeError,
-        "grid: got ['control.epsilon'], expected lists of values by their keys",
+        "grid: got ['control.input_weight'], expected lists of values by their keys",
     ),
     "one value of a grid": (
         lambda: skytether.sweep("demo", {"control.trigger": "always"}),
@@ -481,14 +481,14 @@ REFUSALS: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "grid: control.trigger: got 'always', expected a list of values",
     ),
     "no value of a grid": (
-        lambda: skytether.sweep("demo", {"control.epsilon": []}),
+        lambda: skytether.sweep("demo", {"control.input_weight": []}),
         skytether.ConfigError,
-        "grid: control.epsilon: got no values, expected at least one",
+        "grid: control.input_weight: got no values, expected at least one",
     ),
     "a value of a grid twice": (
-        lambda: skytether.sweep("demo", {"control.epsilon": [1.0, 1]}),
+        lambda: skytether.sweep("demo", {"control.input_weight": [1.0, 1]}),
         skytether.ConfigError,
-        "grid: control.epsilon: got 1.0 twice, expected values that differ",
+        "grid: control.input_weight: got 1.0 twice, expected values that differ",
     ),
     "a grid of seeds": (
         lambda: skytether.sweep("demo", {"seed": [1, 2]}),
@@ -496,9 +496,9 @@ REFUSALS: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "grid: got 'seed', expected another key: it counts the runs",
     ),
     "a combination that cannot be": (
-        lambda: skytether.sweep("demo", {"control.epsilom": [1]}),
+        lambda: skytether.sweep("demo", {"control.horizom": [1]}),
         skytether.ConfigError,
-        "demo with control.epsilom=1: control.epsilom: no such key; did you mean epsilon?",
+        "demo with control.horizom=1: control.horizom: no such key; did you mean horizon?",
     ),
     "no runs": (
         lambda: skytether.sweep("demo", {}, runs=0),

@@ -14,7 +14,7 @@ from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.reading import files_of
 from skytether.shared.telemetry.record import UPLINK
 
 Packet = tuple[int, int, int]
@@ -23,7 +23,7 @@ Packet = tuple[int, int, int]
 
 def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[int]]:
     """Times at which packets have passed by number [ns], and the numbers of those dropped."""
-    queue = path(text).queue
+    queue = path(text, files_of("network.uplink", text)).queue
     assert queue is not None
     bottleneck: Bottleneck[int] = Bottleneck(queue)
     out: dict[int, int] = {}
@@ -131,7 +131,9 @@ def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
     assert [out[number] // ms for number in range(5)] == [10, 10, 30, 40, 50]
     out, _ = passed(text, [(0, 752, 0)] * 4 + [(35 * ms, 100, 0), (60 * ms, 1504, 0)])
     assert [out[number] // ms for number in range(6)] == [10, 10, 10, 10, 40, 70]
-    assert path(text).queue.bytes_per_s == 4 * 1504 / 0.04  # type: ignore[union-attr]
+    queue = path(text, files_of("network.uplink", text)).queue
+    assert queue is not None
+    assert queue.bytes_per_s == 4 * 1504 / 0.04
 
 
 @given(
@@ -160,9 +162,9 @@ def test_every_packet_passes_once_or_is_dropped(
 
 def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
     """A packet lost on the air has used it; one that waits is no earlier for that."""
-    direction = DirectionConfig(impairments="loss(1) & constant(0.1) & rate(12800)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+    direction = "loss(1) & constant(0.1) & rate(12800)"
+    link = Link(UPLINK, 1472, None, path(direction))
+    lane = Lane(0, Fates(path(direction), 1, "uplink", 0), 0)
     for _ in range(3):
         link.take(Datagram(b"x" * (128 - HEADER_BYTES), ("a", 1)), lane, now_ns=0)
     assert link.next_due_ns() == 10 * MILLISECOND_NS
@@ -172,9 +174,9 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
 
 def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
     """Both count, but for the packet that is served; what waits counts with its header."""
-    direction = DirectionConfig(impairments="constant(0.1) & rate(12800)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane, size = Lane(0, Fates(direction, 1, "uplink", 0), 0), 128 - HEADER_BYTES
+    direction = "constant(0.1) & rate(12800)"
+    link = Link(UPLINK, 1472, None, path(direction))
+    lane, size = Lane(0, Fates(path(direction), 1, "uplink", 0), 0), 128 - HEADER_BYTES
     for _ in range(5):
         link.take(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)
     assert (link.depth(), link.depth_bytes()) == (4, 4 * 128)
@@ -187,9 +189,9 @@ def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
 def test_a_rate_that_changes_serves_those_who_wait() -> None:
     """Under the new one; without one they are under way at once."""
     for text, due_ms in (("rate(100000)", 40), ("constant(0)", 20)):
-        slow = DirectionConfig(impairments="rate(10000)")
-        link = Link(UPLINK, 1472, None, slow.path)
-        lane = Lane(0, Fates(slow, 1, "uplink", 0), 0)
+        slow = "rate(10000)"
+        link = Link(UPLINK, 1472, None, path(slow))
+        lane = Lane(0, Fates(path(slow), 1, "uplink", 0), 0)
         for _ in range(20):
             link.take(Datagram(b"x" * 72, ("a", 1)), lane, now_ns=0)
         link.give(now_ns=20 * MILLISECOND_NS)
@@ -204,9 +206,9 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
 def test_ordered_lets_nobody_overtake() -> None:
     """Packets of one flow keep their order; without `ordered` the same packets do not."""
     for text, reordered in (("uniform(0, 0.1)", True), ("uniform(0, 0.1) & ordered", False)):
-        direction = DirectionConfig(impairments=text)
-        link = Link(UPLINK, 1472, None, direction.path)
-        lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+        direction = text
+        link = Link(UPLINK, 1472, None, path(direction))
+        lane = Lane(0, Fates(path(direction), 1, "uplink", 0), 0)
         for number in range(200):
             now_ns = number * 5 * MILLISECOND_NS
             link.give(now_ns=now_ns)
@@ -218,9 +220,9 @@ def test_ordered_lets_nobody_overtake() -> None:
 
 def test_copies_and_flipped_bits() -> None:
     """A copy comes right after its packet; exactly one bit differs."""
-    direction = DirectionConfig(impairments="duplicate(1) & corrupt(1)")
-    link = Link(UPLINK, 1472, None, direction.path)
-    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
+    direction = "duplicate(1) & corrupt(1)"
+    link = Link(UPLINK, 1472, None, path(direction))
+    lane = Lane(0, Fates(path(direction), 1, "uplink", 0), 0)
     for number in range(50):
         link.take(Datagram(bytes(20), ("a", 1)), lane, now_ns=number * MILLISECOND_NS)
     out = [datagram.payload for datagram in link.give(now_ns=SECOND_NS)]

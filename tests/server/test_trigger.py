@@ -30,11 +30,8 @@ quick = settings(max_examples=60, deadline=None)
 
 CONTROL = ControlConfig(
     scheme="committed",
-    trigger="state_gap",
+    trigger="state_gap(3, 2)",
     dt=0.1,
-    epsilon=3.0,
-    decay_rate=2.0,
-    cost_gap=1.0,
     terminal_weight=(50.0, 8.0),
 )
 ROW = np.array([0])
@@ -105,9 +102,7 @@ def test_threshold_decays_per_second() -> None:
 
 
 def test_threshold_depends_on_time_and_not_on_how_it_is_cut() -> None:
-    fine = ControlConfig(
-        trigger="state_gap", dt=0.05, epsilon=3.0, decay_rate=2.0, terminal_weight=(50.0, 8.0)
-    )
+    fine = ControlConfig(trigger="state_gap(3, 2)", dt=0.05, terminal_weight=(50.0, 8.0))
     one = ask(after_event(20, 10.0), 25, 0.0).threshold
     other = ask(after_event(20, 10.0, fine), 30, 0.0).threshold
     assert one == pytest.approx(other, rel=1e-12)
@@ -130,7 +125,7 @@ def test_threshold_is_the_tolerance_long_after() -> None:
 
 def test_first_step_is_an_event_however_small_the_error() -> None:
     """E18: the vehicle has nothing to fly yet."""
-    verdict = ask(trigger_of("state_gap"), 0, 0.0, fresh=True)
+    verdict = ask(trigger_of("state_gap(3)"), 0, 0.0, fresh=True)
     assert (verdict.event.tolist(), verdict.figure.tolist()) == ([True], [0.0])
     assert verdict.threshold.tolist() == [3.0]
 
@@ -173,8 +168,7 @@ def test_faster_decay_means_a_lower_threshold(
 ) -> None:
     """Fig. 5: more λ, more events."""
     slow, fast = (
-        ControlConfig(trigger="state_gap", dt=0.1, epsilon=3.0, decay_rate=decay)
-        for decay in (rate, rate + more)
+        ControlConfig(trigger=f"state_gap(3, {decay!r})", dt=0.1) for decay in (rate, rate + more)
     )
     low = ask(after_event(0, error, fast), steps, 0.0).threshold[0]
     high = ask(after_event(0, error, slow), steps, 0.0).threshold[0]
@@ -190,7 +184,7 @@ def test_more_tolerance_means_a_higher_threshold(
     """Fig. 5: more ε, fewer events; S rises by just as much."""
     low, high = (
         ask(
-            after_event(0, error, ControlConfig(trigger="state_gap", epsilon=tolerance)),
+            after_event(0, error, ControlConfig(trigger=f"state_gap({tolerance!r})")),
             steps,
             0.0,
         ).threshold[0]
@@ -397,12 +391,11 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_fires_above_the_threshold() -> None:
-    for text in ("cost_gap(1)", "cost_gap"):
-        trigger = trigger_of(text)
-        assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
-        for gap, event in ((1.0, False), (1.1, True)):
-            verdict = trigger.test(facing(ROW, figures_of(cost_gap=gap)))
-            assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [gap], [1.0])
+    trigger = trigger_of("cost_gap(1)")
+    assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
+    for gap, event in ((1.0, False), (1.1, True)):
+        verdict = trigger.test(facing(ROW, figures_of(cost_gap=gap)))
+        assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [gap], [1.0])
 
 
 def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> None:
@@ -463,19 +456,18 @@ def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) 
 
 
 def test_scenario_names_its_trigger() -> None:
-    control = ControlConfig(period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0)
     thresholds = {
-        "state_gap": 2.0,
-        "cost_gap": 7.0,
-        "deviation": 8.0,
+        "state_gap(2, 0)": 2.0,
+        "cost_gap(7)": 7.0,
+        "deviation(8)": 8.0,
         "always": 0.0,
-        "periodic": 0.0,
+        "periodic(4)": 0.0,
     }
-    for name, threshold in thresholds.items():
-        trigger = make_trigger(msgspec.structs.replace(control, trigger=name), 1)
+    for text, threshold in thresholds.items():
+        trigger = make_trigger(ControlConfig(trigger=text), 1)
         verdict = trigger.test(facing(ROW, figures_of()))
         assert verdict.threshold.tolist() == [threshold]
-        if name == "periodic":
+        if text == "periodic(4)":
             assert events(trigger, 0, 9) == [0, 4, 8]
 
 

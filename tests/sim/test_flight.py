@@ -33,8 +33,8 @@ def summary(flown: Scenario, flight: Record) -> Summary:
 
 
 QUIET = {
-    "uplink": {"delay": "none", "loss": 0.0},
-    "downlink": {"delay": "none", "loss": 0.0},
+    "uplink": "",
+    "downlink": "",
 }
 """A network that does nothing."""
 
@@ -134,7 +134,10 @@ def test_the_summary_counts_what_the_network_saw() -> None:
 def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
     """Packets that enter at one time meet one fate, for any contender and earlier traffic."""
     met: list[dict[tuple[int, int], tuple[int, bool]]] = []
-    bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
+    bursts = {
+        "uplink": "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 0.5)",
+        "downlink": "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 0.5)",
+    }
     for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
         control = {"trigger": trigger, "scheme": scheme}
         rows = fly(packaged("paper", duration=20.0, control=control, network=bursts)).netem
@@ -232,7 +235,7 @@ def test_two_vehicles_share_one_server() -> None:
 
 def test_a_network_that_loses_everything_is_no_flight() -> None:
     """The client gives up, and says why."""
-    lost = QUIET | {"uplink": {"delay": "none", "loss": 1.0}}
+    lost = QUIET | {"uplink": "loss(1.0)"}
     flight = fly(packaged("paper", settle=0.0, network=lost))
     assert flight.failure == NoAnswer(vehicle=1, host="netem 1", port=0, waited_s=121.0)
     assert len(flight.client) == 0
@@ -241,8 +244,8 @@ def test_a_network_that_loses_everything_is_no_flight() -> None:
 def test_a_flight_keeps_what_everybody_said() -> None:
     """In the order of time, each with its host; names and numbers are the flight's own."""
     lossless = {
-        "uplink": {"delay": "none", "loss": 0.0},
-        "downlink": {"delay": "none", "loss": 0.0},
+        "uplink": "",
+        "downlink": "",
     }
     flown = packaged("paper", duration=2.0, settle=0.0, seed=7, network=lossless)
     events = fly(flown, vehicles=2).events
@@ -296,7 +299,7 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
 
 def test_what_is_never_flown_costs_no_packets() -> None:
     """Over a round trip of 1.6 s the last 1.3 s of a plan are too old before their turn comes."""
-    slow = {"minimum_s": 0.76}
+    slow = "paper(0.76, 0.02, 2.0) & loss(0.1)"
     long = packaged("demo-committed", duration=30.0, network={"uplink": slow, "downlink": slow})
     assert long.link.age_max_s == 5.0
     found = [summary(long, flight) for flight in fly_batch(long, range(1, 7))]

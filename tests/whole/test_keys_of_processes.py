@@ -20,8 +20,7 @@ from warm import Command, skytether
 
 PATIENCE_S = 60.0
 QUICK = [
-    *("--network.uplink.delay", "none", "--network.downlink.delay", "none", "--settle", "0"),
-    *("--network.uplink.loss", "0", "--network.downlink.loss", "0"),
+    *("--network.uplink", "none", "--network.downlink", "none", "--settle", "0"),
 ]
 """A network that does nothing."""
 SECRET = "6f" * 32

@@ -166,8 +166,7 @@ def _samples(
         plan = table.first()
         scenario = plan.scenario_of(table.here, EVENT if method == PERIODIC else method)
         if method == PERIODIC:
-            keys = {"trigger": "periodic", "period": steps}
-            control = msgspec.structs.replace(scenario.control, **keys)
+            control = msgspec.structs.replace(scenario.control, trigger=f"periodic({steps})")
             scenario = msgspec.structs.replace(scenario, control=control)
         file = out / "samples" / f"{method.replace(' ', '-')}.npz"
         if not file.exists():
