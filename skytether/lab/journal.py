@@ -19,7 +19,7 @@ import msgspec
 from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.dotted import flat
-from skytether.shared.scenario.schema import TABLES, Scenario
+from skytether.shared.scenario.schema import Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
 
@@ -43,8 +43,6 @@ class Journal(Generic[E]):
     def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[E]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self.files: Mapping[str, str] = settings.get("files", {})
-        """Digest of every file that the entries depend on, by its path."""
         self.entries: list[E] = []
         """Finished entries, in order."""
         self._file = files.appending(folder / ENTRIES)
@@ -112,10 +110,10 @@ def sealed(content: bytes) -> bytes:
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
     """Digests of all files and plug-ins that some scenarios name, as a part of the settings."""
-    files = {each.reference.file for each in scenarios if each.reference.shape in TABLES}
+    files = {file.name: digest(file.content) for each in scenarios for file in each.files}
     entries = (entry for each in scenarios for entry in each.entries())
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
-    return plugged | {file: digest(Path(file).read_bytes()) for file in sorted(files)}
+    return plugged | dict(sorted(files.items()))
 
 
 def digest(content: bytes) -> str:

@@ -28,15 +28,12 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from msgspec.structs import replace
 
 import skytether.lab.sweep
-from skytether.lab.journal import Journal, digest
-from skytether.lab.search import Generation, Search, SearchPoint, Values, best
+from skytether.lab.journal import Journal
+from skytether.lab.search import Generation, Search, SearchPoint, best
 from skytether.lab.sweep import Done, FlightTask, Results, Sweep
-from skytether.shared.base import files, kernel
-from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.schema import TABLES, Scenario
+from skytether.shared.base import kernel
 from skytether.shell import command, plugins, temporary, terminal
 from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
@@ -134,7 +131,6 @@ class Crew:
 
         Raises:
             CommandError: interrupted, or a worker has died.
-            ConfigError: the trajectory's file has changed since the sweep began.
         """
         todo = plan.todo(skytether.lab.sweep.results(journal.entries))
         before = plan.flights - sum(len(task.seeds) for task in todo)
@@ -148,7 +144,7 @@ class Crew:
             self.spent.runs += len(done.runs)
             self.advance(len(done.runs), text)
 
-        self.share(partial(work, pins=journal.files), todo, keep)
+        self.share(work, todo, keep)
 
     def flown(self, plan: Sweep, folder: Path, text: str) -> Results:
         """All results of a sweep, after flying the missing tasks; see `fly`.
@@ -170,17 +166,10 @@ class Crew:
 
         Raises:
             CommandError: interrupted, or a worker has died.
-            ConfigError: the journal is another search's, or the trajectory's file has changed since
-                the search began.
+            ConfigError: the journal is another search's.
         """
-
-        def fly_all(
-            fly: Callable[[Scenario], Values], proposed: Sequence[Scenario]
-        ) -> Sequence[Values]:
-            return self.map(partial(_fly_point, fly, journal.files), proposed)
-
         points: list[SearchPoint] = []
-        for points in search.points(journal, generations, fly_all):
+        for points in search.points(journal, generations, self.map):
             self.advance(1, f"{text}best {best(points).score:.4f}")
         return points
 
@@ -324,51 +313,12 @@ def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) 
     return function(item)
 
 
-def work(task: FlightTask, pins: Mapping[str, str]) -> tuple[Done, float]:
-    """Result of a task, and its CPU time [s]; called in a worker.
-
-    Args:
-        pins: see `pinned`.
-    """
+def work(task: FlightTask) -> tuple[Done, float]:
+    """Result of a task, and its CPU time [s]; called in a worker."""
     kernel.load()
     began_s = time.thread_time()
-    with pinned(task.scenario, pins) as scenario:
-        done = skytether.lab.sweep.fly(replace(task, scenario=scenario))
+    done = skytether.lab.sweep.fly(task)
     return done, time.thread_time() - began_s
-
-
-def _fly_point(
-    fly: Callable[[Scenario], Values], pins: Mapping[str, str], scenario: Scenario
-) -> Values:
-    """Figures of a point of a search; called in a worker."""
-    with pinned(scenario, pins) as flown:
-        return fly(flown)
-
-
-@contextmanager
-def pinned(scenario: Scenario, pins: Mapping[str, str]) -> Iterator[Scenario]:
-    """Scenario that refers to a copy of its trajectory's file, so that later edits have no effect.
-
-    Args:
-        pins: expected digest of each file, by its path; other files are not copied.
-
-    Raises:
-        ConfigError: the file has changed since the work began, or differs on this machine.
-    """
-    reference = scenario.reference
-    if reference.shape not in TABLES or reference.file not in pins:
-        yield scenario
-        return
-    content, expected = Path(reference.file).read_bytes(), pins[reference.file]
-    if digest(content) != expected:
-        raise ConfigError(
-            f"{reference.file}: got the content {digest(content)}, expected {expected}, "
-            "with which the work began; or another --out"
-        )
-    with temporary.folder() as folder:
-        copy = folder / "trajectory.csv"
-        files.write(copy, content)
-        yield replace(scenario, reference=replace(reference, file=str(copy)))
 
 
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:
