@@ -60,8 +60,8 @@ CLOCK_BEGIN_NS, CLOCK_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Time between two questions for the autopilot's clock [ns]: before it is known, and then."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a pilot that says nothing is gone [ns]: then nothing is sent either."""
-SETPOINTS_MAX_HZ = 50.0
-"""Largest number of setpoints in a second."""
+SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
+"""Least and largest number of setpoints in a second."""
 LOOK_NS = 300 * MILLISECOND_NS
 """Time after a pause of setpoints from which on a heartbeat tells of now [ns]: those before it may
 have waited for us in a queue."""
@@ -186,7 +186,7 @@ class Port(Endpoint):
         self._looks_ns: int | None = None
         """Time since which setpoints wait for the mode to be heard, after a pause; else None."""
         each = scenario.dt_ns
-        parts = -(-each * keys.setpoints_hz // SECOND_NS)
+        parts = -(-each * SETPOINTS_MIN_HZ // SECOND_NS)
         self._repeat_ns = round(LATE * each / parts)
         self._was_armed = False
         """Whether a life of the client has armed it since a person last said that it may be."""

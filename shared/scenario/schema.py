@@ -353,8 +353,6 @@ class MavlinkConfig(Section, frozen=True):
     """Number of our own component in MAVLink; 191 is that of an onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
     """Number of the autopilot's system; 0: the first that is heard."""
-    setpoints_hz: OfVehicle[Annotated[int, Meta(ge=10, le=50)]] = 20
-    """Least number of velocity setpoints a second; there are 50 at most."""
     positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
     """Number of positions a second that the autopilot is asked for."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
