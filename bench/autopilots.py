@@ -209,7 +209,7 @@ def fly_cell(cell: Cell) -> FlownCell:
     both = ("uplink", "downlink")
     changes = [
         (began_s + CUT_S, {f"network.{way}.loss": 1.0 for way in both}),
-        (began_s + HEALED_S, {f"network.{way}.loss": scenario.network.uplink.loss for way in both}),
+        (began_s + HEALED_S, {f"network.{way}.loss": scenario.uplink.loss for way in both}),
     ]
     cut = fly(scenario, law, cell.flavour, changes)
     return judged(cell, scenario, whole, cut)

@@ -131,7 +131,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
     elif case.startswith("link cut"):
         losses = [(fault_s, 1.0)]
         if end_s is not None:
-            losses.append((end_s, scenario.network.uplink.loss))
+            losses.append((end_s, scenario.uplink.loss))
         changes += [
             (time_s, {f"network.{way}.loss": loss for way in ("uplink", "downlink")})
             for time_s, loss in losses

@@ -53,7 +53,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
 from skytether.shared.scenario import reading, zones
 from skytether.shared.scenario.mission import Mission
-from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
@@ -226,7 +226,7 @@ def fly_mission(
     return MissionFlight(
         seed=scenario.seed,
         vehicles=len(each),
-        network=scenario.network.uplink.text,
+        network=scenario.network.uplink,
         least_m=least,
         clear_m=min(clear_m) if scenario.zones else None,
         late=late,
@@ -477,7 +477,7 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
 def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
     """A flight of a cell."""
     swap = reading.load(options.shape)
-    way = DirectionConfig(impairments=SWAP_NETWORKS[network])
+    way = SWAP_NETWORKS[network]
     reference = msgspec.structs.replace(
         swap.reference, shape=f"{options.shape}({options.vehicles})"
     )

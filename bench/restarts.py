@@ -156,7 +156,7 @@ class RestartVerdict:
 
 def scenario() -> Scenario:
     """`demo-committed` in still air, on a network of our own, with a time-out of 1 s."""
-    way = {"delay": "poisson", "minimum_s": 0.03, "slot_s": 0.005, "slots_mean": 1.0, "loss": 0.05}
+    way = "paper(0.03, 0.005, 1.0) & loss(0.05)"
     return derive(
         "demo-committed",
         duration=7200.0,

@@ -8,7 +8,7 @@ from skytether.client.simulated import vehicle as computed
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario import policies
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
 
@@ -44,11 +44,10 @@ def make(scenario: Scenario, number: int) -> Vehicle:
         ConfigError: the kind is unknown, or the vehicle cannot be made.
     """
     try:
-        named = policies.shape(scenario.vehicle.kind, VEHICLES)
-    except policies.PolicyError as error:
+        named = VEHICLES.one(scenario.vehicle.kind)
+    except GrammarError as error:
         raise ConfigError(f"vehicle.kind: got {error.given!r}, expected {error.expected}") from None
-    entry = VEHICLES[named.name]
-    made: Vehicle = entry.make(scenario, number, *entry.numbers(named.values, scenario.vehicle))
+    made: Vehicle = VEHICLES[named.name].make(scenario, number, *named.values)
     if scenario.vehicle.on_loss == "return" and not made.returns:
         expected = f"'land' with vehicle.kind = {named.name!r}, which cannot return by itself"
         raise ConfigError(f"vehicle.on_loss: got 'return', expected {expected}")

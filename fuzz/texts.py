@@ -18,10 +18,11 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
-from skytether.shared.scenario import contradictions, mission, policies, reading, reference, zones
+from skytether.shared.scenario import contradictions, grammar, mission, reading, reference, zones
 from skytether.shared.scenario.air import traces
-from skytether.shared.scenario.policies import PolicyError
-from skytether.shared.scenario.registry import REFERENCES, TRIGGERS
+from skytether.shared.scenario.dotted import value
+from skytether.shared.scenario.grammar import GrammarError
+from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, File
 from skytether.shared.wire import handshake, keys
 from skytether.shared.wire.protocol import Hello, Welcome, decode, encode
 from skytether.shell import log
@@ -71,7 +72,7 @@ class ScenarioFile(Text):
     code = (
         reading,
         contradictions,
-        policies,
+        grammar,
         reference,
         toml,
         importlib.import_module("tomllib._parser"),
@@ -140,19 +141,21 @@ class NamedFiles(Text):
     def __call__(self, payload: bytes) -> None:
         """Read the file."""
         self._path.write_bytes(payload[1:])
-        with suppress(ConfigError, PolicyError, ValueError):
+        with suppress(ConfigError, GrammarError, ValueError):
             match (payload or b"\0")[0] % 6:
                 case 0:
                     assert np.isfinite(reference.from_csv(payload[1:], 2)(SAMPLES_S)).all()
                 case 1:
                     mission.mission(payload[1:], 2).nearest(1.0, 1.0)
                 case 2:
-                    zones.parse(f'geojson("{self._path}")', 2).clearance(np.zeros((2, 2)))
+                    file = File("it", payload[1:])
+                    zones.parse("geojson(it)", 2, (file,)).clearance(np.zeros((2, 2)))
                 case 3:
-                    found = traces._recorded.__wrapped__(str(self._path), "auto")
+                    found = traces.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
                     assert np.isfinite(found.delay_s[~found.lost]).all()
                 case 4:
-                    assert np.isfinite(traces._deliveries.__wrapped__(str(self._path))).all()
+                    times_s = traces.deliveries_in.__wrapped__(File("it", payload[1:]))
+                    assert np.isfinite(times_s).all()
                 case _:
                     keys.parse("it", payload[1:])
 
@@ -160,14 +163,14 @@ class NamedFiles(Text):
 class ControlTarget(Text, EndpointInFlight):
     """Target for control requests: each is answered, and the changed scenario can be flown."""
 
-    code = (change, reading, contradictions, policies)
+    code = (change, reading, contradictions, grammar)
     largest = REQUEST_BYTES_MAX + 1
 
     def __init__(self) -> None:
         EndpointInFlight.__init__(self, LIVE)
         tables = [reading.to_table(each) for each in (LIVE, *SCENARIOS)]
         values = [
-            {key: change._at(table, key)}
+            {key: value(table, key)}
             for table in tables
             for running in self._running
             for key in sorted(running.changeable)
@@ -201,7 +204,7 @@ class LogLines(Text):
         own = {type(each.event): each.event for each in flown().events}
         events = *own.values(), Counted(figures={"missed": 3, "dropped": {"late": 2}})
         lines = [LogLine(process="client", time_ns=5, event=event) for event in events]
-        answers = Answer(refused="no such key"), Answer(values={"network.uplink.loss": 0.1})
+        answers = Answer(refused="no such key"), Answer(values={"network.uplink": "loss(0.1)"})
         super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
 
     def __call__(self, payload: bytes) -> None:

@@ -80,12 +80,11 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     Raises:
         ConfigError: the scenario cannot be flown with it.
     """
-    config = options.config
+    table = reading.to_table(options.config)
     if not (options.uplink is None and options.downlink is None):
-        directions = {"uplink": options.uplink or "none", "downlink": options.downlink or "none"}
-        config = reading.with_directions(config, directions)
+        table["network"] |= {"uplink": options.uplink or "", "downlink": options.downlink or ""}
     source = f"{options.scenario} and the command line"
-    return replace(options, config=reading.check(reading.to_table(config), source))
+    return replace(options, config=reading.check(table, source))
 
 
 def _check_server(server: Address, bind: Address) -> None:

@@ -18,8 +18,8 @@ from dataclasses import replace
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario.air.draws import Draws, Fate, Stream
 from skytether.shared.scenario.air.impairment import Impairment
+from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.registry import IMPAIRMENTS
-from skytether.shared.scenario.schema import DirectionConfig
 
 DELAY_MAX_NS = 86_400 * SECOND_NS
 """Largest delay that a plug-in may set [ns]."""
@@ -37,7 +37,7 @@ class Fates:
         flow: number of the flow.
     """
 
-    def __init__(self, direction: DirectionConfig, seed: int, name: str, flow: int) -> None:
+    def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
         at = seed, name, flow
         packets = Stream(*at, "packets")
         self._impairments: list[tuple[Impairment, Draws]] = []
@@ -46,7 +46,7 @@ class Fates:
         self._guarded = False
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
-        for name_, each in direction.path.impairments:
+        for name_, each in direction.impairments:
             kinds[each.kind] += 1
             names[name_] += 1
             # The first delay and the first loss use fixed streams, so that their numbers do not

@@ -182,7 +182,7 @@ class Link:
         self._bytes = 0
         """UDP payload in the queue [B]."""
         self._entered = 0
-        self._path = path or Path(())
+        self._path = path or Path()
         self._is_ordered = self._path.is_ordered
         self._bottleneck = _bottleneck(self._path)
         self.counts = Counts()

@@ -27,7 +27,7 @@ from skytether.shared.core.endpoint import (
 from skytether.shared.core.events import Fault, FlowOpened, Returned
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
@@ -63,9 +63,8 @@ class Proxy(Endpoint):
         self._scenario = scenario
         self._server = server
         mtu = scenario.network.mtu
-        network = scenario.network
-        self.uplink = Link(UPLINK, mtu, recorder, network.uplink.path)
-        self.downlink = Link(DOWNLINK, mtu, recorder, network.downlink.path)
+        self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink)
+        self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink)
         self._places = Places(flows)
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
@@ -188,7 +187,7 @@ class Proxy(Endpoint):
             self._passed.popitem(last=False)
 
     def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
-        direction: DirectionConfig = getattr(self._scenario.network, name)
+        direction = getattr(self._scenario, name)
         return Fates(direction, self._scenario.seed, name, flow)
 
     def change(
@@ -200,8 +199,8 @@ class Proxy(Endpoint):
     ) -> None:
         """See `Endpoint`; queued packets keep their fate."""
         self._scenario = scenario
-        self.uplink.change(scenario.network.uplink.path, now_ns=now_ns)
-        self.downlink.change(scenario.network.downlink.path, now_ns=now_ns)
+        self.uplink.change(scenario.uplink, now_ns=now_ns)
+        self.downlink.change(scenario.downlink, now_ns=now_ns)
         for flow in self._by_socket.values():
             flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)

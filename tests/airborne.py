@@ -43,7 +43,7 @@ FIGURE = {
     "period_s": 30.0,
     "altitude_m": 2.0,
 }
-NONE = {"delay": "none", "loss": 0.0}
+NONE = ""
 
 
 def documented() -> str:

@@ -14,7 +14,8 @@ from skytether.server.sessions import Session
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
 from skytether.shared.scenario.air.draws import SLOT_NS
-from skytether.shared.scenario.schema import DirectionConfig, LinkConfig
+from skytether.shared.scenario.air.path import path
+from skytether.shared.scenario.schema import LinkConfig
 
 STEP_NS = 50 * MILLISECOND_NS
 """Length of a step of both ends [ns]; the server's steps begin half a step later."""
@@ -33,7 +34,7 @@ class Alive(NamedTuple):
     """Heartbeats of the vehicle."""
 
 
-def keep(network: DirectionConfig, sessions: int, link: LinkConfig | None = None) -> Alive:
+def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
     """Keep an idle link alive for a number of sessions, and cut it at the end of each."""
     kept = [_session(network, link or LinkConfig(), seed) for seed in range(1, sessions + 1)]
     false, noticed_s, packets = zip(*kept, strict=True)
@@ -41,10 +42,10 @@ def keep(network: DirectionConfig, sessions: int, link: LinkConfig | None = None
     return Alive(sum(false) * 3600.0 / length_s, list(noticed_s), sum(packets) / length_s)
 
 
-def _session(network: DirectionConfig, link: LinkConfig, seed: int) -> tuple[int, float, int]:
+def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int]:
     """False losses of one session, how soon its end was noticed [s], and packets of the vehicle."""
     timeout_ns, end_ns = seconds_to_ns(link.timeout_s), SESSION_S * SECOND_NS
-    up, down = (Fates(network, seed, name, 0) for name in ("uplink", "downlink"))
+    up, down = (Fates(path(network), seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, link.fixed_ns)
     failsafe = Failsafe(
         TABLE,

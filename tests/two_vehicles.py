@@ -25,12 +25,15 @@ from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observati
 DT_S = 0.05
 
 
-def scenario(vehicles: int, loss: float = 0.1, duration: float = 60.0, **keys: Any) -> Scenario:
+def scenario(
+    vehicles: int, losses: float | str = 0.1, duration: float = 60.0, seed: int = 1
+) -> Scenario:
     table = reading.to_table(reading.load("swap"))
-    table |= {"duration": duration, "seed": keys.pop("seed", 1)}
+    table |= {"duration": duration, "seed": seed}
+    lost = losses if isinstance(losses, str) else f"loss({losses})"
     table["reference"]["shape"] = f"swap({vehicles})"
     for way in ("uplink", "downlink"):
-        table["network"][way] |= {"loss": loss, **keys}
+        table["network"][way] = f"paper(0.4, 0.02, 2.0) & {lost}"
     return reading.check(table, "swap")
 
 

@@ -63,8 +63,8 @@ CLOCK_SILENT_NS = 10 * SECOND_NS
 """Time without an answer about the clock after which that is reported [ns]."""
 UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a silent pilot counts as gone [ns]; then no set-point is sent."""
-SETPOINTS_MAX_HZ = 50.0
-"""Largest number of set-points in a second."""
+SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
+"""Least and largest number of set-points in a second."""
 CURRENT_NS = 300 * MILLISECOND_NS
 """Time after a pause of set-points from which on a heartbeat counts as current [ns]: earlier ones
 may have waited in a queue."""
@@ -190,7 +190,7 @@ class Port(Endpoint):
         """Time since which, after a pause, set-points wait for a current mode; None if they do
         not."""
         step_ns = scenario.dt_ns
-        parts = -(-step_ns * keys.setpoints_hz // SECOND_NS)
+        parts = -(-step_ns * SETPOINTS_MIN_HZ // SECOND_NS)
         self._repeat_ns = round(LATE * step_ns / parts)
         self._was_armed = False
         """Whether a run of the client has armed it since an operator last allowed arming."""

@@ -32,13 +32,13 @@ def make(fleet: Fleet) -> Scheme:
         ConfigError: a plug-in's scheme cannot be made.
     """
     text = fleet.scenario.control.scheme
-    entry, numbers = schemes.entry(text)
-    if entry.is_ours:
+    call = schemes.call(text)
+    if SCHEMES[call.name].is_ours:
         made: Scheme = OURS[text].make(fleet)
         return made
     other = InputScheme if fleet.terms.splines else SplineScheme
     try:
-        inner = entry.make(fleet, *entry.numbers(numbers, fleet.scenario.control))
+        inner = SCHEMES.made(call, (), fleet)
         if isinstance(inner, other):
             raise TypeError(f"flown as {fleet.terms.scheme!r}, it is no {other.__name__}")
         return GuardedScheme(text, inner, fleet)

@@ -20,14 +20,12 @@ from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.dotted import lay, value, whole
 from skytether.shared.scenario.owners import InFlight
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.schema import Scenario
 
 REQUEST_BYTES_MAX = 4096
 """Largest size of a request [B]."""
-WHOLE = "impairments"
-"""Key for all impairments of a direction of the network; the direction itself may be used
-instead."""
 ONCE = keys_of(InFlight.LEAP)
 """Keys of one-time decisions, which no later run of the process repeats."""
 KEY_SHOWN_MAX = 60
@@ -90,7 +88,8 @@ class Running:
         """
         before = reading.to_table(self._scenario)
         try:
-            scenario = self._checked(values, before)
+            values = self._whole(values)
+            scenario = with_values(self._scenario, values)
             if objection := self._endpoint.objection(scenario, frozenset(values)):
                 raise ConfigError(objection)
         except ConfigError as error:
@@ -105,8 +104,8 @@ class Running:
         changed = tuple(
             Changed(key=key, before=before_text, after=after_text)
             for key in values
-            if (before_text := _text(_shown(_at(before, key))))
-            != (after_text := _text(_shown(_at(after, key))))
+            if (before_text := _text(value(before, key)))
+            != (after_text := _text(value(after, key)))
         )
         for event in changed:
             self._endpoint.tell(event)
@@ -135,7 +134,7 @@ class Running:
             return self._refusal("got no JSON object, expected values by key")
         if not values:
             table = reading.to_table(self._scenario)
-            values = {key: _at(table, key) for key in sorted(self.changeable)}
+            values = {key: value(table, key) for key in sorted(self.changeable)}
             return msgspec.json.encode(Answer(values=values))
         try:
             return msgspec.json.encode(Answer(changed=self.change(values, now_ns=now_ns)))
@@ -146,18 +145,22 @@ class Running:
         self.refuse(reason)
         return msgspec.json.encode(Answer(refused=reason))
 
-    def _checked(self, values: Mapping[str, Any], table: Mapping[str, Any]) -> Scenario:
-        """Scenario with these values.
+    def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of whole keys: arguments of a text become the text with them.
 
         Raises:
-            ConfigError: a key may not change, or the scenario cannot be flown so.
+            ConfigError: a key may not change, or a text has no such argument.
         """
-        may = sorted(self.changeable)
-        for key in values:
-            if key in may or f"{key}.{WHOLE}" in may:
+        may, table = sorted(self.changeable), reading.to_table(self._scenario)
+        found: dict[str, Any] = {}
+        for key, given in values.items():
+            text = whole(key)
+            if text in may:
+                lay({key: given}, table)
+                found[text] = value(table, text)
                 continue
             try:
-                _at(table, key)
+                value(table, text)
             except (KeyError, TypeError):
                 shown = key[:KEY_SHOWN_MAX]
                 # A request may come from anybody who can open the socket: no control characters in
@@ -166,7 +169,7 @@ class Running:
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
             what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
-        return with_values(self._scenario, values)
+        return found
 
 
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
@@ -180,12 +183,7 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         ConfigError: a key is unknown, or the scenario cannot be flown so.
     """
     table = reading.to_table(scenario)
-    for key, value in values.items():
-        *sections, name = key.split(".")
-        try:
-            _at(table, ".".join(sections))[name] = value
-        except (KeyError, TypeError):
-            raise ConfigError(f"{key[:KEY_SHOWN_MAX]}: no such key") from None
+    lay(values, table)
     try:
         return reading.check(table, known=scenario)
     except RecursionError:
@@ -193,25 +191,6 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
 
 
 _DECODER = msgspec.json.Decoder(dict[str, Any])
-
-
-def _at(table: Any, key: str) -> Any:
-    """Value of a dotted key in a table.
-
-    Raises:
-        KeyError: a part of the key is missing.
-        TypeError: a part of the key is not a table.
-    """
-    for name in filter(None, key.split(".")):
-        table = table[name]
-    return table
-
-
-def _shown(value: Any) -> Any:
-    """Value as a user would write it: a direction of the network as its text."""
-    if isinstance(value, dict):
-        return msgspec.convert(value, DirectionConfig).text
-    return value
 
 
 def _text(value: Any) -> str:

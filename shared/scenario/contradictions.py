@@ -4,20 +4,19 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
-import msgspec
 import numpy as np
 
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
-from skytether.shared.scenario import policies, schemes
 from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario import schemes
 from skytether.shared.scenario.fence import inner, is_home_inside, margins
+from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.mission import Mission, given, written
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import (
     TABLES,
     ControlConfig,
-    DirectionConfig,
     Scenario,
 )
 from skytether.shared.scenario.triggers import make_trigger
@@ -116,7 +115,7 @@ def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
     control = scenario.control
     try:
         said = control.properties
-    except policies.PolicyError as error:
+    except GrammarError as error:
         yield "control.scheme", repr(error.given), error.expected
         return
     if said.feedback not in (None, control.feedback):
@@ -139,7 +138,7 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
             expected = "none without a mission: reference.shape = 'mission', or a swap"
             yield "mission.goals", repr(scenario.mission.goals), expected
         return
-    if control.trigger != "expected_gap":
+    if not _is_one(control.trigger, "expected_gap"):
         yield "control.trigger", repr(control.trigger), "'expected_gap' on a mission"
     if vehicle.exhausted != "brake":
         yield "vehicle.exhausted", repr(vehicle.exhausted), "'brake' on a mission"
@@ -161,6 +160,14 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
             yield key, value, f"at least {longest_s:g} s on a mission: no motion is longer"
 
 
+def _is_one(trigger: str, name: str) -> bool:
+    """Whether a trigger is one policy of this name, and nothing else."""
+    try:
+        return TRIGGERS.one(trigger).name == name
+    except GrammarError:
+        return False
+
+
 def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
     """Why there can be no such zones."""
     least_m = scenario.mission.tube_m
@@ -170,11 +177,8 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
             if long_m < least_m:
                 what = f"zones of at least mission.tube_m = {least_m:g} m; this is {long_m:.2g} m"
                 yield "mission.zones", zone.name, f"{what} long, in metres"
-    except policies.PolicyError as error:
+    except GrammarError as error:
         yield "mission.zones", repr(error.given), error.expected
-    except OSError as error:
-        given = repr(scenario.mission.zones)
-        yield "mission.zones", given, f"a file that can be read ({error.strerror})"
 
 
 def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
@@ -185,10 +189,10 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
     try:
         goals = given(mission.goals, scenario.model.axes)
         flown = scenario.given_reference()
-    except policies.PolicyError as error:
+    except GrammarError as error:
         yield "mission.goals", repr(error.given), error.expected
         return
-    except (OSError, ValueError):  # which `_no_reference` tells
+    except ValueError:  # which `_no_reference` tells
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
@@ -255,7 +259,7 @@ def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     """Why no horizon can come in time over the scenario's network."""
     control, link, axes = scenario.control, scenario.link, scenario.model.axes
-    up, down = scenario.network.uplink.path, scenario.network.downlink.path
+    up, down = scenario.uplink, scenario.downlink
     # As the server sees it, whose clock map knows no more than half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
@@ -282,7 +286,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
     """Why the vehicle would brake further than it follows plans; the more so, the more are lost."""
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
-    covered_s, lossy = control.horizon * control.dt, scenario.network.uplink.path.loss > LOSSY
+    covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
     plans = control.properties.indexed
     if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
@@ -298,30 +302,21 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
     """Why a direction of the network cannot be made."""
-    for way, direction in (
-        ("uplink", scenario.network.uplink),
-        ("downlink", scenario.network.downlink),
-    ):
-        key = f"network.{way}"
-        short = msgspec.structs.replace(direction, impairments="")
-        if direction.impairments and short != DirectionConfig():
-            expected = "no other keys of the direction beside it: add them to the text instead"
-            yield f"{key}.impairments", repr(direction.impairments), expected
+    for way in ("uplink", "downlink"):
         try:
-            _ = direction.path
-        except policies.PolicyError as error:
-            yield key, repr(error.given), error.expected
+            getattr(scenario, way)
+        except GrammarError as error:
+            yield f"network.{way}", repr(error.given), error.expected
         except Exception as error:
             expected = f"impairments that can be made ({type(error).__name__}: {error})"
-            yield key, repr(direction.text), expected
+            yield f"network.{way}", repr(getattr(scenario.network, way)), expected
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
     """Why there can be no such trigger."""
     try:
-        policies.parse(control.trigger)
         make_trigger(control, 1)
-    except policies.PolicyError:
+    except GrammarError:
         pass
     except Exception as error:
         expected = f"a trigger that can be made ({type(error).__name__}: {error})"
@@ -334,11 +329,11 @@ def _no_policies(
 ) -> Iterator[Contradiction]:
     """Why a text is no combination of a table's policies, or none for the scheme."""
     try:
-        expression = policies.parse(text, table)
-    except policies.PolicyError as error:
+        expression = table.parse(text)
+    except GrammarError as error:
         yield key, repr(error.given), error.expected
         return
-    for name in (part.name for part in policies.policies(expression)):
+    for name in (part.name for part in leaves(expression)):
         needs = table[name].needs
         if needs and needs not in control.properties.computes:
             able = " or ".join(map(repr, schemes.that_compute(needs)))
@@ -368,8 +363,6 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     elif ref.shape in ("waypoints", *TABLES):
         try:
             scenario.given_reference()
-        except OSError as error:
-            yield "reference.file", repr(ref.file), f"a readable file ({error.strerror})"
         except ValueError as error:
             if ref.shape in TABLES:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
@@ -433,10 +426,10 @@ def _no_shape(scenario: Scenario) -> list[Contradiction]:
     """Why there is no such shape, or a plug-in's that cannot be flown."""
     ref = scenario.reference
     try:
-        shape = policies.shape(ref.shape, REFERENCES)
+        shape = REFERENCES.one(ref.shape)
         if not REFERENCES[shape.name].is_ours:
             shapes.sampled(scenario.given_reference(), scenario.model.axes)
-    except policies.PolicyError as error:
+    except GrammarError as error:
         return [("reference.shape", repr(error.given), error.expected)]
     except Exception as error:
         expected = f"a trajectory that can be flown ({type(error).__name__}: {error})"

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.calls import calls
-from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.grammar import GrammarError, calls
 from skytether.shared.scenario.reference import FAR_M, Reference, read_table
 
 SWAP_AT_S = 2.0
@@ -256,21 +255,20 @@ def given(text: str, axes: int) -> dict[int, Array]:
     """Goals [m] by vehicle that a text names.
 
     Raises:
-        PolicyError: with the part of it that is wrong.
+        GrammarError: with the part of it that is wrong.
     """
     goals = {}
     form = "goal(vehicle, x, y)" if axes == 2 else "goal(vehicle, x, y, z)"
-    for name, arguments in calls(text, f"goals such as {form!r}"):
-        written = name if arguments is None else f"{name}({arguments})"
-        try:
-            vehicle, *place = map(float, (arguments or "").split(","))
-        except ValueError:
-            raise PolicyError(written, form) from None
-        if name != "goal" or len(place) != axes or not vehicle.is_integer():
-            raise PolicyError(written, form)
+    for call in calls(text, f"goals such as {form!r}"):
+        numbers = [each for each in call.values if not isinstance(each, str)]
+        if call.name != "goal" or any(call.keys) or len(numbers) != len(call.values):
+            raise GrammarError(call.text, form)
+        vehicle, *place = numbers or [0.0]
+        if len(place) != axes or not float(vehicle).is_integer():
+            raise GrammarError(call.text, form)
         if not max(map(abs, place)) <= FAR_M:
-            raise PolicyError(written, f"a place within {FAR_M:g} m of the origin")
-        goals[int(vehicle)] = np.array(place)
+            raise GrammarError(call.text, f"a place within {FAR_M:g} m of the origin")
+        goals[int(vehicle)] = np.array(place, dtype=np.float64)
     return goals
 
 

@@ -1,6 +1,6 @@
 """Policies of `vehicle.report`: when an observation is sent.
 
-They combine with & and | like those of a trigger (`shared.scenario.policies`), and are asked once a
+They combine with & and | like those of a trigger (`shared.scenario.grammar`), and are asked once a
 step, aboard, by `client.reporting`. The first observation of a session is sent whatever they say,
 and so is one after the longest silence that the server asks for.
 """
@@ -10,8 +10,8 @@ from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
-from skytether.shared.scenario.policies import PERIOD_MAX, Combination, Expression, Policy, parse
-from skytether.shared.scenario.registry import REPORTS
+from skytether.shared.scenario.grammar import Call, Combination, Expression
+from skytether.shared.scenario.registry import PERIOD_MAX, REPORTS
 
 
 class Unreported(NamedTuple):
@@ -62,7 +62,7 @@ def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)])
 
 def is_always(text: str) -> bool:
     """Whether a report is at every step, and that is all there is to it."""
-    return parse(text, REPORTS) == Policy("always", ())
+    return REPORTS.parse(text) == Call("always")
 
 
 def make_report(text: str) -> Report:
@@ -77,4 +77,4 @@ def make_report(text: str) -> Report:
         entry, values = REPORTS[expression.name], expression.values
         return lambda now: entry.make(now, *values)
 
-    return make(parse(text, REPORTS))
+    return make(REPORTS.parse(text))

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario import policies
 from skytether.shared.scenario.reference import SAMPLED_S
 from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
@@ -60,7 +59,7 @@ def first_too_fast(scenario: Scenario) -> TooFast | None:
     if not is_known(scenario):
         return None
     times_s = np.arange(min(scenario.steps, STEPS_MAX) + 1) * scenario.control.dt
-    if not REFERENCES[policies.shape(scenario.reference.shape, REFERENCES).name].is_ours:
+    if not REFERENCES[REFERENCES.one(scenario.reference.shape).name].is_ours:
         times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # where a plug-in's has been checked
     velocity = scenario.make_reference()(times_s)[..., 1]
     over = is_too_fast(scenario, velocity)

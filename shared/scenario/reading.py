@@ -1,5 +1,7 @@
 """Reading a scenario: one TOML file, laid over those it extends, every value checked once.
 
+The files that a scenario names are read here, too: whatever is made of a scenario opens none.
+
 A scenario may say `extends = "other"` (a scenario's name, or a file beside it) and then holds only
 what differs. `skytether scenarios` lists those that come with Skytether.
 """
@@ -19,11 +21,11 @@ from skytether import scenarios
 from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.scenario import zones
-from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.contradictions import Contradiction, contradictions
-from skytether.shared.scenario.policies import PolicyError
-from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.dotted import TEXTS, flat, lay, with_argument
+from skytether.shared.scenario.grammar import GrammarError
+from skytether.shared.scenario.registry import IMPAIRMENTS, ZONES, File, Files, PluginTable
+from skytether.shared.scenario.schema import TABLES, Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
 """Folder of the scenarios that come with Skytether."""
@@ -31,14 +33,16 @@ EXTENDS_MAX = 20
 """Largest number of scenarios that a scenario is laid over, each over the next."""
 GIVEN_MAX = 200
 """Largest number of characters that a message repeats of what was given."""
-DIRECTIONS = {
-    way: msgspec.to_builtins(direction)
-    for way, direction in (
-        ("uplink", NetworkConfig().uplink),
-        ("downlink", NetworkConfig().downlink),
-    )
-}
-"""Raw tables of the directions of a network, as they are where nothing is written."""
+FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
+    {
+        "network.uplink": (IMPAIRMENTS, 128 * 1024 * 1024),
+        "network.downlink": (IMPAIRMENTS, 128 * 1024 * 1024),
+        "mission.zones": (ZONES, 4_000_000),
+    }
+)
+"""Keys whose text may name files: what it is made of, and the largest size of a file [B]."""
+TABLE_BYTES_MAX = 16_000_000
+"""Largest size of the file of a reference [B]."""
 COMPARED = "compare"
 """The file of the scenarios that `skytether compare` flies."""
 
@@ -102,7 +106,7 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
     Raises:
         ConfigError: the first value that is wrong.
     """
-    raw = _with_directions(raw)
+    raw = _with_texts(raw, source)
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
@@ -114,7 +118,8 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
 def _without_contradictions(
     scenario: Scenario, source: str, *, known: Scenario | None = None
 ) -> Scenario:
-    """Scenario as given, refused unless its values are possible together; see `check`."""
+    """Scenario with its files, refused unless its values are possible together; see `check`."""
+    scenario = _with_files(scenario, source, known)
     _refuse_first(contradictions(scenario, known), source)
     return scenario
 
@@ -130,22 +135,16 @@ def _where(source: str) -> str:
     return f"{source}: " if source else ""
 
 
-def with_directions(scenario: Scenario, directions: Mapping[str, str]) -> Scenario:
-    """A scenario with other directions of its network, unchecked; texts by name of the way."""
-    made = {way: DirectionConfig(impairments=text) for way, text in directions.items()}
-    network = msgspec.structs.replace(scenario.network, **made)
-    return msgspec.structs.replace(scenario, network=network)
-
-
 def to_table(scenario: Scenario) -> dict[str, Any]:
     """The plain values of a scenario, from which `check` makes it again."""
-    table: dict[str, Any] = msgspec.to_builtins(scenario)
-    return table
+    return {
+        name: msgspec.to_builtins(getattr(scenario, name)) for name in Scenario.__struct_fields__
+    }
 
 
 def to_toml(scenario: Scenario) -> bytes:
     """The scenario as a file that `load` reads."""
-    return msgspec.toml.encode(scenario)
+    return msgspec.toml.encode(to_table(scenario))
 
 
 def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
@@ -166,15 +165,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
         raise ConfigError(f"{seen[path, entry]}: extends: got a circle of {circle}")
     if len(seen) > EXTENDS_MAX:
         raise ConfigError(f"{name}: extends: got a chain of more than {EXTENDS_MAX} scenarios")
-    table = raw.get("reference")
-    if isinstance(table, dict) and isinstance(table.get("file"), str) and table["file"]:
-        table["file"] = str((path.parent / table["file"]).absolute())
-    mission = raw.get("mission")
-    if isinstance(mission, dict) and isinstance(mission.get("zones"), str):
-        with suppress(PolicyError):  # said by `check`
-            folder = path.parent.absolute()
-            mission["zones"] = zones.with_files(mission["zones"], lambda file: str(folder / file))
-    raw = _with_directions(raw, path.parent)
+    _relative_to(path.parent.absolute(), raw)
     base = raw.pop("extends", None)
     if base is None:
         return raw
@@ -182,28 +173,89 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
         raise ConfigError(f"{name}: extends: got {base!r}, expected the name of a scenario")
     if ".toml" in base:
         base = str(path.parent / base)
-    return _overlay(_read(base, {**seen, (path, entry): name}), raw)
+    return _overlay(_read(base, {**seen, (path, entry): name}), raw, name)
 
 
-def _with_directions(raw: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A raw table in which each direction of the network that is a text is a table.
+def _relative_to(folder: Path, raw: dict[str, Any]) -> None:
+    """Change the names of files in a raw table, which are relative to a folder, to whole paths."""
+    for key, value in flat(raw):
+        if key == "reference.file" and isinstance(value, str) and value:
+            lay({key: str(folder / value)}, raw)
+        elif key in FILES and isinstance(value, str):
+            with suppress(GrammarError):  # said by `check`
+                lay({key: FILES[key][0].with_files(value, lambda file: str(folder / file))}, raw)
+
+
+def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scenario:
+    """A scenario with the content of the files that it names.
+
+    Raises:
+        ConfigError: one cannot be read.
+    """
+    now, before = (dict(flat(to_table(each))) if each else {} for each in (scenario, known))
+    found: dict[str, File] = {}
+    for key in ("reference.file", *FILES):
+        if key == "reference.file" and scenario.reference.shape not in TABLES:
+            continue
+        with suppress(GrammarError):  # said by `contradictions`
+            own = known.files if known and before[key] == now[key] else ()
+            found |= {file.name: file for file in files_of(key, now[key], source, own)}
+    if not found:
+        return scenario
+    keys = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
+    return WithFiles(**keys, contents=tuple(found.values()))
+
+
+def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
+    """The files that the value of a key names, with their contents.
 
     Args:
-        folder: folder that names of files in the text are relative to; None: they stay.
+        key: `reference.file`, or one of FILES.
+        text: its value.
+        source: where it comes from, for the message.
+        known: files that need not be read.
+
+    Raises:
+        ConfigError: one cannot be read.
+        GrammarError: the text is wrong.
     """
-    network = raw.get("network")
-    if not isinstance(network, dict):
-        return dict(raw)
-    network = dict(network)
-    for way in DIRECTIONS.keys() & network.keys():
-        given = network[way]
-        if isinstance(given, str):
-            network[way] = given = {**DIRECTIONS[way], "impairments": given}
-        if folder and isinstance(given, dict) and isinstance(given.get("impairments"), str):
-            with suppress(PolicyError):  # said by `check`
-                text = air.with_files(given["impairments"], lambda file: str(folder / file))
-                network[way] = {**given, "impairments": text}
-    return {**raw, "network": network}
+    table, most = FILES.get(key, (None, TABLE_BYTES_MAX))
+    read = {file.name: file for file in known}
+    return tuple(
+        read.get(name) or File(name, _content(f"{_where(source)}{key}", name, most))
+        for name in (table.files(text) if table else [text])
+    )
+
+
+def _content(where: str, name: str, most: int) -> bytes:
+    try:
+        return files.read(Path(name), most)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        expected = f"a file that can be read ({reason})"
+        raise ConfigError(f"{where}: got {_short(repr(name))}, expected {expected}") from None
+
+
+def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """A raw table in which arguments of texts are laid over the texts where nothing is written."""
+    default = to_table(Scenario())
+    for key in TEXTS:
+        section, name = key.split(".")
+        below = raw.get(section)
+        if isinstance(below, Mapping) and isinstance(below.get(name), Mapping):
+            text = _with_arguments(key, default[section][name], below[name], source)
+            raw = {**raw, section: {**below, name: text}}
+    return dict(raw)
+
+
+def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: str) -> str:
+    """The text of a key with other arguments."""
+    try:
+        for path, value in flat(arguments, f"{key}."):
+            text = with_argument(key, text, path, value)
+    except ConfigError as error:
+        raise ConfigError(f"{_where(source)}{error}") from None
+    return text
 
 
 def _path(file: str) -> Path:
@@ -226,12 +278,19 @@ def _toml(path: Path, file: str) -> dict[str, Any]:
         raise ConfigError(f"{file}: no valid TOML: {error}") from None
 
 
-def _overlay(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def _overlay(
+    below: dict[str, Any], above: dict[str, Any], source: str, prefix: str = ""
+) -> dict[str, Any]:
+    """A raw table over another; arguments of a text change those in the text below."""
     merged = dict(below)
-    for key, value in above.items():
-        old = merged.get(key)
-        both = isinstance(old, dict) and isinstance(value, dict)
-        merged[key] = _overlay(old, value) if both else value  # type: ignore[arg-type]
+    for name, value in above.items():
+        key, old = f"{prefix}{name}", merged.get(name)
+        if isinstance(old, dict) and isinstance(value, dict):
+            merged[name] = _overlay(old, value, source, f"{key}.")
+        elif isinstance(old, str) and isinstance(value, dict) and key in TEXTS:
+            merged[name] = _with_arguments(key, old, value, source)
+        else:
+            merged[name] = value
     return merged
 
 

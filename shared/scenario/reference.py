@@ -27,8 +27,6 @@ GRID_BLOCK = 1024
 """Number of points that are drawn at a time."""
 COLUMNS_MAX = 64
 """Most columns of a table: each line takes time and memory for each of them."""
-FILE_BYTES_MAX = 16_000_000
-"""Largest size of a table [B]."""
 
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is looked at before a flight [s]: densely for two minutes,

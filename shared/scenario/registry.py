@@ -6,9 +6,9 @@
 
 A table is the decorator of its entries. Name, bounds and the sentence of help are those of the
 function or class itself. The program gives it a fixed number of arguments (here `now`); those
-behind are what a scenario writes in parentheses, as in `slip(0.3)`: numbers, and for impairments
-words and names of files, too. Nothing is imported here: `shell.plugins` imports plug-ins, before a
-scenario is read.
+behind are what a scenario writes in parentheses, as in `slip(0.3)` (`grammar.py`): numbers, and for
+impairments and zones words and names of files, too. Nothing is imported here: `shell.plugins`
+imports plug-ins, before a scenario is read.
 """
 
 import inspect
@@ -18,13 +18,16 @@ import re
 import typing
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NewType, TypeVar, overload
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 
 import msgspec
 from msgspec import Meta
 
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.hint import hint
+from skytether.shared.scenario import grammar
+from skytether.shared.scenario.grammar import Call, Combination, Expression, GrammarError, Value
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -41,15 +44,27 @@ FURTHER = {
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 
 
-@dataclass(frozen=True, slots=True)
-class DefaultKey:
-    """Mark of a parameter: the key of the scenario's section whose value stands in for it."""
+class File(NamedTuple):
+    """File that a scenario names: annotation and value of a parameter."""
 
     name: str
+    content: bytes
 
 
-File = NewType("File", str)
-"""Annotation of a parameter that is the name of a file."""
+Files = tuple[File, ...]
+"""Files that a scenario names, as they were when it was read."""
+
+
+def content(files: Files, name: str) -> bytes:
+    """Content of a file that a scenario names.
+
+    Raises:
+        ConfigError: it has not been read with the scenario.
+    """
+    for file in files:
+        if file.name == name:
+            return file.content
+    raise ConfigError(f"{name}: has not been read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +75,10 @@ class Parameter:
     type: Any = float
     """Type as msgspec converts to it, with bounds: of a number, of words (Literal), or of a text
     that names a file."""
-    default: float | str | None = None
-    """Value where the entry stands without arguments."""
-    key: str = ""
-    """Key whose value it has there instead, in the section of the scenario that names the entry."""
+    default: Value | None = None
+    """Value where none is written; None: one must be."""
+    is_rest: bool = False
+    """Whether it stands for any number of arguments: all that are left."""
 
     def takes(self, value: Any) -> bool:
         """Whether the parameter may have this value."""
@@ -77,11 +92,6 @@ class Parameter:
     def file(self) -> bool:
         """Whether the value is the name of a file."""
         return _bounds(self.type)[0] is str
-
-    @property
-    def may_miss(self) -> bool:
-        """Whether there is a value for it where none is written."""
-        return bool(self.key) or self.default is not None
 
     def __str__(self) -> str:
         kind, bounds = _bounds(self.type)
@@ -130,38 +140,39 @@ class Entry:
         """Whether it comes with Skytether."""
         return self.source.startswith("skytether.")
 
-    def takes(self, values: Sequence[Any]) -> bool:
-        """Whether these arguments are allowed; none at all where there is a value for each."""
-        if not values and self.may_stand_alone:
-            return True
-        return len(values) == len(self.parameters) and all(
-            parameter.takes(value) for parameter, value in zip(self.parameters, values, strict=True)
-        )
-
-    @property
-    def may_stand_alone(self) -> bool:
-        """Whether it may be written without arguments."""
-        return all(parameter.may_miss for parameter in self.parameters)
+    def bound(self, call: Call) -> tuple[Value, ...] | None:
+        """An argument for each parameter, as written or by default; None where they do not fit."""
+        given: dict[str, Value] = {}
+        rest: list[Value] = []
+        names = [parameter.name for parameter in self.parameters if not parameter.is_rest]
+        for key, value in zip(call.keys or [""] * len(call.values), call.values, strict=True):
+            name = key or next((each for each in names if each not in given), "")
+            if name in names and name not in given:
+                given[name] = value
+            elif not name and self.parameters and self.parameters[-1].is_rest:
+                rest.append(value)
+            else:
+                return None
+        values = [
+            *((each, given.get(each.name, each.default)) for each in self.parameters[: len(names)]),
+            *((self.parameters[-1], value) for value in rest),
+        ]
+        if not all(value is not None and parameter.takes(value) for parameter, value in values):
+            return None
+        return tuple(msgspec.convert(value, parameter.type) for parameter, value in values)
 
     def form(self, name: str) -> str:
         """Grammar of an entry with this name."""
         if not self.parameters:
             return name
-        called = f"{name}({', '.join(parameter.name for parameter in self.parameters)})"
-        bare = f"{name} or " if self.takes(()) else ""
-        return f"{bare}{called} with {' and '.join(map(str, self.parameters))}"
-
-    def numbers(self, values: Sequence[float], section: object) -> tuple[Any, ...]:
-        """Arguments as written, or those that stand in for them.
-
-        Args:
-            values: what is written; empty where nothing is.
-            section: the section of the scenario that has the entry's keys.
-        """
-        return tuple(values) or tuple(
-            getattr(section, parameter.key) if parameter.key else parameter.default
-            for parameter in self.parameters
+        shown = ", ".join(
+            f"{each.name}{'…' if each.is_rest else ''}"
+            if each.default is None
+            else f"{each.name}={each.default}"
+            for each in self.parameters
         )
+        bounds = [str(each) for each in self.parameters if str(each) != each.name]
+        return f"{name}({shown})" + (f" with {' and '.join(bounds)}" if bounds else "")
 
 
 class PluginTable(dict[str, Entry]):
@@ -182,16 +193,139 @@ class PluginTable(dict[str, Entry]):
         self.form = form
         self._given, self._class, self._texts = given, class_, texts
 
-    def written(self, name: str) -> str:
-        """Grammar of the entry with this name."""
-        entry = self[name]
-        if not (self._texts and entry.parameters):
-            return entry.form(name)
-        shown = ", ".join(
-            each.name if each.default is None else f"{each.name}={each.default}"
-            for each in entry.parameters
-        )
-        return f"{name}({shown}) with {' and '.join(map(str, entry.parameters))}"
+    def parse(self, text: str) -> Expression:
+        """Entries combined with & and |, each with an argument for each of its parameters.
+
+        Raises:
+            GrammarError: with the part of the text that is wrong.
+        """
+
+        def bound(expression: Expression) -> Expression:
+            match expression:
+                case Combination(operator, left, right):
+                    return Combination(operator, bound(left), bound(right))
+                case Call():
+                    return self._bound(expression)
+
+        return bound(grammar.parse(text, self.form))
+
+    def one(self, text: str) -> Call:
+        """The one entry that a text names.
+
+        Raises:
+            GrammarError: see `parse`.
+        """
+        found = grammar.parse(text, self.form)
+        # Without arguments it is its name alone, which code compares with names.
+        if not isinstance(found, Call) or not (found.keys or text == found.name):
+            raise GrammarError(text, self.form)
+        return self._bound(found)
+
+    def calls(self, text: str) -> list[Call]:
+        """Entries joined by & alone; none of an empty text.
+
+        Raises:
+            GrammarError: see `parse`.
+        """
+        return [self._bound(each) for each in grammar.calls(text, self.form)]
+
+    def files(self, text: str) -> list[str]:
+        """Files that entries joined by & name.
+
+        Raises:
+            GrammarError: see `parse`.
+        """
+        return [str(value) for call in self.calls(text) for value, file in self._args(call) if file]
+
+    def made(self, call: Call, files: Files = (), *given: object) -> Any:
+        """Make what a bound call describes.
+
+        Args:
+            call: the call.
+            files: files of the scenario.
+            given: what the program gives.
+
+        Raises:
+            ConfigError: a file of the call has not been read.
+        """
+        args = [
+            File(str(value), content(files, str(value))) if file else value
+            for value, file in self._args(call)
+        ]
+        return self[call.name].make(*given, *args)
+
+    def with_files(self, text: str, change: Callable[[str], str]) -> str:
+        """Entries joined by &, with other names of their files.
+
+        Raises:
+            GrammarError: see `parse`.
+        """
+        for call in reversed(self.calls(text)):
+            if any(file for _, file in self._args(call)):
+                values = [change(str(value)) if file else value for value, file in self._args(call)]
+                text = self._with(text, call, values)
+        return text
+
+    def with_argument(self, text: str, at: str, value: object) -> str:
+        """A text in which an entry has another argument.
+
+        Args:
+            text: entries combined with & and |.
+            at: name of the entry, and behind a point that of the parameter, or else the first.
+            value: the argument.
+
+        Raises:
+            KeyError: there is no such entry, or it has no such parameter.
+            GrammarError: the text does not name the entry, or is wrong itself.
+        """
+        found, index = self._argument(text, at)
+        for call in reversed(found):
+            values: list[Any] = list(call.values)
+            values[index] = value
+            text = self._with(text, call, values)
+        return text
+
+    def argument(self, text: str, at: str) -> Value:
+        """Argument of the first such entry in a text; see `with_argument`."""
+        found, index = self._argument(text, at)
+        return found[0].values[index]
+
+    def _argument(self, text: str, at: str) -> tuple[list[Call], int]:
+        """Calls of the entry of an argument in a text, and the index of its parameter."""
+        name, _, key = at.partition(".")
+        names = [parameter.name for parameter in self[name].parameters]
+        if not names or (key and key not in names):
+            raise KeyError(at)
+        found = [each for each in grammar.leaves(self.parse(text)) if each.name == name]
+        if not found:
+            raise GrammarError(text, f"{name} in it")
+        return found, names.index(key) if key else 0
+
+    def _bound(self, call: Call) -> Call:
+        entry = self.get(call.name)
+        if entry is None:
+            article = "an" if self.kind[0] in "aeiou" else "a"
+            raise GrammarError(call.text, f"{article} {self.kind}; {hint(call.name, self)}")
+        values = entry.bound(call)
+        if values is None:
+            raise GrammarError(call.text, entry.form(call.name))
+        return replace(call, values=values, keys=())
+
+    def _args(self, call: Call) -> list[tuple[Value, bool]]:
+        """Arguments of a bound call, and whether each is the name of a file."""
+        parameters = self[call.name].parameters
+        last = len(parameters) - 1
+        return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
+
+    def _with(self, text: str, call: Call, values: Sequence[Any]) -> str:
+        """A text with other arguments of a call, every one written out."""
+        files = [file for _, file in self._args(call)]
+        shown = [
+            f'"{value}"' if file else value if isinstance(value, str) else repr(value)
+            for value, file in zip(values, files, strict=True)
+        ]
+        end = call.begin + len(call.text)
+        return f"{text[: call.begin]}{call.name}({', '.join(shown)}){text[end:]}"
 
     @overload
     def __call__(self, make: F) -> F: ...
@@ -258,7 +392,7 @@ def _parameters(
 
 
 def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -> Parameter:
-    """Parameter of an entry, with the bounds and the key in its annotation.
+    """Parameter of an entry, with the bounds in its annotation.
 
     Raises:
         ConfigError: nothing that a scenario writes can be given for it.
@@ -267,11 +401,12 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     default = None if taken.default is taken.empty else taken.default
     words = texts and typing.get_origin(kind) is Literal and typing.get_args(kind)
     written = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
-    if taken.kind is not taken.POSITIONAL_OR_KEYWORD or not (written or (texts and kind is File)):
+    is_rest = texts and taken.kind is taken.VAR_POSITIONAL
+    one = taken.kind is taken.POSITIONAL_OR_KEYWORD or is_rest
+    if not one or not (written or (texts and kind is File)):
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
-    key = next((mark.name for mark in marks if isinstance(mark, DefaultKey)), "")
     for mark in marks:
-        if not isinstance(mark, Meta | DefaultKey | str):  # a bound that nobody would check
+        if not isinstance(mark, Meta | str):  # a bound that nobody would check
             given = f"got {mark!r} with {taken.name}"
             raise ConfigError(f"{what}: {given}, expected bounds as in msgspec.Meta(ge=0)")
     bounds = [mark for mark in marks if isinstance(mark, Meta)]
@@ -284,11 +419,14 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     except TypeError as error:
         said = str(error).partition(" - ")[0]
         raise ConfigError(f"{what}: bounds of {taken.name}: {said}") from None
-    parameter = Parameter(taken.name, bounded, default, key)
+    parameter = Parameter(taken.name, bounded, default, is_rest)
     if default is not None and not parameter.takes(default):
         raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {parameter}")
     return parameter
 
+
+PERIOD_MAX = 1_000_000
+"""Largest number of steps from one packet to the next."""
 
 TRIGGERS = PluginTable(
     "policy", "policies such as 'state_gap & budget(5, 2) | silence(1)'", given=1, class_=2
@@ -308,6 +446,11 @@ VEHICLES = PluginTable(
 )
 """Vehicles of `vehicle.kind`, given the `Scenario` and the vehicle's number. See
 `client.vehicles`."""
+ZONES = PluginTable(
+    "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
+)
+"""Zones of a mission, each a function that gives a list of them. See `shared.scenario.zones`; no
+plug-in adds to them."""
 IMPAIRMENTS = PluginTable(
     "impairment",
     "impairments such as 'constant(0.05) & loss(0.1)'",

@@ -11,23 +11,22 @@ right one by one and impossible together.
 
 import hashlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Clearances, bend_m
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario import policies, schemes, zones
 from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario import schemes, zones
 from skytether.shared.scenario.air import path as air
+from skytether.shared.scenario.grammar import TEXT_MAX, leaves
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.owners import (
     InFlight,
@@ -43,7 +42,15 @@ from skytether.shared.scenario.owners import (
     Owner,
     Term,
 )
-from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, VEHICLES, Entry
+from skytether.shared.scenario.registry import (
+    REFERENCES,
+    SCHEMES,
+    TRIGGERS,
+    VEHICLES,
+    Entry,
+    Files,
+    content,
+)
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
@@ -72,6 +79,10 @@ Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
 """Time from a millisecond to an hour [s]."""
 MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
 """Mean of a random time [s]."""
+Text = Annotated[str, Meta(max_length=TEXT_MAX)]
+"""Text that names what is in a table of `registry.py`."""
+Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
+"""Text of a direction's impairments."""
 
 
 SHAPE_TOLD = 15
@@ -105,7 +116,7 @@ class ControlConfig(Section, frozen=True):
     """Length of a step, Δt [s]."""
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
-    scheme: Term[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "trajectory"
+    scheme: Term[Text] = "trajectory"
     """Delay compensation, see `skytether schemes`. With `trajectory` the vehicle follows what is
     sent by itself, with the regulator that the weights in its own scenario ask for."""
     feedback: Term[bool] = True
@@ -117,27 +128,15 @@ class ControlConfig(Section, frozen=True):
     observer_s: OfServer[Duration] = 4.0
     """Time constant of the disturbance observer, which learns steady wind and a wrong gain [s]; it
     is longer where observations are old. 0, and the scheme "none": no observer."""
-    trigger: OfTrigger[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = (
-        "expected_gap | heartbeat"
-    )
-    """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`."""
+    trigger: OfTrigger[Text] = "expected_gap | heartbeat"
+    """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
+    argument of one is also a key: `control.trigger.expected_gap = 0.1`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
     """Bytes a second that the server sends to all its vehicles together, headers of IP and UDP
     included; of the horizons that the trigger asks for, those expected to gain most a byte go
     first [B/s]. auto: as many as go without queueing; 0: no bound."""
-    period: OfTrigger[Annotated[int, Meta(ge=1, le=policies.PERIOD_MAX)]] = 10
-    """Number of steps between two horizons of the policy `periodic`."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
-    epsilon: OfTrigger[Amount] = 3.6
-    """Tolerance ε of eq. (16)."""
-    decay_rate: OfTrigger[Amount] = 1.5
-    """Decay rate λ of eq. (16) [1/s]."""
-    cost_gap: OfTrigger[Amount] = 0.05
-    """Extra cost of flying on with what the vehicle holds, above which the policies `cost_gap` and
-    `expected_gap` send a new horizon."""
-    deviation_m: OfTrigger[Amount] = 0.05
-    """Distance from the plan above which the policy `deviation` sends [m]."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
     """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
     16 knots reach, with the scheme "trajectory"."""
@@ -158,7 +157,7 @@ class ControlConfig(Section, frozen=True):
         """What the scheme says of itself.
 
         Raises:
-            PolicyError: there is none such.
+            GrammarError: there is none such.
         """
         return schemes.properties(self.scheme)
 
@@ -172,7 +171,7 @@ TABLES = ("csv", "mission")
 class ReferenceConfig(Section, frozen=True):
     """Desired trajectory."""
 
-    shape: Term[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "circle"
+    shape: Term[Text] = "circle"
     """Shape of the desired trajectory, see `skytether references`; target: a random walk that only
     the server knows; live: a point that is moved in flight."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
@@ -205,21 +204,11 @@ class ReferenceConfig(Section, frozen=True):
     """CSV file with the columns t, x, y (and z), of a mission also vehicle, relative to the
     scenario's own folder."""
 
-    @property
-    def table(self) -> bytes:
-        """Content of `file`, of a shape that is read from it; empty for every other shape.
-
-        Raises:
-            OSError: it cannot be read, or is no table's.
-            ValueError: no file can have this name.
-        """
-        return files.read(Path(self.file), shapes.FILE_BYTES_MAX) if self.shape in TABLES else b""
-
 
 class VehicleConfig(Section, frozen=True):
     """The UAV, as far as it is simulated, and its failsafe without fresh horizons."""
 
-    kind: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = "simulated"
+    kind: OfVehicle[Text] = "simulated"
     """Vehicle that flies, see `skytether vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
@@ -227,9 +216,7 @@ class VehicleConfig(Section, frozen=True):
     memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
     """Folder in which its client keeps what it needs to go on after a restart; auto: the state
     folder of its service or user, for a vehicle with an autopilot; none: it keeps nothing."""
-    report: OfVehicle[Annotated[str, Meta(max_length=policies.TEXT_MAX)]] = (
-        "deviation(0.05) | silence(1)"
-    )
+    report: OfVehicle[Text] = "deviation(0.05) | silence(1)"
     """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
     """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""
@@ -371,8 +358,6 @@ class MavlinkConfig(Section, frozen=True):
     """Number of our own component in MAVLink; 191 is that of an onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
     """Number of the autopilot's system; 0: the first that is heard."""
-    setpoints_hz: OfVehicle[Annotated[int, Meta(ge=10, le=50)]] = 20
-    """Least number of velocity setpoints a second; there are 50 at most."""
     positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
     """Number of positions a second that the autopilot is asked for."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
@@ -402,63 +387,14 @@ class MavlinkConfig(Section, frozen=True):
     air [s]."""
 
 
-class DirectionConfig(Section, frozen=True):
-    """Direction of the network. A text in place of the table is the key `impairments`."""
-
-    impairments: OfImpairment[Annotated[str, Meta(max_length=air.TEXT_MAX)]] = ""
-    """Impairments, combined with &, see `skytether impairments`; left out: those that the keys
-    below are short for. Also written as the direction itself: network.uplink = "…"."""
-    delay: OfImpairment[Literal["poisson", "constant", "none"]] = "poisson"
-    """Law of the delay: eq. (17), minimum_s + slot_s · Poisson(slots_mean); minimum_s; or none."""
-    minimum_s: OfImpairment[Duration] = 0.4
-    """Smallest delay [s]."""
-    slot_s: OfImpairment[Duration] = 0.02
-    """Length of a slot of the delay, eq. (17) [s]."""
-    slots_mean: OfImpairment[Annotated[float, Meta(ge=0, le=1e6)]] = 2.0
-    """Mean number of slots on top of the smallest delay."""
-    loss: OfImpairment[Annotated[float, Meta(ge=0, le=1)]] = 0.1
-    """Share of packets that are lost."""
-    burst_s: OfImpairment[Duration] = 0.0
-    """Mean length of a burst of losses [s]; 0: each packet is lost independently."""
-
-    @property
-    def text(self) -> str:
-        """Impairments as a text, also of those that the other keys are short for."""
-        if self.impairments:
-            return self.impairments
-        parts = []
-        if self.delay == "poisson":
-            parts.append(f"paper({self.minimum_s!r}, {self.slot_s!r}, {self.slots_mean!r})")
-        elif self.delay == "constant":
-            parts.append(f"constant({self.minimum_s!r})")
-        if self.burst_s:
-            parts.append(f"gilbert_elliott({self.loss!r}, {self.burst_s!r})")
-        elif self.loss:
-            parts.append(f"loss({self.loss!r})")
-        return " & ".join(parts)
-
-    @property
-    def path(self) -> air.Path:
-        """Impairments that the text describes.
-
-        Raises:
-            PolicyError: with the part of it that is wrong.
-        """
-        return air.path(self.text)
-
-    @property
-    def mean_s(self) -> float:
-        """Mean delay [s]."""
-        return self.path.mean_s
-
-
 class NetworkConfig(Section, frozen=True):
     """Impairments of the network, both ways."""
 
-    uplink: DirectionConfig = DirectionConfig()
-    """Direction from server to vehicle."""
-    downlink: DirectionConfig = DirectionConfig()
-    """Direction from vehicle to server."""
+    uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
+    """Impairments from server to vehicle, combined with &, see `skytether impairments`; "": none.
+    An argument of one is also a key: `network.uplink.loss = 0.3`."""
+    downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
+    """Impairments from vehicle to server, in the same way."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
     """Longest UDP payload that passes [B]: 1472 fill an Ethernet frame."""
 
@@ -548,6 +484,35 @@ class Scenario(Section, frozen=True):
     simulation: SimulationConfig = SimulationConfig()
 
     @property
+    def files(self) -> Files:
+        """Files that the scenario names, with their contents."""
+        return ()
+
+    @property
+    def table(self) -> bytes:
+        """Content of `reference.file`, for a shape that is read from it; else empty.
+
+        Raises:
+            ConfigError: the file has not been read with the scenario.
+        """
+        file = self.reference.file
+        return content(self.files, file) if self.reference.shape in TABLES else b""
+
+    @property
+    def uplink(self) -> air.Path:
+        """Impairments from server to vehicle.
+
+        Raises:
+            GrammarError: there are none such.
+        """
+        return air.path(self.network.uplink, self.files)
+
+    @property
+    def downlink(self) -> air.Path:
+        """Impairments from vehicle to server; see `uplink`."""
+        return air.path(self.network.downlink, self.files)
+
+    @property
     def dt_ns(self) -> int:
         """Length of a step [ns]."""
         return seconds_to_ns(self.control.dt)
@@ -621,7 +586,7 @@ class Scenario(Section, frozen=True):
             points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
             speed_mps=reference.speed_mps,
             loop=reference.loop,
-            table=_digest(reference.table),
+            table=_digest(self.table),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
@@ -633,12 +598,11 @@ class Scenario(Section, frozen=True):
 
     def given_reference(self, vehicle: int = 1) -> shapes.Reference:
         """The desired trajectory of a vehicle; on a mission, before goals are allocated."""
-        shape = policies.shape(self.reference.shape, REFERENCES)
-        entry, flown = REFERENCES[shape.name], self
+        shape, flown = REFERENCES.one(self.reference.shape), self
         if shape.name == "target" and vehicle != 1:
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             flown = msgspec.structs.replace(self, seed=seed)
-        made: shapes.Reference = entry.make(flown, *entry.numbers(shape.values, self.reference))
+        made: shapes.Reference = REFERENCES[shape.name].make(flown, *shape.values)
         return made.of(vehicle) if isinstance(made, Mission) else made
 
     def start_m(self, vehicle: int = 1) -> Array:
@@ -678,28 +642,40 @@ class Scenario(Section, frozen=True):
         """Zones of a mission; nobody who may land is above one.
 
         Raises:
-            PolicyError, OSError: there are none such.
+            GrammarError: there are none such.
         """
-        found = zones.parse(self.mission.zones, self.model.axes)
+        found = zones.parse(self.mission.zones, self.model.axes, self.files)
         return found.to_the_sky() if self.lands else found
 
     def entries(self) -> Iterator[Entry]:
         """Scheme, policies and shape that the scenario names."""
-        yield schemes.entry(self.control.scheme)[0]
-        for policy in policies.policies(policies.parse(self.control.trigger)):
+        yield SCHEMES[schemes.call(self.control.scheme).name]
+        for policy in leaves(TRIGGERS.parse(self.control.trigger)):
             yield TRIGGERS[policy.name]
-        yield REFERENCES[policies.shape(self.reference.shape, REFERENCES).name]
+        yield REFERENCES[REFERENCES.one(self.reference.shape).name]
         flies = self.vehicle.kind.partition("(")[0].strip()
         if flies in VEHICLES:  # ours are there once there is a client
             yield VEHICLES[flies]
 
     def _shape(self) -> str:
         """Shape as both ends compare it: its name, or for a plug-in its text and a digest."""
-        shape = policies.shape(self.reference.shape, REFERENCES)
+        shape = REFERENCES.one(self.reference.shape)
         if REFERENCES[shape.name].is_ours:
             return shape.name
         given = shapes.sampled(self.given_reference(), self.model.axes)
         return f"{str(shape)[:SHAPE_TOLD]} {_digest(f'{shape}'.encode() + given)}"
+
+
+class WithFiles(Scenario, frozen=True):
+    """Scenario that names files, as `reading.py` has read it."""
+
+    contents: Files = ()
+    """The files that it names."""
+
+    @property
+    def files(self) -> Files:
+        """See `Scenario`."""
+        return self.contents
 
 
 def _digest(content: bytes) -> str:

@@ -7,7 +7,7 @@ of `skytether.plugin_scheme` with `properties`.
 from typing import NamedTuple
 
 from skytether.shared.law.terms import ALONG_SPLINES, COMMITTING, FLOWN_AS, INDEXED
-from skytether.shared.scenario import policies
+from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import SCHEMES, Entry
 
 scheme = SCHEMES
@@ -78,26 +78,26 @@ def none() -> SchemeProperties:
     return SchemeProperties("none", ("state_gap",), feedback=False)
 
 
-def entry(text: str) -> tuple[Entry, tuple[float, ...]]:
-    """Entry of the scheme that `control.scheme` names, and its numbers as they are written.
+def call(text: str) -> Call:
+    """The scheme that `control.scheme` names, with its arguments.
 
     Raises:
-        PolicyError: there is none such, or what a plug-in's says of itself cannot be.
+        GrammarError: there is none such, or what a plug-in's says of itself cannot be.
     """
     found = SCHEMES.get(text.partition("(")[0].strip())
     if found is None:
-        raise policies.PolicyError(text, " or ".join(map(repr, SCHEMES)))
+        raise GrammarError(text, " or ".join(map(repr, SCHEMES)))
     _said(found)
-    return found, policies.shape(text, SCHEMES).values
+    return SCHEMES.one(text)
 
 
 def properties(text: str) -> SchemeProperties:
     """Properties of the scheme that `control.scheme` names.
 
     Raises:
-        PolicyError: see `entry`.
+        GrammarError: see `call`.
     """
-    return _said(entry(text)[0])
+    return _said(SCHEMES[call(text).name])
 
 
 def that_compute(need: str) -> list[str]:
@@ -110,8 +110,8 @@ def _said(entry: Entry) -> SchemeProperties:
         return entry.make()
     name, said = entry.make.__name__, getattr(entry.make, "properties", None)
     if not isinstance(said, SchemeProperties):
-        raise policies.PolicyError(name, "a class of skytether.plugin_scheme")
+        raise GrammarError(name, "a class of skytether.plugin_scheme")
     if said.flown_as not in FLOWN_AS or not set(said.figures) <= set(FIGURES):
         known = f"flown_as of {', '.join(FLOWN_AS)}, and figures of {', '.join(FIGURES)}"
-        raise policies.PolicyError(f"{name}: {said}", known)
+        raise GrammarError(f"{name}: {said}", known)
     return said

@@ -63,7 +63,7 @@ def hover(scenario: Scenario) -> Reference:
 @reference
 def csv(scenario: Scenario) -> Reference:
     """Path from the table in `file`, with the columns t, x, y (and z)."""
-    return curves.from_csv(scenario.reference.table, scenario.model.axes)
+    return curves.from_csv(scenario.table, scenario.model.axes)
 
 
 @reference
@@ -104,4 +104,4 @@ def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 1
 @reference
 def mission(scenario: Scenario) -> Reference:
     """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
-    return missions.mission(scenario.reference.table, scenario.model.axes)
+    return missions.mission(scenario.table, scenario.model.axes)

@@ -1,6 +1,6 @@
 """Triggers: when a horizon is sent, by small policies that combine with & and |.
 
-A scenario writes `cost_gap & budget(5, 2) | silence(1)`; `shared.scenario.policies` has the
+A scenario writes `cost_gap & budget(5, 2) | silence(1)`; `shared.scenario.grammar` has the
 grammar, docs/triggers.md says what each policy is good for, and how to write one. Those below are
 entries of the table `TRIGGERS` (`shared.scenario.registry`) like any plug-in's.
 
@@ -20,13 +20,15 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array, Flags, Indices, Model
-from skytether.shared.scenario.policies import PERIOD_MAX, Combination, Expression, parse
-from skytether.shared.scenario.registry import TRIGGERS, DefaultKey
+from skytether.shared.scenario.grammar import Combination, Expression, Value
+from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.schemes import HELD, that_compute
 
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a class like `Trigger`."""
+Amount = Annotated[float, Meta(ge=0)]
+"""Threshold of any unit."""
 Figures = NDArray[np.void]
 """Figures of plans, a record for each vehicle, see `server.mpc.appraisal.FIGURES`; shape
 (n,)."""
@@ -232,7 +234,7 @@ class _Stateless(Trigger):
         values: its numbers.
     """
 
-    def __init__(self, function: Callable[..., Verdict | Flags], values: Sequence[float]) -> None:
+    def __init__(self, function: Callable[..., Verdict | Flags], values: Sequence[Value]) -> None:
         self._function, self._values = function, values
 
     def test(self, situation: Situation) -> Verdict:
@@ -265,7 +267,7 @@ class Periodic(Trigger):
         self,
         control: ControlConfig,  # noqa: ARG002
         capacity: int,
-        N: Annotated[int, Meta(ge=1, le=PERIOD_MAX), DefaultKey("period")],
+        N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)] = 10,
     ) -> None:
         self._period = N
         self._sent_step = np.zeros(capacity, dtype=np.int64)
@@ -303,8 +305,8 @@ class StateGap(Trigger):
         self,
         control: ControlConfig,
         capacity: int,
-        epsilon: Annotated[float, Meta(ge=0), DefaultKey("epsilon")],
-        decay_rate: Annotated[float, Meta(ge=0), DefaultKey("decay_rate")],
+        epsilon: Amount = 3.6,
+        decay_rate: Amount = 1.5,
     ) -> None:
         self._decay = decay_rate * control.dt
         self._epsilon = epsilon
@@ -332,9 +334,7 @@ class StateGap(Trigger):
 
 
 @trigger(needs="cost_gap")
-def cost_gap(
-    situation: Situation, c: Annotated[float, Meta(ge=0), DefaultKey("cost_gap")]
-) -> Verdict:
+def cost_gap(situation: Situation, c: Amount = 0.05) -> Verdict:
     """Sends where flying on with what was sent costs more than c above the new optimum."""
     return above(situation, Compared.COST_GAP, c)
 
@@ -349,7 +349,7 @@ class ExpectedGap(Trigger):
         self,
         control: ControlConfig,  # noqa: ARG002
         capacity: int,  # noqa: ARG002
-        c: Annotated[float, Meta(ge=0), DefaultKey("cost_gap")],
+        c: Amount = 0.05,
     ) -> None:
         self._most = c
 
@@ -359,9 +359,7 @@ class ExpectedGap(Trigger):
 
 
 @trigger(needs="deviation_m")
-def deviation(
-    situation: Situation, metres: Annotated[float, Meta(ge=0), DefaultKey("deviation_m")]
-) -> Verdict:
+def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
     """Sends where flying on with what was sent leads further than so many metres from the plan."""
     return above(situation, Compared.DEVIATION_M, metres)
 
@@ -553,11 +551,11 @@ def make_trigger(
             combine = np.logical_and if expression.operator == "&" else np.logical_or
             return Combined(combine, make(expression.left), make(expression.right))
         entry = TRIGGERS[expression.name]
-        numbers = entry.numbers(expression.values, control)
+        numbers = expression.values
         is_class = isinstance(entry.make, type)
         policy = (
             entry.make(control, capacity, *numbers) if is_class else _Stateless(entry.make, numbers)
         )
         return policy if entry.is_ours else Guarded(expression.name, policy, tell)
 
-    return make(parse(control.trigger))
+    return make(TRIGGERS.parse(control.trigger))

@@ -1,38 +1,31 @@
 """Zones that vehicles of a mission keep out of, or stay within.
 
-    zones := zone | zone & zones
-    zone  := box(x0, x1, y0, y1) | cylinder(x, y, radius) | polygon(x, y, x, y, x, y, …)
-           | fence(x0, x1, y0, y1) | fence(x, y, x, y, x, y, …) | corridor(width, x, y, x, y, …)
-           | geojson(file)
+    box(x0, x1, y0, y1) & cylinder(x, y, radius) & polygon(x, y, x, y, x, y, …)
+    fence(x0, x1, y0, y1) & fence(x, y, x, y, x, y, …) & corridor(width, x, y, x, y, …)
+    geojson(file)
 
-Metres. `box` and `cylinder` take two heights more, the lowest and the highest; without them they
-reach from the ground to the sky. A vehicle keeps out of `box`, `cylinder` and `polygon`, and
-stays within every `fence` and `corridor`. Every zone is a polygon between two heights; a cylinder
-is one of 24 corners around it.
+Metres, joined by & (`shared.scenario.grammar`). `box` and `cylinder` take two heights more, the
+lowest and the highest; without them they reach from the ground to the sky. A vehicle keeps out of
+`box`, `cylinder` and `polygon`, and stays within every `fence` and `corridor`. Every zone is a
+polygon between two heights; a cylinder is one of 24 corners around it.
 """
 
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from skytether.shared.base import files
-from skytether.shared.base.hint import hint
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.outlines import Outlines, is_near
-from skytether.shared.scenario.calls import calls
-from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.grammar import GrammarError
+from skytether.shared.scenario.registry import ZONES, File, Files
 
-FORM = "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'"
 ROUND = 24
 """Corners of a cylinder."""
 CORNERS_MAX = 1000
 """Largest number of corners of all zones."""
-FILE_BYTES_MAX = 4_000_000
-"""Size of the largest GeoJSON file [B]."""
 EARTH_M = 6_378_137.0
 """Radius of the earth at the equator, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
@@ -225,91 +218,79 @@ def _facing(points: Array, places: Array, at: Indices) -> Planes:
 # -- as a scenario writes them -----------------------------------------------------------------
 
 
-def parse(text: str, axes: int) -> Zones:
+def parse(text: str, axes: int, files: Files = ()) -> Zones:
     """Zones that a text names; none of an empty one.
 
+    Args:
+        text: zones joined by &.
+        axes: number of axes of a flight.
+        files: files that the text names, with their contents.
+
     Raises:
-        PolicyError: with the part of it that is wrong.
-        OSError: a file cannot be read.
+        GrammarError: with the part of the text that is wrong.
     """
     zones: list[Zone] = []
-    for name, arguments in calls(text, FORM):
-        written = name if arguments is None else f"{name}({arguments})"
-        make = _KINDS.get(name)
-        if make is None:
-            raise PolicyError(written, f"a zone; {hint(name, _KINDS)}")
+    for call in ZONES.calls(text):
         try:
-            zones += make(written, arguments or "")
+            if any(not isinstance(each, str) and abs(each) > METRES_MAX for each in call.values):
+                raise ValueError(f"numbers of at most {METRES_MAX:g} m")
+            made: list[Zone] = ZONES.made(call, files)
         except ValueError as error:
-            raise PolicyError(written, str(error)) from None
+            raise GrammarError(call.text, str(error)) from None
+        zones += [zone if zone.name else zone._replace(name=call.text) for zone in made]
     if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
-        raise PolicyError(f"{text[:40]}…", f"at most {CORNERS_MAX} corners of all zones")
+        raise GrammarError(f"{text[:40]}…", f"at most {CORNERS_MAX} corners of all zones")
     for zone in zones:
         if axes < 3 and (zone.low_m, zone.high_m) != (-math.inf, math.inf):
-            raise PolicyError(zone.name, "no heights with model.axes = 2")
+            raise GrammarError(zone.name, "no heights with model.axes = 2")
     return Zones(zones)
 
 
-def with_files(text: str, change: Callable[[str], str]) -> str:
-    """The text with other names of its files.
-
-    Raises:
-        PolicyError: it is no list of zones.
-    """
-    return " & ".join(
-        f'{name}("{change(_file(arguments or ""))}")'
-        if name == "geojson"
-        else f"{name}({arguments or ''})"
-        for name, arguments in calls(text, FORM)
-    )
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        found = [float(word) for word in text.split(",")]
-    except ValueError:
-        raise ValueError("numbers between commas") from None
-    if not all(math.isfinite(each) and abs(each) <= 1e6 for each in found):
-        raise ValueError("numbers of at most 1e6 m")
-    return found
-
-
-def _box(written: str, text: str) -> list[Zone]:
-    given = _numbers(text)
-    if len(given) not in (4, 6) or not all(map(float.__lt__, given[::2], given[1::2])):
+@ZONES
+def box(x0: float, x1: float, y0: float, y1: float, *heights: float) -> list[Zone]:
+    """Box to keep out of, from the ground to the sky or between two heights."""
+    if not (x0 < x1 and y0 < y1):
         raise ValueError("box(x0, x1, y0, y1), or with z0, z1: from less to more")
-    return [_between(written, _corners(*given[:4]), given[4:])]
+    return [_between(_corners(x0, x1, y0, y1), heights)]
 
 
-def _cylinder(written: str, text: str) -> list[Zone]:
-    given = _numbers(text)
-    if len(given) not in (3, 5) or given[2] <= 0.0 or given[3:] != sorted(given[3:]):
-        raise ValueError("cylinder(x, y, radius), or with z0, z1 from less to more")
-    return [_between(written, _around(*given[:3]), given[3:])]
+@ZONES
+def cylinder(x: float, y: float, radius: float, *heights: float) -> list[Zone]:
+    """Cylinder to keep out of, from the ground to the sky or between two heights."""
+    if radius <= 0.0:
+        raise ValueError("cylinder(x, y, radius) with a radius above 0")
+    return [_between(_around(x, y, radius), heights)]
 
 
-def _between(written: str, corners: Array, heights: list[float]) -> Zone:
+def _between(corners: Array, heights: Sequence[float]) -> Zone:
+    if len(heights) not in (0, 2) or not all(map(float.__lt__, heights[::2], heights[1::2])):
+        raise ValueError("two heights behind all else, from less to more, or none")
     low, high = heights or (-math.inf, math.inf)
-    return Zone(written, corners, low, high)
+    return Zone("", corners, low, high)
 
 
-def _polygon(written: str, text: str) -> list[Zone]:
-    return [Zone(written, _ring(_points(_numbers(text), 3, "polygon")))]
+@ZONES
+def polygon(*corners: float) -> list[Zone]:
+    """Polygon to keep out of: x, y of each corner."""
+    return [Zone("", _ring(_points(corners, 3, "polygon")))]
 
 
-def _fence(written: str, text: str) -> list[Zone]:
-    given = _numbers(text)
-    if len(given) == 4:
-        if not (given[0] < given[1] and given[2] < given[3]):
-            raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
-        return [Zone(written, _corners(*given), is_fence=True)]
-    return [Zone(written, _ring(_points(given, 3, "fence")), is_fence=True)]
+@ZONES
+def fence(*corners: float) -> list[Zone]:
+    """Polygon to stay within: x, y of each corner, or x0, x1, y0, y1 of a rectangle."""
+    if len(corners) != 4:
+        return [Zone("", _ring(_points(corners, 3, "fence")), is_fence=True)]
+    x0, x1, y0, y1 = corners
+    if not (x0 < x1 and y0 < y1):
+        raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
+    return [Zone("", _corners(x0, x1, y0, y1), is_fence=True)]
 
 
-def _corridor(written: str, text: str) -> list[Zone]:
-    width, *rest = _numbers(text)
-    middle = _points(rest, 2, "corridor")
-    way = np.diff(middle, axis=0)
+@ZONES
+def corridor(width: float, *middle: float) -> list[Zone]:
+    """Corridor to stay within: its width, and x, y of each point of its middle."""
+    points = _points(middle, 2, "corridor")
+    way = np.diff(points, axis=0)
     long = np.linalg.norm(way, axis=1, keepdims=True)
     if width <= 0.0 or (long < 1e-6).any():
         raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
@@ -320,29 +301,27 @@ def _corridor(written: str, text: str) -> list[Zone]:
     if (square[1:-1] < 0.1).any():
         raise ValueError("a corridor without a turn back")
     ends[1:-1] *= 2.0 / square[1:-1]
-    sides = [middle + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
-    return [Zone(written, np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
+    sides = [points + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
+    return [Zone("", np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
 
 
-def _geojson(written: str, text: str) -> list[Zone]:
-    file = _file(text)
-    content = files.read(Path(file), FILE_BYTES_MAX)
+@ZONES
+def geojson(file: File) -> list[Zone]:
+    """Features of a GeoJSON file, see docs/together.md."""
     try:
-        told = json.loads(content)
+        collection = json.loads(file.content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"a GeoJSON file ({error})") from None
     found: list[Zone] = []
     corners = 0
-    for zone in _features(f"{Path(file).name}", told):
+    for zone in _features(file.name.rpartition("/")[2], collection):
         found.append(zone)
         corners += len(zone.corners)
         if corners > CORNERS_MAX:  # each ring takes a time in the square of its corners
             raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
-    return found or _none(written)
-
-
-def _none(written: str) -> list[Zone]:
-    raise ValueError(f"a feature with a Polygon, a MultiPolygon or a Point in {written}")
+    if not found:
+        raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
+    return found
 
 
 def _features(file: str, told: Any) -> Iterator[Zone]:
@@ -518,10 +497,6 @@ def _near(places: Array, most_m: float) -> Array:
     return places
 
 
-def _file(text: str) -> str:
-    return text.strip().strip('"')
-
-
 def _corners(x0: float, x1: float, y0: float, y1: float) -> Array:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
@@ -532,17 +507,7 @@ def _around(x: float, y: float, radius: float) -> Array:
     return np.array([x, y]) + out * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _points(given: list[float], least: int, name: str) -> Array:
+def _points(given: Sequence[float], least: int, name: str) -> Array:
     if len(given) % 2 or len(given) < 2 * least:
         raise ValueError(f"{name} with at least {least} points: x, y, x, y, …")
     return np.array(given).reshape(-1, 2)
-
-
-_KINDS: dict[str, Callable[[str, str], list[Zone]]] = {
-    "box": _box,
-    "cylinder": _cylinder,
-    "polygon": _polygon,
-    "fence": _fence,
-    "corridor": _corridor,
-    "geojson": _geojson,
-}

@@ -23,9 +23,10 @@ from skytether.shared.base import kernel
 from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
-from skytether.shared.scenario.schema import ReferenceConfig, Scenario
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, plugins, terminal
@@ -204,8 +205,8 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     try:
         with Path(mission).open(encoding="utf-8") as table:
             axes = 3 if "z" in table.readline().strip().split(",") else 2
-        table_of = ReferenceConfig(shape="mission", file=mission)
-        lasts_s = read_mission(table_of.table, axes).lasts_s
+        (read,) = reading.files_of("reference.file", mission)
+        lasts_s = read_mission(read.content, axes).lasts_s
     except (OSError, ValueError) as error:
         raise CommandError(f"--mission: {mission}: {error}", command.CONFIGURATION) from None
     shape = ["--reference.shape", "mission", "--reference.file", mission]

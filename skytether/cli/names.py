@@ -22,7 +22,7 @@ def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[st
     options.read(ListingOptions(), argv, f"skytether {title}", about)
     for name, entry in table.items():
         source = "" if entry.is_ours else f" (from {entry.source})"
-        print(f"{table.written(name)}\n    {entry.about}{source}")
+        print(f"{entry.form(name)}\n    {entry.about}{source}")
 
 
 triggers = partial(

@@ -49,7 +49,7 @@ def set_keys(argv: Sequence[str]) -> None:
 
 
 def parsed(changes: Sequence[str]) -> dict[str, Any]:
-    """Values by key, parsed from texts such as `control.epsilon=2`.
+    """Values by key, parsed from texts such as `control.horizon=60`.
 
     Raises:
         CommandError: a text is no assignment, a key comes twice, or all together exceed a request.

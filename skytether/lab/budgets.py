@@ -26,7 +26,7 @@ from skytether.lab.contenders import (
 from skytether.lab.sweep import GridAxis, Results, Sweep
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import lay, value
 from skytether.shared.scenario.schema import Scenario
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
@@ -86,7 +86,7 @@ def flying(
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
     values: list[float | None] = [None]
-    here = getattr(tuned.control, key) if key else None
+    here = value(reading.to_table(tuned), f"control.{key}") if key else None
     if here is not None:
         first = contender.factors.index(1) % scale.every
         scaled = [here * factor for factor in contender.factors[first :: scale.every]]

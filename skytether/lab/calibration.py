@@ -13,7 +13,9 @@ import numpy as np
 
 from skytether.lab import sweep
 from skytether.lab.search import Free, Values, plain
-from skytether.shared.scenario import policies, reading
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.grammar import leaves
+from skytether.shared.scenario.registry import TRIGGERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary
 
@@ -123,10 +125,13 @@ REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
 """Key of a trajectory that the server knows ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
-    "state_gap": (Free("control.epsilon", 1e-4, 1e8), Free("control.decay_rate", 1e-2, 1e2)),
-    "cost_gap": (Free("control.cost_gap", 1e-6, 1e6),),
-    "expected_gap": (Free("control.cost_gap", 1e-6, 1e6),),
-    "deviation": (Free("control.deviation_m", 1e-4, 1e1),),
+    "state_gap": (
+        Free("control.trigger.state_gap.epsilon", 1e-4, 1e8),
+        Free("control.trigger.state_gap.decay_rate", 1e-2, 1e2),
+    ),
+    "cost_gap": (Free("control.trigger.cost_gap", 1e-6, 1e6),),
+    "expected_gap": (Free("control.trigger.expected_gap", 1e-6, 1e6),),
+    "deviation": (Free("control.trigger.deviation", 1e-4, 1e1),),
 }
 """Keys of each policy that looks at the state, which are searched for so that weights and policy
 together decide what is sent."""
@@ -139,9 +144,9 @@ HERE = "here"
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:
-    """Keys of the policies in a trigger; none for a policy whose numbers stand in the trigger."""
-    bare = (each.name for each in policies.policies(policies.parse(trigger)) if not each.values)
-    keys = (key for name in bare for key in TRIGGER_KEYS.get(name, ()))
+    """Keys of the policies in a trigger."""
+    names = (each.name for each in leaves(TRIGGERS.parse(trigger)))
+    keys = (key for name in names for key in TRIGGER_KEYS.get(name, ()))
     return list(dict.fromkeys(keys))
 
 
@@ -205,7 +210,7 @@ class Rmse:
 
     def _binds(self) -> bool:
         """Whether the share of packets depends on the flight."""
-        named = policies.policies(policies.parse(self.scenario.control.trigger))
+        named = leaves(TRIGGERS.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 
 

@@ -61,7 +61,7 @@ class Contender:
         """Multiples of the found threshold, each one point of the curve."""
         if not self.threshold:
             return ()
-        return PERIODS if self.threshold == "period" else NEAR
+        return PERIODS if self.threshold == "trigger.periodic" else NEAR
 
 
 LOOSE = {
@@ -103,34 +103,45 @@ TRAJECTORY = {
 """Scheme that sends no inputs, but a trajectory, along which the vehicle regulates itself."""
 
 ALWAYS = {"trigger": "always"}
-PERIODIC = {"trigger": "periodic", "period": 10}
-STATE_GAP = {"trigger": "state_gap", "epsilon": 5e4}
-COST_GAP = {"trigger": "cost_gap", "cost_gap": 300.0}
-EXPECTED_GAP = {"trigger": "expected_gap", "cost_gap": 300.0}
-SILENT = {"trigger": "cost_gap | silence(1)", "cost_gap": 3.0}
-ACKNOWLEDGED = {"trigger": "expected_gap | heartbeat", "cost_gap": 3.0}
+PERIODIC = {"trigger": "periodic(10)"}
+STATE_GAP = {"trigger": "state_gap(5e4, 1.5)"}
+COST_GAP = {"trigger": "cost_gap(300.0)"}
+EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
+SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
+ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
 """Triggers of a trajectory, whose gap is the cost of an instant, not of a horizon."""
 
 
 def _contenders() -> tuple[Contender, ...]:
     """All contenders, family by family."""
     every, periodic, gap, expected = "every step", "periodic", "cost gap", "expected gap"
+    steps, cost, doubted = "trigger.periodic", "trigger.cost_gap", "trigger.expected_gap"
     committed, aboard, spline = "committed", "committed with feedback", "trajectory"
     return (
         Contender("paper-every-step", "paper", every, PAPER | ALWAYS),
-        Contender("paper-event", "paper", "eq. (16)", PAPER | STATE_GAP, "epsilon"),
-        Contender("paper-periodic", "paper", periodic, PAPER | PERIODIC, "period"),
-        Contender("committed-gap", committed, gap, COMMITTED | COST_GAP, "cost_gap"),
+        Contender("paper-event", "paper", "eq. (16)", PAPER | STATE_GAP, "trigger.state_gap"),
+        Contender("paper-periodic", "paper", periodic, PAPER | PERIODIC, steps),
+        Contender("committed-gap", committed, gap, COMMITTED | COST_GAP, cost),
         Contender("feedback-every-step", aboard, every, FEEDBACK | ALWAYS),
-        Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, "period"),
-        Contender("feedback-gap", aboard, gap, FEEDBACK | COST_GAP, "cost_gap"),
-        Contender("feedback-expected", aboard, expected, FEEDBACK | EXPECTED_GAP, "cost_gap"),
+        Contender("feedback-periodic", aboard, periodic, FEEDBACK | PERIODIC, steps),
+        Contender("feedback-gap", aboard, gap, FEEDBACK | COST_GAP, cost),
+        Contender("feedback-expected", aboard, expected, FEEDBACK | EXPECTED_GAP, doubted),
         Contender("trajectory-every-step", spline, every, TRAJECTORY | ALWAYS),
-        Contender("trajectory-periodic", spline, periodic, TRAJECTORY | PERIODIC, "period"),
+        Contender("trajectory-periodic", spline, periodic, TRAJECTORY | PERIODIC, steps),
         Contender(
-            "trajectory-gap", spline, "cost gap or a second", TRAJECTORY | SILENT, "cost_gap"
+            "trajectory-gap",
+            spline,
+            "cost gap or a second",
+            TRAJECTORY | SILENT,
+            cost,
         ),
-        Contender("trajectory-expected", spline, expected, TRAJECTORY | ACKNOWLEDGED, "cost_gap"),
+        Contender(
+            "trajectory-expected",
+            spline,
+            expected,
+            TRAJECTORY | ACKNOWLEDGED,
+            doubted,
+        ),
     )
 
 
@@ -162,8 +173,7 @@ class Case:
     contenders: Sequence[str] = ()
     """Names of the contenders that fly the case; empty for all."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Keys of `control` and their initial values in searches of this case, for contenders that have
-    them."""
+    """Thresholds and their initial values in searches of this case."""
 
 
 TARGET = {
@@ -186,15 +196,15 @@ def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
 
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
     """Case that flies the paper's circle, where costs are hundreds of times smaller."""
-    small = {"cost_gap": 1.0, "epsilon": 300.0}
+    small = {"trigger.cost_gap": 1.0, "trigger.expected_gap": 1.0, "trigger.state_gap": 300.0}
     round_ = {**keys, "duration": 32.5}  # one full circle after the time that RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
-def _network(**keys: Any) -> Mapping[str, Any]:
-    """Keys of both directions of the network."""
-    ways = ("uplink", "downlink")
-    return {f"network.{way}.{key}": value for way in ways for key, value in keys.items()}
+def _network(argument: str, value: Any) -> Mapping[str, Any]:
+    """Keys of both directions of the network: their whole text, or an argument in it."""
+    at = f".{argument}" if argument else ""
+    return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 
 
 def _noise(position_m: float) -> Mapping[str, Any]:
@@ -205,6 +215,7 @@ def _noise(position_m: float) -> Mapping[str, Any]:
     }
 
 
+BURSTS = "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)"
 GUSTS = {"vehicle.gust_mps2": 1.0, "vehicle.gust_every_s": 10.0, "vehicle.gust_s": 1.0}
 WINDY = {"vehicle.wind": 0.3, "vehicle.gain": 0.8}
 CASES = (
@@ -216,11 +227,15 @@ CASES = (
         {**TARGET, "reference.turn_every_s": 4.0},
         0.3,
     ),
-    _unsearched("loss-0.3", "loss of 0.3 each way", _network(loss=0.3)),
-    _unsearched("loss-0.5", "loss of 0.5 each way", _network(loss=0.5)),
+    _unsearched("loss-0.3", "loss of 0.3 each way", _network("loss", 0.3)),
+    _unsearched("loss-0.5", "loss of 0.5 each way", _network("loss", 0.5)),
     _unsearched("wind-gain", "wind of 0.3 m/s per √s, and a gain of 0.8", WINDY),
-    _unsearched("jitter", "jitter doubled", _network(minimum_s=0.36, slot_s=0.04, slots_mean=2.0)),
-    _unsearched("burst-2", "bursts of 2 s", _network(burst_s=2.0)),
+    _unsearched("jitter", "jitter doubled", _network("", "paper(0.36, 0.04, 2.0) & loss(0.1)")),
+    _unsearched(
+        "burst-2",
+        "bursts of 2 s",
+        _network("", BURSTS),
+    ),
     _unsearched("noise-10", "noise of 10 cm", _noise(0.1)),
     Case(
         "route",
@@ -329,8 +344,9 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
 def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Scenario:
     """Scenario from which the search for a contender's weights in a case begins."""
     table = reading.to_table(reading.load(case.plant))
-    control = {key: case.start.get(key, value) for key, value in contender.control.items()}
-    lay({f"control.{key}": value for key, value in control.items()}, table)
+    lay({f"control.{key}": value for key, value in contender.control.items()}, table)
+    if contender.threshold in case.start:
+        lay({f"control.{contender.threshold}": case.start[contender.threshold]}, table)
     lay(case.keys, table)
     lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
     return reading.check(table, f"{contender.title}, {case.title}")

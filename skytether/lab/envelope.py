@@ -71,9 +71,10 @@ def draw(seed: int, number: int) -> dict[str, Any]:
     loss_max = float(rng.choice(LOSSES_MAX))
     keys: dict[str, Any] = {}
     for direction in ("uplink", "downlink"):
-        keys[f"network.{direction}.delay"] = str(rng.choice(("constant", "poisson")))
-        keys[f"network.{direction}.minimum_s"] = _short(rng.uniform(0.0, DELAY_MAX_S))
-        keys[f"network.{direction}.loss"] = _short(rng.uniform(0.0, loss_max))
+        is_constant = rng.choice(("constant", "poisson")) == "constant"
+        least_s, loss = _short(rng.uniform(0.0, DELAY_MAX_S)), _short(rng.uniform(0.0, loss_max))
+        delay = f"constant({least_s})" if is_constant else f"paper({least_s}, 0.02, 2.0)"
+        keys[f"network.{direction}"] = f"{delay} & loss({loss})"
     keys["control.dt"] = _short(DT_MIN_S * (DT_MAX_S / DT_MIN_S) ** rng.random())
     keys["control.horizon"] = int((HORIZON_MAX + 1) ** rng.random())
     keys["control.feedback"] = bool(rng.integers(2))

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 
 from skytether.figures.flights import save
 from skytether.figures.page import blank
@@ -14,7 +13,7 @@ from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
 from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.air.path import path as path_of
 
 OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
     "refused": {"color": "0.82", "marker": "."},
@@ -45,17 +44,18 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
         return np.array([each[key] for each in keys])
 
     outcomes = np.array([point.outcome for point in points])
-    up_s, down_s = (_mean_delays_s(plan.scenario, way, keys) for way in ("uplink", "downlink"))
-    loss = np.maximum(column("network.uplink.loss"), column("network.downlink.loss"))
+    ways = [[path_of(each[f"network.{way}"]) for each in keys] for way in ("uplink", "downlink")]
+    up_s, down_s = (np.array([each.mean_s for each in paths]) for paths in ways)
+    loss = np.max([[each.loss for each in paths] for paths in ways], axis=0)
     trip_s, covers_s = up_s + down_s, column("control.horizon") * column("control.dt")
     figure = blank(10.0, 9.0)
-    (cover, bars), (ways, losses) = figure.subplots(2, 2)
+    (cover, bars), (delays, losses) = figure.subplots(2, 2)
     shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
     for outcome, here in shown.items():
         style: Any = {**OUTCOMES[outcome], "s": _size(outcome, len(points)), "linewidths": 0.0}
         cover.scatter(trip_s[here], covers_s[here], **style)
         long = here & (covers_s >= trip_s)
-        ways.scatter(up_s[long], down_s[long], **style)
+        delays.scatter(up_s[long], down_s[long], **style)
         losses.scatter(trip_s[long], loss[long], **style)
     line_s = np.geomspace(0.01, float(trip_s.max()), 100)
     cover.plot(line_s, line_s, "k-", linewidth=1.0)
@@ -63,15 +63,15 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     cover.set_ylabel("what a horizon covers, H · Δt [s]")
     cover.set_title("all points; above the line a horizon covers a round trip", fontsize=10)
     losses.set_ylabel("loss, the larger of both ways")
-    for plane in (ways, losses):
+    for plane in (delays, losses):
         plane.set_title("where a horizon covers a round trip", fontsize=10)
     for plane in (cover, losses):
         plane.set_xlabel("mean round trip [s]")
-    ways.set_xlabel("mean delay to the vehicle [s]")
-    ways.set_ylabel("mean delay to the server [s]")
-    ways.set_aspect("equal", adjustable="box")
+    delays.set_xlabel("mean delay to the vehicle [s]")
+    delays.set_ylabel("mean delay to the server [s]")
+    delays.set_aspect("equal", adjustable="box")
     _stack(bars, covers_s / trip_s, shown)
-    for plane in (cover, ways, losses):
+    for plane in (cover, delays, losses):
         plane.grid(alpha=0.3)
     patches = [
         Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {here.sum()}")
@@ -86,14 +86,6 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
         handlelength=1.0,
     )
     save(figure, path, dpi=100)
-
-
-def _mean_delays_s(scenario: Scenario, way: str, keys: Sequence[Mapping[str, Any]]) -> Array:
-    """Mean delay of a direction at each point [s]; shape (points,)."""
-    base: DirectionConfig = getattr(scenario.network, way)
-    names = ("delay", "minimum_s")
-    changed = ({name: each[f"network.{way}.{name}"] for name in names} for each in keys)
-    return np.array([replace(base, **changes).mean_s for changes in changed])
 
 
 def _size(outcome: Outcome, points: int) -> float:
@@ -130,8 +122,8 @@ OTHER_UNITS = {
     "control.dt": "s",
     "control.horizon": "steps",
     "control.delay_bound": "s",
-    "control.period": "steps",
-    "control.decay_rate": "1/s",
+    "control.trigger.periodic": "steps",
+    "control.trigger.state_gap.decay_rate": "1/s",
     "model.u_max": "m/s",
     "vehicle.wind": "m/s per √s",
 }

@@ -20,7 +20,7 @@ import msgspec
 from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.dotted import flat
-from skytether.shared.scenario.schema import TABLES, Scenario
+from skytether.shared.scenario.schema import Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
 
@@ -42,13 +42,6 @@ class Journal(Generic[E]):
     """
 
     def __init__(self, folder: Path | None, settings: Mapping[str, Any], kind: type[E]) -> None:
-        self.files: Mapping[str, str] = {
-            file: known
-            for file, known in settings.get("files", {}).items()
-            if not file.endswith(".py") and Path(file).is_file()
-        }
-        """Digest of every file that the results depend on, by its path. Plug-ins are none: they
-        are passed to workers with their content."""
         self.results: dict[str, E] = {}
         """Results by the names of their cells, see `name_of`."""
         self._file: BinaryIO | None = None
@@ -129,10 +122,10 @@ def sealed(content: bytes) -> bytes:
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
     """Digests of all files and plug-ins that some scenarios name, as a part of the settings."""
-    files = {each.reference.file for each in scenarios if each.reference.shape in TABLES}
+    files = {file.name: digest(file.content) for each in scenarios for file in each.files}
     entries = (entry for each in scenarios for entry in each.entries())
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
-    return plugged | {file: digest(Path(file).read_bytes()) for file in sorted(files)}
+    return plugged | dict(sorted(files.items()))
 
 
 def digest(content: bytes) -> str:

@@ -24,6 +24,7 @@ from skytether.lab.journal import digests
 from skytether.lab.margins import Differing, growth_of, hovering, windless
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
@@ -109,10 +110,11 @@ class Box:
         """Scenario of a point, without wind."""
         burst_s, dead_time_s, gain, tau = self.places[number]
         network = self.scenario.network
-        uplink, downlink = (
-            replace(direction, burst_s=burst_s) for direction in (network.uplink, network.downlink)
-        )
-        network = replace(network, uplink=uplink, downlink=downlink)
+        if burst_s:
+            uplink, downlink = (
+                _in_bursts(each, burst_s) for each in (network.uplink, network.downlink)
+            )
+            network = replace(network, uplink=uplink, downlink=downlink)
         return Differing(tau, gain, dead_time_s).of(
             replace(windless(self.scenario), network=network)
         )
@@ -143,6 +145,14 @@ class Box:
             [number, *place, *msgspec.structs.astuple(point)] for number, (place, point) in each
         ]
         return to_csv(["number", *Place._fields, *MapPoint.__struct_fields__], rows)
+
+
+def _in_bursts(direction: str, burst_s: float) -> str:
+    """A direction whose losses come in bursts of a mean length."""
+    calls = IMPAIRMENTS.calls(direction)
+    share = next((call.values[0] for call in calls if call.name == "loss"), 0.0)
+    others = [call.text for call in calls if call.name != "loss"]
+    return " & ".join([*others, f"gilbert_elliott({share}, {burst_s})"])
 
 
 def at_rest(scenario: Scenario) -> Scenario:

@@ -26,7 +26,8 @@ from msgspec.structs import replace
 
 from skytether.lab.intervals import interval, jackknife
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import policies
+from skytether.shared.scenario.grammar import leaves
+from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
 from skytether.shared.scenario.schema import ReferenceConfig, Scenario, SensorConfig
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import AT_BOUND
@@ -87,7 +88,7 @@ class Differing(NamedTuple):
         )
         if self.delay_s:
             uplink, downlink = (
-                replace(each, impairments=" & ".join(filter(None, (each.text, later))))
+                " & ".join(filter(None, (each, later)))
                 for later in [f"constant({self.delay_s!r})"]
                 for each in (network.uplink, network.downlink)
             )
@@ -154,8 +155,8 @@ class Limit(msgspec.Struct, frozen=True, kw_only=True):
 
 def looks_at_state(scenario: Scenario) -> bool:
     """Whether the trigger looks at the state, and so has a threshold."""
-    trigger, splines = policies.parse(scenario.control.trigger), scenario.terms().splines
-    return not splines and any(each.name not in CLOCK_ONLY for each in policies.policies(trigger))
+    trigger, splines = TRIGGERS.parse(scenario.control.trigger), scenario.terms().splines
+    return not splines and any(each.name not in CLOCK_ONLY for each in leaves(trigger))
 
 
 def clocked_trigger(scenario: Scenario) -> str:
@@ -163,7 +164,7 @@ def clocked_trigger(scenario: Scenario) -> str:
     if not looks_at_state(scenario):
         return scenario.control.trigger
     events = np.concatenate([each.server["event"] for each in _flown(scenario, RATE_RUNS)])
-    period = max(1, round(1.0 / max(events.mean(), 1.0 / policies.PERIOD_MAX)))
+    period = max(1, round(1.0 / max(events.mean(), 1.0 / PERIOD_MAX)))
     return f"periodic({period})"
 
 
@@ -186,8 +187,7 @@ def hovering(scenario: Scenario, duration: float) -> Scenario:
 
 def settled_s(scenario: Scenario) -> float:
     """Time after which a flight is stationary [s], see SETTLE_S."""
-    network = scenario.network
-    return SETTLE_S + ROUND_TRIPS * (network.uplink.mean_s + network.downlink.mean_s)
+    return SETTLE_S + ROUND_TRIPS * (scenario.uplink.mean_s + scenario.downlink.mean_s)
 
 
 def windless(scenario: Scenario) -> Scenario:

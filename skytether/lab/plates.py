@@ -28,7 +28,8 @@ from skytether.lab.studies import (
 )
 from skytether.lab.sweep import by_name, estimate
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.scenario.schema import ControlConfig, DirectionConfig, Scenario
+from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
+from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import Summary, desired, summarise
 
@@ -75,22 +76,23 @@ def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Pla
     return Plate(name, title, says, png, pdf.getvalue(), csv)
 
 
-def delay(direction: DirectionConfig, delay_ms: Array) -> Plate:
+def delay(direction: str, delay_ms: Array) -> Plate:
     """Fig. 2: the delay (17), and the delay that netem added.
 
     Args:
         delay_ms: measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2).
     """
     took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
-    first_ms, slot_ms = direction.minimum_s * 1e3, direction.slot_s * 1e3
-    count = int(stats.poisson.ppf(0.9999, direction.slots_mean)) + 2
+    least_s, slot_s, slots_mean, *_ = map(float, IMPAIRMENTS.calls(direction)[0].values)
+    first_ms, slot_ms = least_s * 1e3, slot_s * 1e3
+    count = int(stats.poisson.ppf(0.9999, slots_mean)) + 2
     slots = np.arange(count)
-    lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, direction.slots_mean)
+    lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, slots_mean)
     # A packet can be late, never early: any excess of up to a slot is assigned to the drawn slot.
     nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
     share = np.array([np.mean(nearest == slot) for slot in slots])
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
-    cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), direction.slots_mean)
+    cdf = stats.poisson.cdf(np.floor((fine_ms - first_ms) / slot_ms + 1e-9), slots_mean)
     took_cdf = np.searchsorted(np.sort(took_ms), fine_ms, side="right") / len(took_ms)
     with lettered(PAGE, 2.4, LETTERS) as figure:
         left, right = figure.subplots(1, 2)
@@ -196,13 +198,14 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
         here: the paper's own λ and ε, which a cross marks.
     """
     decay, epsilon, rmse, ratio = _grid(flown)
+    here_epsilon, here_decay = TRIGGERS.one(here.trigger).values
     with lettered(PAGE, 2.8, LETTERS) as figure:
         panes = figure.subplots(1, 2)
         names = ("RMSE xy [m]", "event ratio")
         for plane, values, name in zip(panes, (rmse, ratio), names, strict=True):
             mesh = plane.pcolormesh(decay, epsilon, values.T, shading="nearest")
             plane.grid(visible=False)
-            plane.plot(here.decay_rate, here.epsilon, "wx", markeredgewidth=1.5)
+            plane.plot(here_decay, here_epsilon, "wx", markeredgewidth=1.5)
             plane.set_xlabel(DECAY)
             plane.set_ylabel(EPSILON)
             figure.colorbar(mesh, label=name)
@@ -387,7 +390,7 @@ def intervals(samples: Samples) -> Plate:
     )
     steps = np.arange(1, int(gaps.max()) + 1)
     counts = np.array([np.sum(gaps == step) for step in steps])
-    regular = samples[PERIODIC][0].control.period
+    (regular,) = map(int, TRIGGERS.one(samples[PERIODIC][0].control.trigger).values)
     with lettered(COLUMN, 2.4, LETTERS) as figure:
         plane = figure.subplots()
         dt = scenario.control.dt

@@ -13,7 +13,8 @@ import numpy as np
 
 from skytether.lab.journal import digests
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario import reading
+from skytether.shared.scenario import dotted, reading
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 
 SIGMA = 0.1
@@ -50,19 +51,18 @@ class Free:
 
     def of(self, table: Any) -> float:
         """Value of the key in a scenario's table."""
-        for name in self._path():
-            table = table[name]
-        return float(table)
+        *sections, last = self.key.split(".")
+        if last.isdigit():
+            return float(dotted.value(table, ".".join(sections))[int(last)])
+        return float(dotted.value(table, self.key))
 
     def put(self, table: Any, value: float) -> None:
         """Set the key in a scenario's table."""
-        *path, last = self._path()
-        for name in path:
-            table = table[name]
-        table[last] = value
-
-    def _path(self) -> list[str | int]:
-        return [int(name) if name.isdigit() else name for name in self.key.split(".")]
+        *sections, last = self.key.split(".")
+        if last.isdigit():
+            dotted.value(table, ".".join(sections))[int(last)] = value
+        else:
+            dotted.lay({self.key: value}, table)
 
 
 def check_free(free: Sequence[Free], start: Scenario) -> None:
@@ -74,7 +74,7 @@ def check_free(free: Sequence[Free], start: Scenario) -> None:
     for key in free:
         try:
             value = key.of(plain(start))
-        except (KeyError, IndexError, TypeError, ValueError):
+        except (KeyError, IndexError, TypeError, ValueError, GrammarError):
             raise ConfigError(
                 f"--free: got {key.key}, expected the key of a number, as in model.tau_s.0"
             ) from None

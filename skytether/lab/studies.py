@@ -16,6 +16,7 @@ import numpy as np
 from skytether.lab.calibration import COLUMNS, TABLE_1, deviations
 from skytether.lab.intervals import Estimate, interval
 from skytether.lab.sweep import GridAxis, Results, Sweep, estimate
+from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary
 
@@ -125,7 +126,7 @@ class Study:
 
 def periodic(steps: int) -> Mapping[str, Any]:
     """Keys and values of periodic sending with so many steps between packets."""
-    return {"control.trigger": "periodic", "control.period": steps}
+    return {"control.trigger": f"periodic({steps})"}
 
 
 def period(runs: Sequence[Summary]) -> int:
@@ -149,8 +150,10 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
     """Studies that are usual in the literature: loss, delay, jitter, a wrong model, other
     clocks.
     """
-    up, n = scenario.network.uplink, scale.points
-    slots_s = up.slot_s * up.slots_mean
+    up, n = scenario.uplink, scale.points
+    (paper, _) = IMPAIRMENTS.calls(scenario.network.uplink)
+    _, slot_s, slots_mean, _ = map(float, paper.values)
+    slots_s = slot_s * slots_mean
 
     def study(
         name: str,
@@ -163,14 +166,15 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
         axis = GridAxis(name, rounded, tuple(map(changes, rounded)))
         return Study(name, label, scenario, axis, scale.curve_runs, here)
 
-    def both_ways(**keys: float) -> dict[str, Any]:
+    def both_ways(keys: Mapping[str, float]) -> dict[str, Any]:
         directions = ("uplink", "downlink")
         return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
 
     def jitter(std_ms: float) -> Mapping[str, Any]:
         # A Poisson number of slots has variance = mean; the mean delay is kept.
-        slots = (std_ms / 1e3 / up.slot_s) ** 2
-        return both_ways(slots_mean=slots, minimum_s=round(up.mean_s - up.slot_s * slots, 9))
+        slots = (std_ms / 1e3 / slot_s) ** 2
+        least_s = round(up.mean_s - slot_s * slots, 9)
+        return both_ways({"paper.slots_mean": slots, "paper.minimum_s": least_s})
 
     return [
         study(
@@ -178,20 +182,20 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
             "share of packets lost, each way",
             np.linspace(0.0, 0.9, n if n < 9 else 10),
             up.loss,
-            lambda loss: both_ways(loss=loss),
+            lambda loss: both_ways({"loss": loss}),
         ),
         study(
             "delay",
             "mean delay, each way [s]",
             np.linspace(slots_s, 2 * up.mean_s - slots_s, n),
             up.mean_s,
-            lambda mean_s: both_ways(minimum_s=round(mean_s - slots_s, 9)),
+            lambda mean_s: both_ways({"paper.minimum_s": round(mean_s - slots_s, 9)}),
         ),
         study(
             "jitter",
             "standard deviation of the delay, each way [ms]",
             np.linspace(0.0, 90.0, n if n < 9 else 10),
-            up.slot_s * math.sqrt(up.slots_mean) * 1e3,
+            slot_s * math.sqrt(slots_mean) * 1e3,
             jitter,
         ),
         study(
@@ -216,15 +220,15 @@ def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
     decay = np.linspace(0.5, 5.0, scale.cells).tolist()
     epsilon = np.linspace(0.9, 9.0, scale.cells).tolist()
     axes = [
-        GridAxis("control.decay_rate", tuple(round(value, 9) for value in decay)),
-        GridAxis("control.epsilon", tuple(round(value, 9) for value in epsilon)),
+        GridAxis("control.trigger.state_gap.decay_rate", tuple(round(value, 9) for value in decay)),
+        GridAxis("control.trigger.state_gap.epsilon", tuple(round(value, 9) for value in epsilon)),
     ]
     return Sweep(SCENARIO, scenario, axes, scale.map_runs)
 
 
 def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
     """Sweep of periodic sending for Fig. 5, from every step to very rarely."""
-    axis = GridAxis("control.period", scale.periods, tuple(map(periodic, scale.periods)))
+    axis = GridAxis("control.trigger.periodic", scale.periods, tuple(map(periodic, scale.periods)))
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
 
@@ -282,7 +286,9 @@ def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly:
         secondly: finished tasks of the second sweep.
     """
     found = {key: MethodFlights(runs) for key, runs in flown(first, firstly).items()}
-    periods = [keys["control.period"] for _, keys in second.axes[0].points()]
+    periods = [
+        int(TRIGGERS.one(keys["control.trigger"]).values[0]) for _, keys in second.axes[0].points()
+    ]
     for steps, ((value,), runs) in zip(periods, flown(second, secondly).items(), strict=True):
         found[value, PERIODIC] = MethodFlights(runs, steps)
     return {

@@ -59,7 +59,7 @@ class GridAxis:
 
 
 def parse_axis(text: str) -> GridAxis:
-    """Grid from a user's text: `control.epsilon=0.5:8:10` or `control.scheme=committed,none`.
+    """Grid from a user's text: `vehicle.wind=0:0.5:6` or `control.scheme=committed,none`.
 
     Raises:
         ConfigError: the text has another form, or a value twice.

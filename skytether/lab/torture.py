@@ -48,6 +48,7 @@ from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.core.steady import JUMP_NS, Steady
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
@@ -85,7 +86,7 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
     scheme = ("committed", "committed", "predictive")[kind]
     dt_s, axes = (0.05, 0.1)[rng.choice(2, p=(0.25, 0.75))], (2, 3)[rng.integers(2)]
     delay_s = round(float(np.exp(rng.uniform(np.log(0.005), np.log(0.4)))), 3)
-    direction = {"delay": "poisson", "minimum_s": delay_s, "slot_s": delay_s / 20.0, "loss": 0.0}
+    direction = f"paper({delay_s!r}, {delay_s / 20.0!r}, 2.0)"
     table: dict[str, Any] = {
         "seed": seed,
         "duration": 86_400.0,
@@ -494,8 +495,9 @@ def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
         restarts: whether vehicles are restarted: then the server may wait for the end of the
             earlier life.
     """
-    direction = scenario.network.uplink
-    trip_ns = 2 * seconds_to_ns(direction.minimum_s + 8 * direction.slot_s)
+    (paper,) = IMPAIRMENTS.calls(scenario.network.uplink)
+    least_s, slot_s, *_ = map(float, paper.values)
+    trip_ns = 2 * seconds_to_ns(least_s + 8 * slot_s)
     noticed_ns = WELCOME_NS if restarts else seconds_to_ns(scenario.link.timeout_s)
     return noticed_ns + 2 * AGAIN_NS + GOOD_NS + 4 * trip_ns + 4 * scenario.dt_ns
 

@@ -8,13 +8,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from errno import EMFILE
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import msgspec
 
@@ -26,6 +26,7 @@ from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, NoFailsafe, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 from skytether.shell.options import Argument, asks_help, key_values, read
@@ -127,29 +128,14 @@ def parse(
     options = read(defaults, argv, prog, help_)
     name = options.scenario
     base = reading.load_base(name)
-    table = _laid(base, values)
+    table = reading.to_table(base)
+    lay(values, table)
     read_scenario = reading.check if is_final else reading.convert
     source = name if table == reading.to_table(base) else f"{name} and the command line"
     checked = read_scenario(table, source)
     for option in OUTPUTS:
         claim_output(f"--{option}", getattr(options, option, None))
     return replace(options, config=checked)  # type: ignore[type-var]
-
-
-def _laid(scenario: Scenario, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Table of a scenario with values of keys; unknown keys stay in it, for the check to find."""
-    whole = {f"network.{way}": way for way in reading.DIRECTIONS}
-    directions = {whole[key]: text for key, text in values.items() if key in whole}
-    table = reading.to_table(reading.with_directions(scenario, directions))
-    for key in values.keys() - whole.keys():
-        *sections, name = key.split(".")
-        below: Any = table
-        for section in sections:
-            below = below.setdefault(section, {})
-            if not isinstance(below, dict):
-                raise ConfigError(f"{key}: no such key")
-        below[name] = values[key]
-    return table
 
 
 def address(flag: str, text: str) -> Address:

@@ -136,8 +136,6 @@ def _kinds(key: str) -> frozenset[Any]:
         kind = get_type_hints(kind).get(name) if hasattr(kind, "__struct_fields__") else None
     if kind is None:
         return frozenset()
-    if hasattr(kind, "__struct_fields__"):  # a direction of the network may be a text
-        return frozenset({str})
     kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     words = {type(word) for each in kinds if get_origin(each) is Literal for word in get_args(each)}
     return frozenset(words | {get_origin(each) or each for each in kinds} - {Literal})

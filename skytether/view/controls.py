@@ -9,23 +9,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
-
-from skytether.shared.scenario import policies, registry
-from skytether.shared.scenario.policies import PolicyError
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario import dotted, registry
+from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.schemes import properties
 
 Values = Mapping[str, Any]
 """Values by key."""
-Read = Callable[[Values], float]
+Read = Callable[[Values], float | None]
 Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
 """Both directions of the network."""
 ALL_LOST = " & loss(1)"
 """Text appended to a direction's impairments to lose every packet."""
-MODES_OF_DELAY = {"none": "constant"}
-"""Delay law that replaces the present one where packets are to be delayed."""
+LOST = ("loss(1)", "loss(1.0)")
+"""Ends of texts of directions that lose every packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,80 +33,78 @@ class Knob:
     hint: str
     process: str
     """Process that owns the keys: server, netem or client."""
-    key: str
-    """Key that must be changeable for the number to be offered."""
     low: float
     high: float
     """Upper end of the slider; raised if the present value is higher."""
     step: float
     read: Read
-    """Function that reads the number from the process's values."""
+    """Function that reads the number from the process's values; None: there is none."""
     write: Write
     """Function that returns the changed keys and values, given the present values."""
 
 
 def texts(values: Values) -> dict[str, str]:
     """Network directions as texts, by key; empty where they may not change."""
-    return {way: _direction(values, way).text for way in WAYS if f"{way}.impairments" in values}
-
-
-def is_written(values: Values) -> bool:
-    """Whether a direction is written as a text, which sliders cannot change."""
-    return any(values.get(f"{way}.impairments") for way in WAYS)
+    return {way: values[way] for way in WAYS if way in values}
 
 
 def cut(values: Values) -> dict[str, Any]:
     """Changes that lose every packet from now on."""
-    changed: dict[str, Any] = {}
-    for way in WAYS:
-        text = values.get(f"{way}.impairments")
-        changed |= {f"{way}.impairments": text + ALL_LOST} if text else {f"{way}.loss": 1.0}
-    return changed
+    return {way: f"{text}{ALL_LOST}" if text else LOST[0] for way, text in texts(values).items()}
 
 
 def is_cut(values: Values) -> bool:
     """Whether every packet is lost, as after `cut`."""
-    return bool(values) and all(
-        values[f"{way}.loss"] == 1.0 or values[f"{way}.impairments"].endswith(ALL_LOST)
-        for way in WAYS
-    )
+    return bool(values) and all(values[way].endswith(LOST) for way in WAYS)
 
 
 def healed(values: Values) -> dict[str, Any]:
     """Changes that undo `cut`."""
-    changed: dict[str, Any] = {}
-    for way in WAYS:
-        text = values[f"{way}.impairments"].removesuffix(ALL_LOST)
-        changed |= {f"{way}.impairments": text} if text else {f"{way}.loss": 0.0}
-    return changed
+    changed = {way: text.removesuffix(ALL_LOST) for way, text in texts(values).items()}
+    return {
+        way: _with(way, text, "loss", 0.0) if text.endswith(LOST) else text
+        for way, text in changed.items()
+    }
 
 
-def _direction(values: Values, way: str) -> DirectionConfig:
-    keys = {key.removeprefix(f"{way}."): value for key, value in values.items()}
-    return msgspec.convert(
-        {name: keys[name] for name in DirectionConfig.__struct_fields__}, DirectionConfig
-    )
+def _with(key: str, text: str, at: str, number: float) -> str:
+    """The text of a key with another argument."""
+    return dotted.TEXTS[key].with_argument(text, at, number)
+
+
+def _number(values: Values, key: str, at: str) -> float | None:
+    """An argument in the text of a key; None where there is none."""
+    try:
+        return float(dotted.TEXTS[key].argument(values[key], at))
+    except (KeyError, GrammarError):
+        return None
 
 
 def _own(key: str) -> tuple[Read, Write]:
-    return lambda values: float(values[key]), lambda _, number: {key: number}
+    return lambda values: values.get(key), lambda _, number: {key: number}
 
 
-def _ways(name: str, scale: float) -> tuple[Read, Write]:
-    """Slider for a key of both directions, which may differ until changed; shown in another
-    unit.
+def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
+    """Slider for the first argument of an impairment in both directions, in another unit.
+
+    Args:
+        names: impairments; that which a direction has is changed.
+        scale: what the argument is multiplied by.
     """
-    return (
-        lambda values: scale * max(float(values[f"{way}.{name}"]) for way in WAYS),
-        lambda _, number: {f"{way}.{name}": number / scale for way in WAYS},
-    )
 
+    def known(values: Values) -> dict[str, tuple[str, float]]:
+        numbers = ((way, name, _number(values, way, name)) for way in WAYS for name in names)
+        return {way: (name, number) for way, name, number in numbers if number is not None}
 
-def _delay(values: Values, number: float) -> dict[str, Any]:
-    """Changes that delay packets by at least so much [ms], also where there was no delay."""
-    laws = {f"{way}.delay": MODES_OF_DELAY.get(values[f"{way}.delay"]) for way in WAYS}
-    least: dict[str, Any] = {f"{way}.minimum_s": number / 1e3 for way in WAYS}
-    return least | {key: law for key, law in laws.items() if law and number}
+    def read(values: Values) -> float | None:
+        found = known(values)
+        return scale * max(number for _, number in found.values()) if found else None
+
+    def write(values: Values, number: float) -> dict[str, Any]:
+        found = known(values).items()
+        return {way: _with(way, values[way], name, number / scale) for way, (name, _) in found}
+
+    return read, write
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
@@ -120,42 +115,38 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
         numbers[axis] = number
         return {key: numbers}
 
-    return lambda values: float(values[key][axis]) if values[key] else 0.0, write
+    def read(values: Values) -> float | None:
+        return None if key not in values else float(values[key][axis]) if values[key] else 0.0
+
+    return read, write
 
 
-def _compared(label: str, hint: str, name: str, high: float, step: float) -> Knob:
-    key = f"control.{name}"
-    return Knob(label, hint, "server", key, 0.0, high, step, *_own(key))
+def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
+    """Slider for an argument of a policy in the trigger."""
+    key = "control.trigger"
+
+    def write(values: Values, number: float) -> dict[str, Any]:
+        return {key: _with(key, values[key], at, number)}
+
+    return Knob(label, hint, "server", 0.0, high, step, lambda each: _number(each, key, at), write)
 
 
 def knobs(axes: int) -> tuple[Knob, ...]:
     """Sliders for vehicles with so many axes that do not depend on the trigger."""
-    up, air = "network.uplink", "vehicle"
-    wind, steady = f"{air}.wind", f"{air}.steady_wind_mps"
+    wind, steady = "vehicle.wind", "vehicle.steady_wind_mps"
     lossy = "Share of packets that are lost, both ways"
     least = "Smallest delay of a packet, each way"
     white = "Strength of white acceleration"
     along = "Velocity that steady wind adds in the long run"
     return (
-        Knob("Loss [%]", lossy, "netem", f"{up}.loss", 0.0, 100.0, 1.0, *_ways("loss", 100.0)),
-        Knob(
-            "Delay [ms]",
-            least,
-            "netem",
-            f"{up}.minimum_s",
-            0.0,
-            1500.0,
-            10.0,
-            _ways("minimum_s", 1e3)[0],
-            _delay,
-        ),
-        Knob("Wind [m/s per √s]", white, "client", wind, 0.0, 1.0, 0.01, *_own(wind)),
+        Knob("Loss [%]", lossy, "netem", 0.0, 100.0, 1.0, *_ways(("loss",), 100.0)),
+        Knob("Delay [ms]", least, "netem", 0.0, 1500.0, 10.0, *_ways(("paper", "constant"), 1e3)),
+        Knob("Wind [m/s per √s]", white, "client", 0.0, 1.0, 0.01, *_own(wind)),
         *(
             Knob(
                 f"Steady wind {name} [m/s]",
                 along,
                 "client",
-                steady,
                 -1.0,
                 1.0,
                 0.02,
@@ -168,12 +159,19 @@ def knobs(axes: int) -> tuple[Knob, ...]:
 
 THRESHOLDS = (
     _compared("Threshold: cost gap", "Extra cost above which a plan is sent", "cost_gap", 20, 0.05),
-    _compared("Threshold: ε", "Tolerance of eq. (16)", "epsilon", 20, 0.1),
-    _compared("Threshold: decay λ [1/s]", "Decay rate of eq. (16)", "decay_rate", 10, 0.1),
+    _compared(
+        "Threshold: expected gap",
+        "Expected extra cost above which a plan is sent",
+        "expected_gap",
+        20,
+        0.05,
+    ),
+    _compared("Threshold: ε", "Tolerance of eq. (16)", "state_gap.epsilon", 20, 0.1),
+    _compared("Threshold: decay λ [1/s]", "Decay rate of (16)", "state_gap.decay_rate", 10, 0.1),
     _compared(
         "Threshold: deviation [m]",
         "Distance from the plan above which one is sent",
-        "deviation_m",
+        "deviation",
         1,
         0.01,
     ),
@@ -181,12 +179,15 @@ THRESHOLDS = (
         "Rate: steps from packet to packet",
         "One packet every so many steps",
         "server",
-        "control.period",
         1.0,
         100.0,
         1.0,
-        _own("control.period")[0],
-        lambda _, number: {"control.period": round(number)},
+        lambda values: _number(values, "control.trigger", "periodic"),
+        lambda values, number: {
+            "control.trigger": _with(
+                "control.trigger", values["control.trigger"], "periodic", round(number)
+            )
+        },
     ),
 )
 """Sliders for the thresholds of triggers, each offered where the present trigger compares it."""
@@ -206,24 +207,9 @@ def triggers(scheme: str, present: str) -> tuple[str, ...]:
     """Triggers offered with a scheme, including the present one."""
 
     def has(trigger: str) -> bool:
-        names = (each.name for each in policies.policies(policies.parse(trigger)))
+        names = (each.name for each in leaves(registry.TRIGGERS.parse(trigger)))
         needs = (registry.TRIGGERS[name].needs for name in names)
         return all(not each or each in properties(scheme).computes for each in needs)
 
     offered = tuple(each for each in TRIGGERS if has(each))
     return offered if present in offered else (present, *offered)
-
-
-def compared(trigger: str) -> frozenset[str]:
-    """Keys of the thresholds that a trigger uses and does not itself state."""
-    try:
-        found = tuple(policies.policies(policies.parse(trigger)))
-    except PolicyError:
-        return frozenset()
-    return frozenset(
-        f"control.{parameter.key}"
-        for each in found
-        if not each.values
-        for parameter in registry.TRIGGERS[each.name].parameters
-        if parameter.key
-    )

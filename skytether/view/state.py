@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
 from skytether.shared.base import toml
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import zones
-from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.feed import (
@@ -512,8 +513,10 @@ class State:
     def kept(self) -> Zones:
         """Zones of a mission; none where their file is on another machine."""
         try:
-            return zones.parse(self.zones, self.scenario.model.axes)
-        except (OSError, PolicyError):
+            return zones.parse(
+                self.zones, self.scenario.model.axes, reading.files_of("mission.zones", self.zones)
+            )
+        except (ConfigError, GrammarError):
             return Zones()
 
     def waits(self, number: int) -> str:

@@ -43,7 +43,7 @@ from skytether.station.laws import Heard, setpoint
 OTHERS = (("velocity", 1.28), ("targets", 0.64))
 """Other laws, and the RMSE xy that was measured with them [m]."""
 EIGHT = figure_eight(5.0, 30.0, 3, 5.0)
-NONE = {"delay": "none", "loss": 0.0}
+NONE = ""
 
 
 def scenario(**table: Any) -> Scenario:
@@ -146,7 +146,7 @@ def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
 
 
 def test_half_of_all_packets_may_be_lost() -> None:
-    half = {"delay": "constant", "minimum_s": 0.2, "loss": 0.5}
+    half = "constant(0.2) & loss(0.5)"
     record = flown(network={"uplink": half, "downlink": half})
     assert record.failure is None
     assert len(record.client) == 80
@@ -154,7 +154,7 @@ def test_half_of_all_packets_may_be_lost() -> None:
 
 def test_an_age_is_known_although_clocks_differ() -> None:
     """TIMESYNC gives the age of a position that was 0.2 s under way: 0.2 s to 0.2 s plus a step."""
-    late = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
+    late = "constant(0.2)"
     drifts = {"clock_drift_ppm": 500.0, "clock_offset_s": 1000.0}
     record = flown(network={"uplink": late, "downlink": late}, simulation=drifts)
     ages_s = record.client["age_ns"] / 1e9

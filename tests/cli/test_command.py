@@ -38,9 +38,8 @@ from skytether.shell.log import LogLine
 from warm import PATIENCE_S, Command, Process, skytether
 
 QUICK = [
-    *("--network.uplink.delay", "constant", "--network.downlink.delay", "constant"),
-    *("--network.uplink.minimum-s", "0.03", "--network.downlink.minimum-s", "0.03"),
-    *("--network.uplink.loss", "0", "--network.downlink.loss", "0", "--settle", "0"),
+    *("--network.uplink", "constant(0.03)", "--network.downlink", "constant(0.03)"),
+    *("--settle", "0"),
     *("--link.heartbeat-s", "0.1", "--link.timeout-s", "0.5"),
 ]
 """A short link without losses, and a session that notices silence soon."""
@@ -169,7 +168,7 @@ def test_help_shows_the_scenario_that_was_named(
     assert exit_.value.code == 0
     said = " ".join(re.sub(r"[│\n]", " ", capfd.readouterr().out).split())
     assert f"usage: skytether {name}" in said
-    assert "--control.decay-rate FLOAT" in said
+    assert "--control.change-weight FLOAT" in said
     assert "(default: 60.0)" in said
 
 

@@ -26,7 +26,7 @@ SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]
 SHORT = ["--duration", "2", "--settle", "0"]
 for _direction in ("uplink", "downlink"):  # a plan comes at once
-    SHORT += [f"--network.{_direction}.delay", "none"]
+    SHORT += [f"--network.{_direction}", "loss(0.1)"]
 
 POOR = {
     "PYTHONWARNINGS": "error",

@@ -82,14 +82,14 @@ def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> Non
     table["control"]["trigger"] = "always"
     server = reading.check(table)
     table = reading.to_table(SCENARIO)
-    table["network"]["uplink"]["loss"] = 0.25
+    table["network"]["uplink"] = "loss(0.25)"
     netem = reading.check(table)
     scenarios = {"client": SCENARIO, "server": server, "netem": netem}
     paths = [recorded_by(name, tmp_path, flown, own) for name, own in scenarios.items()]
     assert together(paths, tmp_path / "flight.mcap") == 0
     joined = read(tmp_path / "flight.mcap").scenario
     assert joined.control.trigger == "always"
-    assert joined.network.uplink.loss == 0.25
+    assert joined.network.uplink == "loss(0.25)"
     assert joined.vehicle == SCENARIO.vehicle
 
 

@@ -54,7 +54,7 @@ def test_the_help_shows_keys_after_a_mistake_as_well(capsys: pytest.CaptureFixtu
     for flag in ("--nonsense", "--help"):
         with pytest.raises(SystemExit):
             command.parse(client.ClientOptions(), ["demo", flag], "x", None)
-    assert "--control.decay-rate FLOAT" in capsys.readouterr().out
+    assert "--control.change-weight FLOAT" in capsys.readouterr().out
 
 
 def test_a_command_with_a_required_option_is_for_tyro() -> None:
@@ -66,7 +66,7 @@ KEYS: list[tuple[list[str], dict[str, Any]]] = [
         ["--duration", "20", "--seed=3", "--settle", ".5"],
         {"duration": 20, "seed": 3, "settle": 0.5},
     ),
-    (["--control.decay-rate", "1.5e-3"], {"control.decay_rate": 1.5e-3}),
+    (["--control.change-weight", "1.5e-3"], {"control.change_weight": 1.5e-3}),
     (["--control.trigger", "cost_gap | silence(1)"], {"control.trigger": "cost_gap | silence(1)"}),
     (["--control.delay-bound", "auto"], {"control.delay_bound": "auto"}),
     (["--control.delay-bound", "0.55"], {"control.delay_bound": 0.55}),

@@ -143,7 +143,7 @@ def test_a_link_that_is_cut_on_the_ground_is_told_and_that_it_is_back() -> None:
 
 
 def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
-    ways = {"delay": "constant", "minimum_s": 0.5, "loss": 0.2}
+    ways = "constant(0.5) & loss(0.2)"
     air = Air(armed=False, network={"uplink": ways, "downlink": ways})
     air.run(120.0)
     assert len(air.of(Welcomed)) == 1

@@ -25,7 +25,7 @@ from skytether.shared.telemetry.record import client_columns, parse
 from skytether.shell.log import LogLine
 
 pytestmark = pytest.mark.long
-PAPER = {"minimum_s": 0.4, "slot_s": 0.02, "slots_mean": 2.0, "loss": 0.1}
+PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"
 
 
 def figure_eight(autopilot: Address, **table: object) -> Scenario:

@@ -25,7 +25,7 @@ HERE = np.zeros((2, 2))
 
 def terms(*, scheme: str = "predictive", exhausted: str = "hold", feedback: bool = False) -> Terms:
     """Ten stages of 0.1 s, on a network of no delay; the age bound is 50 steps."""
-    direction = {"delay": "none"}
+    direction = "loss(0.1)"
     return check(
         {
             "model": {"u_max": [1.8, 0.9]},

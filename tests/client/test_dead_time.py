@@ -27,7 +27,7 @@ AUTOPILOT = {
     "u_max": [3.0],
 }
 """A model like that of an autopilot's horizontal and vertical axis; neither dead time is whole."""
-PERFECT = {way: {"delay": "none", "loss": 0.0} for way in ("uplink", "downlink")}
+PERFECT = dict.fromkeys(("uplink", "downlink"), "")
 BRISK = {"shape": "figure-eight", "radius_m": 3.0, "period_s": 15.0}
 
 
@@ -139,8 +139,8 @@ def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
 def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
     """Ablation: the same vehicle with a model without dead time is off."""
     splines = scheme == "trajectory"
-    control = {"scheme": scheme, "trigger": "cost_gap | silence(1)" if splines else "always"}
-    control |= {"cost_gap": 0.01, "input_weight": 0.05}
+    control = {"scheme": scheme, "trigger": "cost_gap(0.01) | silence(1)" if splines else "always"}
+    control |= {"input_weight": 0.05}
     model = {"tau_s": [0.47], "gain": 1.0, "dead_time_s": [0.27, 0.24], "u_max": [3.0]}
     without = model | {"dead_time_s": 0.0}
     late = {"dead_time_s": model["dead_time_s"]}
@@ -156,7 +156,7 @@ def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
 
 @pytest.mark.parametrize("feedback", [True, False])
 def test_the_server_foresees_what_is_reported(feedback: bool) -> None:
-    network = {way: {"loss": 0.0, "delay": "constant"} for way in ("uplink", "downlink")}
+    network = dict.fromkeys(("uplink", "downlink"), "constant(0.4)")
     control = {"feedback": feedback, "trigger": "always", "observer_s": 0.0}
     _, record = flown(model=AUTOPILOT, control=control, network=network)
     client = record.client

@@ -38,8 +38,6 @@ def swap(seed: int) -> Scenario:
     table = reading.to_table(SWAP)
     table |= {"duration": 20.0, "seed": seed}
     table["reference"]["shape"] = "swap(8)"
-    for way in ("uplink", "downlink"):
-        table["network"][way] |= {"loss": 0.1}
     return reading.check(table, "swap")
 
 

@@ -314,7 +314,7 @@ ALONE = {
     "horizon": 40,
     "input_weight": 0.01,
     "input_reference": False,
-    "cost_gap": 2.0,
+    "trigger": "cost_gap(2) | silence(1)",
 }
 """Committed inputs alone, at tight weights: whatever is measured is for the server to answer."""
 

@@ -10,7 +10,7 @@ import skytether
 from skytether.client import reporting
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import BelievedState, Reporter
-from skytether.shared.scenario import policies
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.observing import Unreported, make_report
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import REPORTS
@@ -54,8 +54,8 @@ def test_what_is_no_report_is_refused(text: str, said: str) -> None:
         skytether.load("demo", **{"vehicle.report": text})
     assert "vehicle.report" in str(raised.value)
     assert said in str(raised.value)
-    with pytest.raises(policies.PolicyError):
-        policies.parse("cost_gap", REPORTS)
+    with pytest.raises(GrammarError):
+        REPORTS.parse("cost_gap")
 
 
 def reporter(text: str = "deviation(0.05)") -> tuple[Reporter, Compensator]:
@@ -215,7 +215,7 @@ def test_a_longer_delay_is_found(report: str, within_s: float) -> None:
     """Packets up take 0.3 s more from 15 s on: d follows, of a quiet vehicle a little later."""
     keys = {"vehicle.report": report}
     scenario = skytether.load("demo-committed", duration=25, settle=8, **keys)
-    rows = fly(scenario, changes=[(15.0, {"network.uplink.minimum_s": 0.7})]).server
+    rows = fly(scenario, changes=[(15.0, {"network.uplink.paper": 0.7})]).server
     before = rows["ahead"][rows["step"] < 13 * 20].max()
     longer = rows["step"][rows["ahead"] >= before + 3]
     assert len(longer)

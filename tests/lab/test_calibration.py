@@ -18,6 +18,7 @@ from skytether.lab.intervals import interval
 from skytether.lab.search import Free, Objective, Optimiser, SearchPoint, Values, check_free, put
 from skytether.lab.sweep import summaries
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import value
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -147,7 +148,7 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
         "control.change_weight",
     }
     assert {key.key for key in weighs("always").free()} == weights
-    own = {"control.epsilon", "control.decay_rate"}
+    own = {f"control.trigger.state_gap.{name}" for name in ("epsilon", "decay_rate")}
     assert {key.key for key in weighs("state_gap").free()} == weights | own
     off = replace(PAPER, control=replace(PAPER.control, trigger="always", change_weight=0.0))
     assert {key.key for key in Rmse(off, TENTH).free()} == weights - {"control.change_weight"}
@@ -160,14 +161,12 @@ def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> 
     ("trigger", "keys"),
     [
         ("periodic", []),
-        ("cost_gap & budget(5, 2)", ["control.cost_gap"]),
-        ("deviation | silence(1)", ["control.deviation_m"]),
-        ("state_gap(3.6, 1.5)", []),
-        ("cost_gap | (cost_gap & always)", ["control.cost_gap"]),
+        ("cost_gap & budget(5, 2)", ["control.trigger.cost_gap"]),
+        ("deviation(1) | silence(1)", ["control.trigger.deviation"]),
+        ("cost_gap | (cost_gap & always)", ["control.trigger.cost_gap"]),
     ],
 )
 def test_a_trigger_has_the_keys_of_the_policies_in_it(trigger: str, keys: list[str]) -> None:
-    """Policies that are written with numbers of their own add no keys."""
     assert [key.key for key in calibration.trigger_keys(trigger)] == keys
 
 
@@ -183,7 +182,7 @@ def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
     assert here["event_ratio"] == pytest.approx(mean)
     assert here["event_ratio_most"] == pytest.approx(mean + half)
     assert here["rmse_xy"] == pytest.approx(sum(run.rmse_xy or 0.0 for run in runs) / 3)
-    deaf = replace(short.network.uplink, loss=1.0)
+    deaf = "loss(1)"
     deaf = replace(short, network=replace(short.network, uplink=deaf))
     assert Rmse(deaf, TENTH).score(Rmse(deaf, TENTH).fly(deaf, [5])) == UNFLYABLE
 
@@ -267,7 +266,8 @@ def test_the_smallest_error_is_searched_for_and_shown(
     points = flown(tmp_path, Rmse(PAPER, SearchLimits(packets=0.3)))
     best = min(points, key=lambda point: point.score)
     found = reading.load(str(tmp_path / "best.toml"))
-    assert found.control.epsilon == best.keys["control.epsilon"]
+    key = "control.trigger.state_gap.epsilon"
+    assert value(reading.to_table(found), key) == best.keys[key]
     assert found.control.state_weight == (
         PAPER.control.state_weight[0],
         best.keys["control.state_weight.1"],

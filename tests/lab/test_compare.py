@@ -121,7 +121,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     """The file holds what differs from the plant, and where that comes from."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["gusts"]
     start = contenders.search_start(contender, case, SCALE)
-    control = replace(start.control, state_weight=(7.1, 1e-4), cost_gap=12.5)
+    control = replace(start.control, state_weight=(7.1, 1e-4), trigger="cost_gap(12.5)")
     found = replace(start, control=control)
     file = tmp_path / "mine.toml"
     file.write_text(contenders.to_file([Found(contender, case, found, "A line.")], SCALE))
@@ -149,12 +149,13 @@ def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, b
 
 def test_a_curve_goes_through_what_was_found_and_rises() -> None:
     """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
-    gap = replace(PAPER, control=replace(PAPER.control, cost_gap=0.8))
+    gap = replace(PAPER, control=replace(PAPER.control, trigger="cost_gap(0.8)"))
     found = thresholds(BY_NAME["committed-gap"], gap)
     assert list(found) == pytest.approx([0.08, 0.24, 0.8, 2.4, 8.0, 24.0, 80.0])
     assert [value for value, tuned in found.items() if tuned] == [0.8]
-    assert list(thresholds(BY_NAME["paper-periodic"], PAPER)) == [1, 2, 5, 10, 20, 40, 80]
-    often = replace(PAPER, control=replace(PAPER.control, period=2))
+    slow = replace(PAPER, control=replace(PAPER.control, trigger="periodic(10)"))
+    assert list(thresholds(BY_NAME["paper-periodic"], slow)) == [1, 2, 5, 10, 20, 40, 80]
+    often = replace(PAPER, control=replace(PAPER.control, trigger="periodic(2)"))
     assert list(thresholds(BY_NAME["paper-periodic"], often)) == [1, 2, 4, 8, 16]
     assert thresholds(BY_NAME["paper-every-step"], PAPER) == {None: True}
 
@@ -163,7 +164,7 @@ def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_
     """The network is the case's own, whatever the weights were found with."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["loss-0.5"]
     tuned = contenders.search_start(contender, TARGET, SCALE)
-    lossy = replace(tuned.network.uplink, loss=0.2)
+    lossy = "paper(0.4, 0.02, 2.0) & loss(0.2)"
     tuned = replace(tuned, network=replace(tuned.network, uplink=lossy))
     for flying in budgets.flying(contender, case, tuned, SCALE):
         assert flying.keys.keys() & case.keys.keys() <= {
@@ -504,7 +505,7 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
         row for row in table if (row["case"], row["contender"]) == ("target", "trajectory-expected")
     )
     found = reading.load(f"{tuned / 'weights.toml'}/trajectory-expected-target")
-    keys = {**REPORTS[row["report"]], "control.cost_gap": float(row["threshold"])}
+    keys = {**REPORTS[row["report"]], "control.trigger.expected_gap": float(row["threshold"])}
     runs = [
         each.summary for each in skytether.fly_batch(found, [1, 2, 3], duration=FLOWN_S, **keys)
     ]
@@ -514,8 +515,7 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     assert float(row["rmse_xy_median"]) == pytest.approx(np.median([run.rmse_xy for run in runs]))
     weights = {row["contender"]: row for row in rows(out / "weights.csv")}
     assert list(weights) == [*LOOKED_AT]
-    here = float(weights["trajectory-expected"]["control.cost_gap"])
-    assert here == pytest.approx(found.control.cost_gap, rel=1e-3)
+    assert weights["trajectory-expected"]["control.trigger"] == found.control.trigger
 
 
 def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:

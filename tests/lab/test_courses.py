@@ -34,7 +34,7 @@ def terms(scheme: str, exhausted: str, rng: np.random.Generator) -> Terms:
         "model": {"tau_s": rng.uniform(0.2, 2.0, AXES).tolist(), "gain": [0.8, 1.1]},
         "control": {"dt": 0.1, "horizon": H, "scheme": scheme},
         "vehicle": {"exhausted": exhausted, "brake_mps2": float(rng.uniform(0.5, 4.0))},
-        "network": {"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        "network": {"uplink": "loss(0.1)", "downlink": "loss(0.1)"},
         "link": {"age_max_s": 0.1 * AGE_MAX},
     }
     return reading.check(table, "test").terms()

@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shlex
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -30,7 +31,9 @@ from skytether.server.controller import Controller
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.shell import command
@@ -47,11 +50,13 @@ def test_points_lie_within_their_bounds_and_fill_them() -> None:
     points = [draw(1, number) for number in range(2000)]
     column = {key: np.array([point[key] for point in points]) for key in points[0]}
     for direction in ("uplink", "downlink"):
-        delays = column[f"network.{direction}.minimum_s"]
+        calls = [IMPAIRMENTS.calls(text)[0] for text in column[f"network.{direction}"]]
+        delays = np.array([call.values[0] for call in calls])
         assert 0.0 <= delays.min() < 0.01
         assert 2.99 < delays.max() <= 3.0
-        assert {*column[f"network.{direction}.delay"]} == {"constant", "poisson"}
-    up, down = (column[f"network.{direction}.loss"] for direction in ("uplink", "downlink"))
+        assert {call.name for call in calls} == {"constant", "paper"}
+    paths = [[path(each) for each in column[f"network.{way}"]] for way in ("uplink", "downlink")]
+    up, down = (np.array([each.loss for each in way]) for way in paths)
     assert 0.97 < max(up.max(), down.max()) <= 0.99
     assert np.mean(np.maximum(up, down) <= 0.5) == pytest.approx(
         0.5 + 0.5 * 0.5**2 * 1.02, abs=0.04
@@ -62,7 +67,7 @@ def test_points_lie_within_their_bounds_and_fill_them() -> None:
     assert (column["control.horizon"].min(), column["control.horizon"].max()) == (1, 120)
     assert {*column["control.feedback"].tolist()} == {False, True}
     assert len({*column["seed"]}) == 2000
-    delays = [column[f"network.{direction}.minimum_s"] for direction in ("uplink", "downlink")]
+    delays = [[each.least_s for each in way] for way in paths]
     assert abs(np.corrcoef(delays)[0, 1]) < 0.1
 
 
@@ -71,7 +76,7 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
     assert draw(1, 5) != draw(2, 5)
     scenario = DEMO.scenario_of(1)
     assert reading.to_table(scenario)["control"]["horizon"] == draw(1, 1)["control.horizon"]
-    assert scenario.network.uplink.minimum_s == draw(1, 1)["network.uplink.minimum_s"]
+    assert scenario.network.uplink == draw(1, 1)["network.uplink"]
     assert scenario.reference == DEMO.scenario.reference
 
 
@@ -80,7 +85,7 @@ def test_the_command_line_of_a_point_flies_that_point() -> None:
     plan = Envelope(
         "demo-committed", demo_with(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2])
     )
-    line = plan.command(1).split()
+    line = shlex.split(plan.command(1))
     assert line[:4] == ["skytether", "fly", "demo-committed", "--virtual"]
     options = command.parse(fly.FlyOptions(), line[2:], "skytether fly", "")
     assert options.config == plan.scenario_of(1)
@@ -360,8 +365,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     )
     table = reading.to_table(reading.load("demo-committed"))
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
-        network = f"network.{direction}"
-        lay({f"{network}.delay": "constant", f"{network}.minimum_s": delay_s}, table)
+        lay({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
     lay({key.replace("__", "."): value for key, value in BLIND.items()}, table)
     lay({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
     scenario = msgspec.convert(table, Scenario)  # unchecked: it would be refused

@@ -139,10 +139,10 @@ def test_a_slow_swing_does_not_change_the_growth() -> None:
 
 def test_a_later_network_is_the_scenarios_with_a_delay_more() -> None:
     """The delay is added each way, also to a direction without any impairment."""
-    nothing = {"delay": "none", "loss": 0.0}
+    nothing = ""
     scenario = demo_with(network__uplink="constant(0.1)", network__downlink=nothing)
-    network = Differing(delay_s=0.25).of(scenario).network
-    assert (network.uplink.mean_s, network.downlink.mean_s) == pytest.approx((0.35, 0.25))
+    later = Differing(delay_s=0.25).of(scenario)
+    assert (later.uplink.mean_s, later.downlink.mean_s) == pytest.approx((0.35, 0.25))
 
 
 def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> None:
@@ -216,7 +216,7 @@ def test_a_place_of_the_box_differs_as_it_says() -> None:
     assert scenario.true_gain.tolist() == [0.7, 0.7]
     assert scenario.true_dead_time_s.tolist() == [0.1, 0.1]
     assert (scenario.vehicle.wind, scenario.tau_s.tolist()) == (0.0, [0.84, 0.84])
-    assert scenario.network.uplink.burst_s == scenario.network.downlink.burst_s == 2.0
+    assert scenario.network.uplink == "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)"
 
 
 # -- the command -----------------------------------------------------------------------------------

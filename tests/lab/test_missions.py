@@ -20,7 +20,7 @@ def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
     drawn = missions.random_mission(RandomOptions(), 5, tmp_path)
     again = missions.random_mission(RandomOptions(harsh=True), 5, tmp_path)
     assert again.mission == drawn.mission
-    assert again.network.uplink.text.startswith(f"{drawn.network.uplink.text} & outages(")
+    assert again.network.uplink.startswith(f"{drawn.network.uplink} & outages(")
 
 
 @pytest.mark.long

@@ -107,7 +107,7 @@ def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
     dotted = load("demo", seed=np.int64(7), **keys)
     network = {"uplink": {"loss": 0.25}}
     assert dotted == load(load("demo"), seed=7, control={"trigger": "always"}, network=network)
-    assert (dotted.seed, dotted.network.uplink.loss, dotted.control.cost_gap) == (7, 0.25, 0.05)
+    assert (dotted.seed, dotted.uplink.loss) == (7, 0.25)
     start = load("demo", **{"vehicle.start_m": np.array([1.0, 2.0])})
     assert start.vehicle.start_m == (1.0, 2.0)
 
@@ -279,7 +279,7 @@ def test_a_server_of_ones_own_is_flown() -> None:
 
 @pytest.mark.long
 def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
-    at_once = {"network.uplink.delay": "none", "network.downlink.delay": "none"}
+    at_once = {"network.uplink": "loss(0.1)", "network.downlink": "loss(0.1)"}
     flown = fly("demo", udp=True, secure=True, duration=5, settle=0, **at_once)
     assert (flown.summary.duration_s, flown.summary.secure) == (5.0, True)
     times_ns = [each.time_ns for each in flown.events]
@@ -441,14 +441,14 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
         "grid: control.trigger: got 'always', expected a list of values",
     ),
     (
-        lambda: sweep("demo", {"control.epsilon": []}),
+        lambda: sweep("demo", {"control.input_weight": []}),
         ConfigError,
-        "grid: control.epsilon: got no values, expected at least one",
+        "grid: control.input_weight: got no values, expected at least one",
     ),
     (
-        lambda: sweep("demo", {"control.epsilon": [1.0, 1]}),
+        lambda: sweep("demo", {"control.input_weight": [1.0, 1]}),
         ConfigError,
-        "grid: control.epsilon: got 1.0 twice, expected values that differ",
+        "grid: control.input_weight: got 1.0 twice, expected values that differ",
     ),
     (
         lambda: sweep("demo", {"seed": [1, 2]}),
@@ -456,9 +456,9 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
         "grid: got 'seed', expected another key: it counts the runs",
     ),
     (
-        lambda: sweep("demo", {"control.epsilom": [1]}),
+        lambda: sweep("demo", {"control.horizom": [1]}),
         ConfigError,
-        "demo with control.epsilom=1: control.epsilom: no such key; did you mean epsilon?",
+        "demo with control.horizom=1: control.horizom: no such key; did you mean horizon?",
     ),
     (
         lambda: sweep("demo", {}, runs=0),

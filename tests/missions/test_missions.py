@@ -596,10 +596,10 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("keys", [{}, {"loss": 0.5}, {"loss": 0.3, "burst_s": 2.0}], ids=str)
+@pytest.mark.parametrize("losses", ["loss(0.1)", "loss(0.5)", "gilbert_elliott(0.3, 2.0)"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_sixteen_swap_places_over_the_worst_networks(keys: dict[str, float], seed: int) -> None:
-    flown = flight.fly(scenario(16, duration=60.0, seed=seed, **keys), vehicles=16)
+def test_sixteen_swap_places_over_the_worst_networks(losses: str, seed: int) -> None:
+    flown = flight.fly(scenario(16, losses, duration=60.0, seed=seed), vehicles=16)
     assert separation_m(flown) > 0.5
 
 

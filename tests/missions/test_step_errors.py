@@ -28,8 +28,9 @@ from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.mission import Mission
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 from two_vehicles import drawn, left_m, separation_m
 
@@ -390,7 +391,7 @@ def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
 
     def fates(_: Proxy, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         delay_s = delays(flow)[name == "downlink"]
-        return Fates(DirectionConfig(impairments=f"constant({delay_s})"), 1, name, flow)
+        return Fates(path(f"constant({delay_s})"), 1, name, flow)
 
     monkeypatch.setattr(Proxy, "_fates", fates)
 
@@ -470,6 +471,6 @@ def test_the_flight_of_seed_9114_keeps_its_distance() -> None:
     scenario = mission("swap", "swap(8)", 60.0)
     table = reading.to_table(msgspec.structs.replace(scenario, seed=9114))
     for way in ("uplink", "downlink"):
-        table["network"][way] = {"impairments": "uniform(0.05, 0.9, correlation_s=60)"}
+        table["network"][way] = "uniform(0.05, 0.9, correlation_s=60)"
     flown = flight.fly(reading.check(table, "swap"), vehicles=8)
     assert separation_m(flown) > 0.5

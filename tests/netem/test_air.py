@@ -16,9 +16,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import Part, parse, path, with_files
-from skytether.shared.scenario.policies import PolicyError
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.air.path import path
+from skytether.shared.scenario.grammar import Call, GrammarError
+from skytether.shared.scenario.registry import IMPAIRMENTS
 
 SEEDS = range(10)
 SAMPLES = 3000
@@ -27,7 +27,7 @@ P_MIN = 0.001
 
 def fates(text: str, seed: int = 1, count: int = SAMPLES, every: int = 7) -> list[Fate]:
     """Fates of packets that enter every so many slots."""
-    made = Fates(DirectionConfig(impairments=text), seed, "uplink", 0)
+    made = Fates(path(text), seed, "uplink", 0)
     return [made.at(every * number) for number in range(count)]
 
 
@@ -156,21 +156,11 @@ def test_another_impairment_changes_no_draw_of_the_others() -> None:
 
 def test_a_network_is_met_whatever_was_sent_before() -> None:
     text = "gamma(0, 0.1, 0.05, correlation_s=0.3) & gilbert_elliott(0.2, 0.2) & duplicate(0.2)"
-    made = Fates(DirectionConfig(impairments=text), 3, "uplink", 0)
+    made = Fates(path(text), 3, "uplink", 0)
     order = np.random.default_rng(1).permutation(500)
     shuffled = {int(slot): made.at(int(slot)) for slot in order}
-    again = Fates(DirectionConfig(impairments=text), 3, "uplink", 0)
+    again = Fates(path(text), 3, "uplink", 0)
     assert [again.at(slot) for slot in range(500)] == [shuffled[slot] for slot in range(500)]
-
-
-@pytest.mark.parametrize("delay", ["poisson", "constant", "none"])
-@pytest.mark.parametrize(("loss", "burst_s"), [(0.1, 0.0), (0.3, 0.5), (0.0, 0.0)])
-def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float) -> None:
-    short = DirectionConfig(delay=delay, loss=loss, burst_s=burst_s)
-    made = Fates(short, 5, "downlink", 2)
-    text = short.text or "constant(0)"
-    other = Fates(DirectionConfig(impairments=text), 5, "downlink", 2)
-    assert [made.at(slot) for slot in range(300)] == [other.at(slot) for slot in range(300)]
 
 
 @pytest.mark.parametrize(
@@ -193,12 +183,11 @@ def test_short_keys_are_short_for_a_text(delay: Any, loss: float, burst_s: float
         ("rate(1000, queue=1.5)", "1 <= queue <= 67108864 (whole)"),
         ("rate(1000, drop=head)", "drop tail or codel"),
         ("rate(1000) & rate(2000)", "expected one rate or deliveries in a direction"),
-        ("trace(no such.csv)", "no such.csv: cannot be read: No such file or directory"),
         (" & ".join(["loss(0.1)"] * 17), "expected at most 16 impairments"),
     ],
 )
 def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
-    with pytest.raises(PolicyError) as raised:
+    with pytest.raises(GrammarError) as raised:
         path(text)
     assert said in str(raised.value)
     assert "\n" not in str(raised.value)
@@ -206,40 +195,48 @@ def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
 
 @given(st.text("()&,=.\"' -0123456789alosrtequnif_\n", max_size=60))
 def test_no_text_does_anything_but_be_refused(text: str) -> None:
-    with suppress(PolicyError):
+    with suppress(GrammarError):
         path(text)
 
 
 def test_arguments_may_have_names_and_defaults() -> None:
-    expected = (Part("rate", (12500, 20000, "codel", "fair")),)
-    assert parse("rate(12500, queue=20000, serve=fair, drop=codel)") == expected
-    assert parse("rate(12500,20000,codel,fair)") == expected
-    assert parse("gilbert_elliott( share=.1 ,burst_s = 2)")[0].values == (0.1, 2, 1.0, 0.0)
+    expected = [Call("rate", (12500.0, 20000, "codel", "fair"))]
+    assert IMPAIRMENTS.calls("rate(12500, queue=20000, serve=fair, drop=codel)") == expected
+    assert IMPAIRMENTS.calls("rate(12500,20000,codel,fair)") == expected
+    assert IMPAIRMENTS.calls("gilbert_elliott( share=.1 ,burst_s = 2)")[0].values == (
+        0.1,
+        2,
+        1.0,
+        0.0,
+    )
 
 
 def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
-    assert with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
+    assert IMPAIRMENTS.with_files("trace(a.csv) & loss(0.1)", lambda file: f"/x/{file}") == (
         'trace("/x/a.csv", loop, auto) & loss(0.1)'
     )
-    assert with_files("loss(0.1)", lambda file: f"/x/{file}") == "loss(0.1)"
+    assert IMPAIRMENTS.with_files("loss(0.1)", lambda file: f"/x/{file}") == "loss(0.1)"
     (tmp_path / "a, b (c).csv").write_text("time_s,delay_s\n0,0.1\n1,0.2\n")
     (tmp_path / "mine.toml").write_text(
         "extends = 'demo'\nnetwork.uplink = 'trace(\"a, b (c).csv\")'\n"
-        "network.downlink.impairments = 'loss(0.5)'\n"
+        "network.downlink = 'loss(0.5)'\n"
     )
-    network = reading.load(str(tmp_path / "mine.toml")).network
-    assert network.uplink.path.mean_s == pytest.approx(0.15)
-    assert network.downlink.path.loss == 0.5
+    found = reading.load(str(tmp_path / "mine.toml"))
+    assert found.uplink.mean_s == pytest.approx(0.15)
+    assert found.downlink.loss == 0.5
 
 
-def test_a_text_says_all_of_a_direction(tmp_path: Any) -> None:
-    """Over keys of the scenario that it extends; keys beside it are refused, not passed over."""
+def test_a_text_replaces_that_below_and_an_argument_changes_it(tmp_path: Any) -> None:
+    """Also where the scenario below has arguments alone, over the text of the default."""
     (tmp_path / "lossy.toml").write_text("extends = 'demo'\nnetwork.uplink.loss = 0.3\n")
+    assert reading.load(str(tmp_path / "lossy.toml")).network.uplink == (
+        "paper(0.4, 0.02, 2.0) & loss(0.3)"
+    )
     above = tmp_path / "above.toml"
     above.write_text("extends = 'lossy.toml'\nnetwork.uplink = 'constant(0.1)'\n")
-    assert reading.load(str(above)).network.uplink.text == "constant(0.1)"
+    assert reading.load(str(above)).network.uplink == "constant(0.1)"
     above.write_text("extends = '5g-urban'\nnetwork.uplink.loss = 0.3\n")
-    with pytest.raises(ConfigError, match="no other keys of the direction beside it"):
+    with pytest.raises(ConfigError, match=r"network\.uplink\.loss: .* expected loss in it"):
         reading.load(str(above))
     again = reading.check(reading.to_table(reading.load("5g-urban")))
     assert again == reading.load("5g-urban")

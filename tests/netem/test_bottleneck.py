@@ -14,7 +14,7 @@ from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.reading import files_of
 from skytether.shared.telemetry.record import UPLINK
 
 Packet = tuple[int, int, int]
@@ -23,14 +23,13 @@ Packet = tuple[int, int, int]
 
 def linked(text: str) -> tuple[Link, Lane]:
     """A link with these impairments, and a flow through it."""
-    direction = DirectionConfig(impairments=text)
-    lane = Lane(0, Fates(direction, 1, "uplink", 0), 0)
-    return Link(UPLINK, 1472, None, direction.path), lane
+    direction = path(text)
+    return Link(UPLINK, 1472, None, direction), Lane(0, Fates(direction, 1, "uplink", 0), 0)
 
 
 def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[int]]:
     """Times at which packets have passed by number [ns], and the numbers of those dropped."""
-    queue = path(text).queue
+    queue = path(text, files_of("network.uplink", text)).queue
     assert queue is not None
     bottleneck: Bottleneck[int] = Bottleneck(queue)
     out: dict[int, int] = {}
@@ -135,7 +134,9 @@ def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
     assert [out[number] // ms for number in range(5)] == [10, 10, 30, 40, 50]
     out, _ = passed(text, [(0, 752, 0)] * 4 + [(35 * ms, 100, 0), (60 * ms, 1504, 0)])
     assert [out[number] // ms for number in range(6)] == [10, 10, 10, 10, 40, 70]
-    assert path(text).queue.bytes_per_s == 4 * 1504 / 0.04  # type: ignore[union-attr]
+    queue = path(text, files_of("network.uplink", text)).queue
+    assert queue is not None
+    assert queue.bytes_per_s == 4 * 1504 / 0.04
 
 
 @given(

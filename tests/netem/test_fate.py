@@ -1,11 +1,9 @@
 """`netem.fate`: the delays of eq. (17) as corrected, and fates that follow from names and time."""
 
 from bisect import bisect_right
-from typing import Any
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -13,29 +11,30 @@ from skytether.netem.fate import Fates
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.scenario.air import delays
 from skytether.shared.scenario.air.draws import SLOT_NS, Draws, Fate, Stream
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.air.path import path
 
 SAMPLES = 20_000
 TAIL = 8
 """Slots from here on are one class: Poisson(2) has 22 of 20 000 samples there."""
 
-PAPER = DirectionConfig()
+PAPER = "paper(0.4, 0.02, 2.0)"
+LOSSY = f"{PAPER} & loss(0.1)"
 COUNT = 800
 
 
 def first_fates(
-    direction: DirectionConfig = PAPER,
+    direction: str = LOSSY,
     seed: int = 1,
     name: str = "uplink",
     flow: int = 0,
     count: int = COUNT,
 ) -> list[Fate]:
     """The fates of the first packets of a flow's first slots."""
-    fates = Fates(direction, seed, name, flow)
+    fates = Fates(path(direction), seed, name, flow)
     return [fates.at(slot) for slot in range(count)]
 
 
-def delays_ns(direction: DirectionConfig, count: int) -> NDArray[np.int64]:
+def delays_ns(direction: str, count: int) -> NDArray[np.int64]:
     """Delays of a flow's first slots [ns]; shape (count,)."""
     fates = first_fates(direction, 17, count=count)
     return np.array([fate.delay_ns for fate in fates], dtype=np.int64)
@@ -43,19 +42,13 @@ def delays_ns(direction: DirectionConfig, count: int) -> NDArray[np.int64]:
 
 def test_paper_delays_follow_the_corrected_equation_17() -> None:
     """P(m) = 2^m e^-2 / m!, by a chi-square test; on the lattice 0.4 s + 0.02 s m."""
-    delays = delays_ns(PAPER, SAMPLES)
+    delays = delays_ns(LOSSY, SAMPLES)
     slots, rest_ns = np.divmod(delays - 400 * MILLISECOND_NS, 20 * MILLISECOND_NS)
     assert not rest_ns.any()
     shares = [*stats.poisson.pmf(range(TAIL), 2), stats.poisson.sf(TAIL - 1, 2)]
     counts = np.bincount(np.minimum(slots, TAIL), minlength=TAIL + 1)
     assert stats.chisquare(counts, np.multiply(shares, SAMPLES)).pvalue > 0.001
-    assert PAPER.mean_s == pytest.approx(0.44)
-
-
-@pytest.mark.parametrize(("delay", "expected_ms"), [("constant", 250), ("none", 0)])
-def test_a_delay_without_slots_is_the_minimum_or_none(delay: Any, expected_ms: int) -> None:
-    direction = DirectionConfig(delay=delay, minimum_s=0.25)
-    assert delays_ns(direction, 3).tolist() == [expected_ms * MILLISECOND_NS] * 3
+    assert path(PAPER).mean_s == pytest.approx(0.44)
 
 
 def test_losses_are_independent_of_delays() -> None:
@@ -66,7 +59,10 @@ def test_losses_are_independent_of_delays() -> None:
 
 
 def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
-    fates, bursty = (Fates(replace(PAPER, burst_s=s), 1, "uplink", 0) for s in (0.0, 0.5))
+    fates, bursty = (
+        Fates(path(f"{PAPER} & {losses}"), 1, "uplink", 0)
+        for losses in ("loss(0.1)", "gilbert_elliott(0.1, 0.5)")
+    )
     year = 365 * 86_400 * SECOND_NS // SLOT_NS
     for each in (fates, bursty):
         slots = [0, 7, 7_000, year, year + 1, -5]
@@ -76,16 +72,16 @@ def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
 
 def test_packets_of_one_slot_have_fates_of_their_own() -> None:
     """CLOSE is sent three times at once, because one may be lost: a binomial test."""
-    fates = Fates(PAPER, 17, "uplink", 0)
+    fates = Fates(path(LOSSY), 17, "uplink", 0)
     triples = [[fates.at(slot, rank) for rank in range(3)] for slot in range(SAMPLES)]
     all_lost = sum(all(fate.lost for fate in triple) for triple in triples)
-    assert stats.binomtest(all_lost, SAMPLES, PAPER.loss**3).pvalue > 0.001
+    assert stats.binomtest(all_lost, SAMPLES, 0.1**3).pvalue > 0.001
     assert len({triple[0].delay_ns == triple[1].delay_ns for triple in triples}) == 2
 
 
 @pytest.mark.parametrize("mean", [0.0, 1e-9, 0.3, 40.0, 1e6])
 def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
-    config = DirectionConfig(minimum_s=0.0, slot_s=1e-3, slots_mean=mean)
+    config = f"paper(0.0, 0.001, {mean}) & loss(0.1)"
     slots = delays_ns(config, SAMPLES) / MILLISECOND_NS
     assert slots.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / SAMPLES) + 1e-6)
     kurtosis = np.sqrt((2 * mean**2 + mean) / SAMPLES)
@@ -123,7 +119,7 @@ def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
 
 
 def test_in_a_burst_everything_is_lost() -> None:
-    fates = Fates(replace(PAPER, loss=0.3, burst_s=0.1), 1, "uplink", 0)
+    fates = Fates(path(f"{PAPER} & gilbert_elliott(0.3, 0.1)"), 1, "uplink", 0)
     slots = [{fates.at(slot, rank).lost for rank in range(4)} for slot in range(2000)]
     assert all(len(fates_of) == 1 for fates_of in slots)
     assert {True} in slots
@@ -133,13 +129,13 @@ def test_in_a_burst_everything_is_lost() -> None:
 @pytest.mark.parametrize("burst_s", [0.0, 1e-9, 1e-3, 3600.0])
 @pytest.mark.parametrize(("loss", "share"), [(0.0, 0.0), (1.0, 1.0)])
 def test_certain_losses_are_certain(loss: float, share: float, burst_s: float) -> None:
-    drawn = first_fates(replace(PAPER, loss=loss, burst_s=burst_s))
+    drawn = first_fates(f"{PAPER} & gilbert_elliott({loss}, {burst_s})")
     assert np.mean([fate.lost for fate in drawn]) == share
 
 
 def test_bursts_shorter_than_a_slot_are_none() -> None:
-    drawn = first_fates(replace(PAPER, loss=0.5, burst_s=1e-4))
-    assert drawn == first_fates(replace(PAPER, loss=0.5))
+    drawn = first_fates(f"{PAPER} & gilbert_elliott(0.5, 1e-4)")
+    assert drawn == first_fates(f"{PAPER} & loss(0.5)")
 
 
 # -- names -----------------------------------------------------------------------------------------
@@ -155,17 +151,18 @@ def test_another_seed_direction_or_flow_meets_another_network(other: dict[str, o
 @pytest.mark.parametrize(("loss", "burst_s"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 1.0)])
 def test_losses_change_no_delay(loss: float, burst_s: float) -> None:
     """A lost packet draws its delay as well, so nothing after it shifts."""
-    drawn = first_fates(replace(PAPER, loss=loss, burst_s=burst_s))
+    losses = f"gilbert_elliott({loss}, {burst_s})" if burst_s else f"loss({loss})"
+    drawn = first_fates(f"{PAPER} & {losses}")
     assert [fate.delay_ns for fate in drawn] == [fate.delay_ns for fate in first_fates()]
 
 
-@pytest.mark.parametrize("delay", ["constant", "none"])
+@pytest.mark.parametrize("delay", ["constant(0.4)", "none"])
 def test_the_delay_model_changes_no_loss(delay: str) -> None:
-    lost = [fate.lost for fate in first_fates(replace(PAPER, delay=delay))]
+    lost = [fate.lost for fate in first_fates(f"{delay} & loss(0.1)")]
     assert lost == [fate.lost for fate in first_fates()]
 
 
 def test_a_higher_loss_rate_loses_the_same_packets_and_more() -> None:
-    few, many = (first_fates(replace(PAPER, loss=loss)) for loss in (0.1, 0.3))
+    few, many = (first_fates(f"{PAPER} & loss({loss})") for loss in (0.1, 0.3))
     assert all(more.lost for less, more in zip(few, many, strict=True) if less.lost)
     assert sum(fate.lost for fate in few) < sum(fate.lost for fate in many)

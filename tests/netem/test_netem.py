@@ -18,13 +18,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from helpers import packaged
 from skytether.__main__ import main
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.traces import recorded_in
+from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
 from skytether.shell.udp import leads_back
 from skytether.view import traffic
@@ -175,7 +176,7 @@ def test_changes_and_recordings(
         time.sleep(0.5)
         ended(relay)
     assert main(shlex.split(export)[1:]) == 0
-    found = recorded_in(str(tmp_path / "traces" / "downlink-0.csv"))
+    found = recorded_in(File("it", (tmp_path / "traces" / "downlink-0.csv").read_bytes()))
     assert len(found.time_s) == 60
     assert 0.01 <= found.delay_s.min() <= found.delay_s.mean() <= 0.1
     assert 0 < found.lost.sum() < 30
@@ -187,7 +188,10 @@ def test_changes_and_recordings(
     [
         (["--uplink", "los(1)"], "network.uplink: got 'los(1)'"),
         (["--downlink", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
-        (["--downlink", "trace(none.csv)"], "none.csv: cannot be read: No such file or directory"),
+        (
+            ["--downlink", "trace(none.csv)"],
+            "none.csv', expected a file that can be read (No such file",
+        ),
     ],
 )
 def test_a_wrong_direction_is_told_in_a_line(
@@ -200,9 +204,7 @@ def test_a_wrong_direction_is_told_in_a_line(
 
 
 def test_a_change_shows_at_once_and_a_wrong_one_changes_nothing() -> None:
-    scenario = reading.with_directions(
-        reading.load("demo"), {"uplink": "none", "downlink": "loss(0.1)"}
-    )
+    scenario = packaged("demo", network={"uplink": "none", "downlink": "loss(0.1)"})
     proxy = Proxy(scenario, server=("server", 1))
     running_ = Running(proxy, scenario)
 
@@ -268,7 +270,7 @@ def test_a_recording_becomes_the_trace_of_each_flow(tmp_path: Path) -> None:
     made = traffic.traces(rows)
     assert set(made) == {"downlink-0", "downlink-1"}
     (tmp_path / "a.csv").write_text(made["downlink-0"])
-    found = recorded_in(str(tmp_path / "a.csv"))
+    found = recorded_in(File("it", (tmp_path / "a.csv").read_bytes()))
     assert found.time_s.tolist() == [0.0, 1.0, 2.0]
     assert found.lost.tolist() == [False, True, False]
     assert found.delay_s.tolist() == [0.1, 0.2, 0.3]

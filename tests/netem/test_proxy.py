@@ -6,7 +6,6 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from skytether.netem import link as link_module
 from skytether.netem import places as places_module
@@ -17,24 +16,27 @@ from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, host_of
 from skytether.shared.core.events import FlowOpened, Returned
-from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.air.path import path
+from skytether.shared.scenario.schema import NetworkConfig, Scenario
 
 SERVER = ("192.0.2.9", 47001)
 ALICE, BOB, CAROL = (("192.0.2.1", 5000), ("192.0.2.1", 5001), ("192.0.2.2", 5000))
 
-AT_ONCE = DirectionConfig(delay="none", loss=0.0)
-IN_20_MS = DirectionConfig(delay="constant", minimum_s=0.02, loss=0.0)
+AT_ONCE = ""
+IN_20_MS = "constant(0.02)"
 
 
 def make_proxy(
-    uplink: DirectionConfig = AT_ONCE,
-    downlink: DirectionConfig | None = None,
+    uplink: str = AT_ONCE,
+    downlink: str | None = None,
     seed: int = 1,
     flows: int = FLOWS_MAX,
     mtu: int = 1472,
 ) -> Proxy:
     """A proxy with this network, the same both ways unless said."""
-    network = NetworkConfig(uplink=uplink, downlink=downlink or uplink, mtu=mtu)
+    network = NetworkConfig(
+        uplink=uplink, downlink=uplink if downlink is None else downlink, mtu=mtu
+    )
     return Proxy(Scenario(seed=seed, network=network), server=SERVER, flows=flows)
 
 
@@ -421,7 +423,7 @@ def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
-    slow = DirectionConfig(delay="constant", minimum_s=61.0, loss=0.0)
+    slow = "constant(61.0)"
     proxy = make_proxy(uplink=slow, downlink=AT_ONCE, flows=1)
     socket = pass_on(proxy, b"?", ALICE)
     hear(proxy, b"!", SERVER, socket)
@@ -463,7 +465,7 @@ def test_a_duplicate_is_a_packet_of_its_own() -> None:
 
 
 def test_it_wants_to_be_woken_for_the_next_packet_of_either_direction() -> None:
-    slower = replace(IN_20_MS, minimum_s=0.03)
+    slower = "constant(0.03)"
     proxy, ms = make_proxy(uplink=slower, downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)
     hear(proxy, b"!", SERVER, 1, at=0)
@@ -482,7 +484,7 @@ def test_being_woken_early_does_no_harm() -> None:
 
 
 def test_each_direction_and_flow_meets_its_own_fates() -> None:
-    half = DirectionConfig(delay="none", loss=0.5)
+    half = "loss(0.5)"
     proxy = make_proxy(half, seed=7)
     for flow, client in enumerate((ALICE, BOB)):
         for number in range(40):
@@ -490,14 +492,14 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
             hear(proxy, bytes([number]), SERVER, flow + 1)
         sent = proxy.outbox()
         for name, peer in (("downlink", SERVER), ("uplink", client)):
-            fates = Fates(half, 7, name, flow)
+            fates = Fates(path(half), 7, name, flow)
             drawn = [fates.at(0, rank).lost for rank in range(40)]
             passed = [datagram.payload[0] for datagram in sent if datagram.peer == peer]
             assert passed == [number for number in range(40) if not drawn[number]]
 
 
 def test_the_figures_name_every_statistic() -> None:
-    proxy, ms = make_proxy(uplink=DirectionConfig(loss=1.0), downlink=IN_20_MS), MILLISECOND_NS
+    proxy, ms = make_proxy(uplink="loss(1)", downlink=IN_20_MS), MILLISECOND_NS
     hear(proxy, b"?", ALICE, at=0)
     hear(proxy, b"?", ALICE, at=2 * ms)
     hear(proxy, b"!", SERVER, 1, at=3 * ms)
@@ -556,7 +558,11 @@ def test_no_packet_appears_or_vanishes(
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(link_module, "QUEUE_MAX", 8)
-        proxy, now_ns, sent = make_proxy(DirectionConfig(loss=0.3), seed=seed, flows=2), 0, 0
+        proxy, now_ns, sent = (
+            make_proxy("paper(0.4, 0.02, 2.0) & loss(0.3)", seed=seed, flows=2),
+            0,
+            0,
+        )
         links = (proxy.uplink, proxy.downlink)
         for number, ((peer, socket), gap_ms) in enumerate(arrivals, start=1):
             now_ns += gap_ms * MILLISECOND_NS

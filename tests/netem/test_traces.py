@@ -12,8 +12,9 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air import traces
 from skytether.shared.scenario.air.draws import SLOT_NS
+from skytether.shared.scenario.air.path import Path as AirPath
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.registry import File
 
 PING = """PING example (192.0.2.1) 56(84) bytes of data.
 64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=20.0 ms
@@ -75,14 +76,13 @@ def file(tmp_path: Path, text: str) -> str:
     ],
 )
 def test_formats_are_told_apart_by_their_content(
-    tmp_path: Path,
     text: str,
     way: traces.Way,
     time_s: list[float],
     delay_s: list[float] | None,
     lost: list[int],
 ) -> None:
-    found = traces.recorded_in(file(tmp_path, text), way)
+    found = traces.recorded_in(File("it", text.encode()), way)
     delay_s = delay_s or [0.1, 0.1 + 0.1 / 3, 0.2]
     np.testing.assert_allclose(found.time_s, time_s, atol=1e-6)
     np.testing.assert_allclose(found.delay_s, delay_s, atol=1e-9)
@@ -131,20 +131,25 @@ def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> 
 def test_too_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
     name = file(tmp_path, "time_s,delay_s\n" + "0,1\n" * 10_000_000)
     with pytest.raises(ValueError, match="got 10000000 rows, expected at most 1000000"):
-        traces.recorded_in(name)
+        traces.recorded_in(File(name, Path(name).read_bytes()))
 
 
 def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
     name = file(tmp_path, "time_s,delay_s\n0,0.1\n")
-    assert path(f"trace({name})").mean_s == 0.1
+    assert path_of(f"trace({name})").mean_s == 0.1
     file(tmp_path, "time_s,delay_s\n0,0.25\n")
-    assert path(f"trace({name})").mean_s == 0.25
+    assert path_of(f"trace({name})").mean_s == 0.25
+
+
+def path_of(text: str) -> AirPath:
+    """A direction, with the files that its text names."""
+    return path(text, reading.files_of("network.uplink", text))
 
 
 @pytest.mark.parametrize("play", ["loop", "once"])
 def test_a_trace_is_replayed_by_time(tmp_path: Path, play: str) -> None:
     name = file(tmp_path, "time_s,delay_s,lost\n0,0.1,0\n1,0.3,0\n2,,1\n3,0.3,0\n")
-    fates = Fates(DirectionConfig(impairments=f"trace({name}, {play})"), 1, "uplink", 0)
+    fates = Fates(path_of(f"trace({name}, {play})"), 1, "uplink", 0)
 
     def at(time_s: float) -> tuple[float, bool]:
         fate = fates.at(round(time_s * SECOND_NS / SLOT_NS))
@@ -159,8 +164,8 @@ def test_a_trace_is_replayed_by_time(tmp_path: Path, play: str) -> None:
 
 @pytest.mark.parametrize("name", ["urban", "edge-of-cell", "outage", "rural", "rural-queue"])
 def test_the_recorded_links_are_scenarios(name: str) -> None:
-    network = reading.load(f"5g-{name}").network
+    scenario = reading.load(f"5g-{name}")
     table = np.loadtxt(reading.SCENARIOS / "traces" / f"5g-{name}.csv", delimiter=",", skiprows=1)
-    assert network.uplink == network.downlink
-    assert network.uplink.path.mean_s == pytest.approx(table[:, 1].mean() / 2e3)
-    assert network.uplink.path.is_ordered
+    assert scenario.network.uplink == scenario.network.downlink
+    assert scenario.uplink.mean_s == pytest.approx(table[:, 1].mean() / 2e3)
+    assert scenario.uplink.is_ordered

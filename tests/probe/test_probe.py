@@ -40,7 +40,7 @@ from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.schema import DirectionConfig, NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
@@ -239,9 +239,7 @@ def measure(
     uplink: str, downlink: str, *, seconds: float, clock: Clock = CLOCK
 ) -> tuple[MeasuredPath, Rows]:
     """Measure a netem network in virtual time, 20 packets a second; with netem's rows."""
-    network = NetworkConfig(
-        uplink=DirectionConfig(impairments=uplink), downlink=DirectionConfig(impairments=downlink)
-    )
+    network = NetworkConfig(uplink=uplink, downlink=downlink)
     sink, world = BytesIO(), World()
     listener = world.add("listener", Listener(PlainGate(), b"secret" * 5), clock=clock)
     recorder = Recorder(PACKET_COLUMNS, sink)

@@ -43,7 +43,7 @@ def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
 
 def scenario(scheme: str, **control: Any) -> Scenario:
     """A network without delay, on which twelve steps may pass after an observation."""
-    direct = {"delay": "none"}
+    direct = "loss(0.1)"
     raw = {
         "model": {"tau_s": TAU_S, "u_max": [1.6]},
         "control": {

@@ -50,7 +50,7 @@ def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> S
         model={"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
         control={"dt": 0.1, "horizon": H, "delay_bound": 0.1 * BOUND, **control},
         vehicle={"exhausted": exhausted, "brake_mps2": 2.0},
-        network={"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        network={"uplink": "loss(0.1)", "downlink": "loss(0.1)"},
         link={"age_max_s": age_max_s},
     )
 
@@ -447,7 +447,7 @@ def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> N
     """Hovering in constant wind, in the last twenty seconds; without it there is one."""
     offsets = {}
     for observer_s in (0.0, 4.0):
-        control = {"trigger": "cost_gap", "cost_gap": 0.01, "observer_s": observer_s}
+        control = {"trigger": "cost_gap(0.01)", "observer_s": observer_s}
         reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
         flown = scenario(control=control, reference=reference, vehicle=vehicle, duration=60.0)
         flight = fly(flown)
@@ -460,7 +460,7 @@ def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
     """With the cost gap, under twice the error at a loss of 0.1."""
     errors = {}
     for loss in (0.1, 0.5):
-        control = {"trigger": "cost_gap", "cost_gap": 0.5, **FIRM}
+        control = {"trigger": "cost_gap(0.5)", **FIRM}
         flown = scenario(
             control=control, network=lossy(loss, loss), vehicle={"wind": 0.1}, settle=5.0
         )
@@ -474,8 +474,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
     for feedback in (False, True):
         control = {
             "feedback": feedback,
-            "trigger": "cost_gap | silence(1)",
-            "cost_gap": 1.0,
+            "trigger": "cost_gap(1) | silence(1)",
             **FIRM,
         }
         flown = scenario(control=control, vehicle={"wind": 0.1}, settle=5.0)
@@ -509,7 +508,7 @@ def test_the_observer_sees_past_feedback_aboard() -> None:
     control = {
         "scheme": "committed",
         "feedback": True,
-        "trigger": "cost_gap | silence(1)",
+        "trigger": "cost_gap(1) | silence(1)",
         "observer_s": 2.0,
     }
     vehicle = {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}
@@ -537,7 +536,7 @@ def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
 
 def test_a_budget_is_kept_in_any_window_of_a_flight() -> None:
     """The budget holds even where every step would be worth a packet."""
-    control = {"trigger": "cost_gap & budget(5, 2)", "cost_gap": 0.0, **FIRM}
+    control = {"trigger": "cost_gap(0) & budget(5, 2)", **FIRM}
     flight = fly(scenario(control=control, vehicle={"wind": 0.3}, duration=30.0))
     sent_s = flight.server["step"][flight.server["event"]] * 0.05
     assert len(sent_s) > 4 * 30

@@ -53,8 +53,8 @@ Floats = NDArray[np.float32]
 SECONDS = 20.0
 LINE = {"shape": "waypoints", "points_m": [[0.0, 0.0], [80.0, 60.0]], "speed_mps": 1.0}
 """A target of constant velocity, 0.8 and 0.6 m/s."""
-STILL: dict[str, Any] = {"delay": "none", "loss": 0.0}
-FAR: dict[str, Any] = {"delay": "constant", "minimum_s": 0.4, "loss": 0.0}
+STILL: dict[str, Any] = ""
+FAR: dict[str, Any] = "constant(0.4)"
 
 
 def scenario(**sections: Any) -> Scenario:
@@ -654,7 +654,7 @@ def flown_and_kept(flown: Scenario) -> tuple[Record, Kept]:
         return fly(flown), kept
 
 
-POISSON = {"delay": "poisson", "loss": 0.2}
+POISSON = "paper(0.4, 0.02, 2.0) & loss(0.2)"
 
 
 @pytest.mark.parametrize("shape", ["circle", "figure-eight"])
@@ -701,11 +701,6 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
             assert row["input"][axis] == pytest.approx(u, abs=1e-12)
             checked += 1
     assert checked > 100
-
-
-def test_a_key_stands_in_for_the_number_of_the_policy() -> None:
-    flown = scenario(control={"trigger": "expected_gap", "cost_gap": 0.55})
-    assert set(fly(flown).server["threshold"]) == {0.55}
 
 
 def test_silence_is_as_long_as_is_said() -> None:
@@ -758,7 +753,7 @@ def test_only_with_feedback() -> None:
 
 def test_acknowledgements_make_good_what_is_lost() -> None:
     """One packet of three is lost: without them the vehicle is further from its target."""
-    lossy = {"delay": "constant", "minimum_s": 0.2, "loss": 0.3}
+    lossy = "constant(0.2) & loss(0.3)"
     target = {"shape": "target", "preview": "none", "turn_every_s": 4.0}
     errors = {}
     for trigger in ("expected_gap(0.3)", "cost_gap(0.3)"):

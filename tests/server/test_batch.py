@@ -15,6 +15,7 @@ from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import NoAnswer, SessionEnded
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import lay
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode
@@ -49,12 +50,10 @@ def test_a_change_in_flight_reaches_every_run_of_a_batch() -> None:
     assert together != [each.trace_hash() for each in fly_batch(scenario(), (1, 2))]
 
 
-directions = st.fixed_dictionaries(
-    {
-        "delay": st.sampled_from(["poisson", "constant", "none"]),
-        "minimum_s": st.sampled_from([0.0, 0.05, 0.1, 0.4]),
-        "loss": st.sampled_from([0.0, 0.1, 0.5]),
-    }
+directions = st.builds(
+    "{} & loss({})".format,
+    st.sampled_from(["none", "constant(0.05)", *(f"paper({s}, 0.02, 2)" for s in (0, 0.1, 0.4))]),
+    st.sampled_from([0.0, 0.1, 0.5]),
 )
 
 scenarios = st.fixed_dictionaries(
@@ -68,7 +67,6 @@ scenarios = st.fixed_dictionaries(
                     ["state_gap", "always", "periodic", "state_gap & budget(5, 2) | silence(0.3)"]
                 ),
                 "observer_s": st.sampled_from([0.0, 2.0]),
-                "epsilon": st.sampled_from([0.01, 0.5]),
                 "solver": st.sampled_from(["exact", "exact", "exact", "osqp"]),
             }
         ).filter(lambda control: not (control["feedback"] and control["scheme"] == "none")),
@@ -94,8 +92,9 @@ committing = st.builds(
         {
             "scheme": st.just("committed"),
             "feedback": st.booleans(),
-            "trigger": st.sampled_from(["cost_gap", "deviation & budget(5, 2) | cost_gap(1)"]),
-            "cost_gap": st.sampled_from([0.01, 1.0]),
+            "trigger": st.sampled_from(
+                ["cost_gap(0.01)", "cost_gap(1)", "deviation & budget(5, 2) | cost_gap(1)"]
+            ),
         }
     ),
 )
@@ -183,7 +182,7 @@ def test_a_session_expires_at_the_same_time_alone_and_in_a_batch(
 
     The server looks for expired sessions on the grid of its own clock.
     """
-    rare = {"downlink": {"delay": "none", "loss": loss}, "uplink": {"delay": "none", "loss": 0.0}}
+    rare = {"downlink": f"loss({loss})", "uplink": ""}
     control, link = {"dt": dt, "horizon": 3}, {"connect_s": 60.0}
     flown = scenario(duration=duration, control=control, network=rare, link=link)
     flights = assert_as_alone(flown, range(4))
@@ -199,7 +198,7 @@ def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
     """Vehicles report every few seconds, and the server forgets a session after three."""
     monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
     table = reading.to_table(reading.load(name)) | {"duration": 20.0, "settle": 0.0}
-    table["network"]["downlink"]["loss"] = 0.97
+    lay({"network.downlink.loss": 0.97}, table)
     table["link"]["connect_s"] = 1000.0
     flights = assert_as_alone(reading.check(table, "test"), range(1, 6))
     assert sum(event == SessionEnded(vehicle=1) for run in flights for *_, event in run.events) >= 3
@@ -228,7 +227,7 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
         made.append(self)
 
     monkeypatch.setattr(Desired, "__init__", crowded)
-    quiet = {"delay": "constant", "minimum_s": 0.0, "loss": 0.0}
+    quiet = "constant(0.0)"
     flown = scenario(
         duration=0.6,
         control={"dt": 0.001, "horizon": 2},

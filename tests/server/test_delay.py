@@ -18,7 +18,7 @@ from skytether.server.schemes.delay_bound import (
     forget,
 )
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.scenario.schema import DirectionConfig
+from skytether.shared.scenario.air.path import path
 
 quick = settings(max_examples=100)
 
@@ -206,7 +206,10 @@ def flown(
         minima_s: smallest delay in each of as many equal parts of the flight [s].
     """
     dt_ns, steps = seconds_to_ns(dt_s), round(SECONDS / dt_s)
-    parts = [Fates(DirectionConfig(minimum_s=least_s), seed, "uplink", 0) for least_s in minima_s]
+    parts = [
+        Fates(path(f"paper({least_s}, 0.02, 2.0) & loss(0.1)"), seed, "uplink", 0)
+        for least_s in minima_s
+    ]
     arrivals: dict[int, list[int]] = {}
     for made in range(0, steps, period):
         fate = parts[made * len(minima_s) // steps].at(made)

@@ -461,7 +461,7 @@ def test_a_wake_before_its_time_does_nothing() -> None:
 
 
 def test_a_silent_server_sends_heartbeats() -> None:
-    vehicles = Vehicles(scenario(trigger="state_gap", epsilon=1e9))
+    vehicles = Vehicles(scenario(trigger="state_gap(1e9)"))
     welcome = vehicles.open()
     sent = []
     for step in range(61):

@@ -27,7 +27,8 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.schema import DirectionConfig, Scenario
+from skytether.shared.scenario.air.path import Path
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import IDLE_TEXTS, Idle
@@ -50,7 +51,7 @@ def scenario(
     table["control"] |= TIGHT
     table["vehicle"] |= {"wind": 0.0, "report": "always"}
     for direction, delay_s in (("uplink", uplink_s), ("downlink", downlink_s)):
-        table["network"][direction] |= {"delay": "constant", "minimum_s": delay_s}
+        table["network"][direction] = f"constant({delay_s}) & loss(0.1)"
     for section, values in sections.items():
         table[section] |= values
     return reading.check(table, "test")
@@ -62,7 +63,7 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
     class Clocked(Fates):
         """Fates that are functions of the time, by the seed of the flight."""
 
-        def __init__(self, direction: DirectionConfig, seed: int, name: str, flow: int) -> None:
+        def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
             super().__init__(direction, seed, name, flow)
             self._delay = delays[seed][name != "uplink"]
 

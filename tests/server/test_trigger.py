@@ -30,11 +30,8 @@ quick = settings(max_examples=60)
 
 CONTROL = ControlConfig(
     scheme="committed",
-    trigger="state_gap",
+    trigger="state_gap(3, 2)",
     dt=0.1,
-    epsilon=3.0,
-    decay_rate=2.0,
-    cost_gap=1.0,
     terminal_weight=(50.0, 8.0),
 )
 ROW = np.array([0])
@@ -106,7 +103,7 @@ def test_threshold_decays_per_second() -> None:
 
 def test_first_step_is_an_event_however_small_the_error() -> None:
     """E18: the vehicle has nothing to fly yet."""
-    verdict = ask(trigger_of("state_gap"), 0, 0.0, fresh=True)
+    verdict = ask(trigger_of("state_gap(3)"), 0, 0.0, fresh=True)
     assert (verdict.event.tolist(), verdict.figure.tolist()) == ([True], [0.0])
     assert verdict.threshold.tolist() == [3.0]
 
@@ -153,7 +150,7 @@ def test_an_event_is_an_error_above_the_threshold_of_eq_16(
     error: float, steps: int, rate: float, epsilon: float, dt: float, off: float
 ) -> None:
     """S(k) = V(k_i) exp(-λ (k - k_i) Δt) + ε, however time is cut into steps."""
-    control = ControlConfig(trigger="state_gap", dt=dt, epsilon=epsilon, decay_rate=rate)
+    control = ControlConfig(trigger=f"state_gap({epsilon!r}, {rate!r})", dt=dt)
     S = error * math.exp(-rate * steps * dt) + epsilon
     V = max(S + off, 0.0)
     verdict = ask(after_event(20, error, control), 20 + steps, V)
@@ -355,12 +352,11 @@ def test_deviation_is_a_distance_above_the_threshold() -> None:
 
 
 def test_cost_gap_fires_above_the_threshold() -> None:
-    for text in ("cost_gap(1)", "cost_gap"):
-        trigger = trigger_of(text)
-        assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
-        for gap, event in ((1.0, False), (1.1, True)):
-            verdict = trigger.test(facing(ROW, figures_of(cost_gap=gap)))
-            assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [gap], [1.0])
+    trigger = trigger_of("cost_gap(1)")
+    assert trigger.test(facing(ROW, figures_of(fresh=True))).event.tolist() == [True]
+    for gap, event in ((1.0, False), (1.1, True)):
+        verdict = trigger.test(facing(ROW, figures_of(cost_gap=gap)))
+        assert (verdict.event, verdict.figure, verdict.threshold) == ([event], [gap], [1.0])
 
 
 def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> None:
@@ -419,19 +415,18 @@ def test_both_sides_are_told_whichever_is_recorded(compares: tuple[bool, bool]) 
 
 
 def test_scenario_names_its_trigger() -> None:
-    control = ControlConfig(period=4, epsilon=2.0, decay_rate=0.0, cost_gap=7.0, deviation_m=8.0)
     thresholds = {
-        "state_gap": 2.0,
-        "cost_gap": 7.0,
-        "deviation": 8.0,
+        "state_gap(2, 0)": 2.0,
+        "cost_gap(7)": 7.0,
+        "deviation(8)": 8.0,
         "always": 0.0,
-        "periodic": 0.0,
+        "periodic(4)": 0.0,
     }
-    for name, threshold in thresholds.items():
-        trigger = make_trigger(msgspec.structs.replace(control, trigger=name), 1)
+    for text, threshold in thresholds.items():
+        trigger = make_trigger(ControlConfig(trigger=text), 1)
         verdict = trigger.test(facing(ROW, figures_of()))
         assert verdict.threshold.tolist() == [threshold]
-        if name == "periodic":
+        if text == "periodic(4)":
             assert events(trigger, 0, 9) == [0, 4, 8]
 
 

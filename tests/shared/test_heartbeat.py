@@ -21,7 +21,7 @@ from skytether.shared.law.heartbeat import (
     false_per_h,
     silences,
 )
-from skytether.shared.scenario.schema import DirectionConfig, LinkConfig
+from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason
 from skytether.sim.flight import fly
 
@@ -140,7 +140,7 @@ def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
 @pytest.mark.parametrize(("loss", "packets_per_s"), [(0.1, 1.4), (0.3, 2.7)])
 def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float, packets_per_s: float) -> None:
     """In three hours; where heartbeats do not follow the loss, far more often."""
-    network = DirectionConfig(loss=loss)
+    network = f"paper(0.4, 0.02, 2.0) & loss({loss})"
     kept = keep(network, 18, LinkConfig(timeout_s=2.0))
     assert kept.false_per_h <= 0.34
     assert max(kept.noticed_s) < 2.0 + 0.6
@@ -164,17 +164,17 @@ def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> N
 
 
 def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
-    kept = keep(DirectionConfig(loss=0.1), 6)
+    kept = keep("paper(0.4, 0.02, 2.0) & loss(0.1)", 6)
     assert kept.false_per_h <= 1.0
     assert len(kept.noticed_s) == 6
     assert 1.2 < min(kept.noticed_s) <= max(kept.noticed_s) < 2.1
-    assert keep(DirectionConfig(loss=0.6), 6).false_per_h > 0
-    calm = keep(DirectionConfig(loss=0.0), 1)
+    assert keep("paper(0.4, 0.02, 2.0) & loss(0.6)", 6).false_per_h > 0
+    calm = keep("paper(0.4, 0.02, 2.0)", 1)
     assert (calm.false_per_h, calm.noticed_s) == (0, pytest.approx([1.75], abs=0.35))
 
 
 def test_bursts_are_longer_than_any_heartbeat_helps_against() -> None:
-    assert keep(DirectionConfig(loss=0.1, burst_s=2.0), 6).false_per_h > 20
+    assert keep("paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)", 6).false_per_h > 20
 
 
 def test_a_flight_notices_that_it_is_cut() -> None:

@@ -143,7 +143,7 @@ def test_triggers_are_listed_with_a_sentence_each(
     assert main(["triggers", "--plugin", str(path)]) == 0
     said = capsys.readouterr().out
     assert f"never\n    Sends nothing. (from {path})\n" in said
-    assert "periodic or periodic(N) with 1 <= N <= 1000000 (whole)\n    Sends N steps" in said
+    assert "periodic(N=10) with 1 <= N <= 1000000 (whole)\n    Sends N steps" in said
     assert all(entry.about.endswith(".") for table in TABLES for entry in table.values())
 
 
@@ -191,7 +191,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
     plug(tmp_path, code)
     seen: list[Any] = []
     TRIGGERS["look"].make.__globals__["seen"] = seen  # type: ignore[attr-defined]
-    way = {"delay": "constant", "minimum_s": 0.1, "loss": 0.0, "burst_s": 0.0}
+    way = "constant(0.1)"
     asked = scenario(
         control={"trigger": "look", "feedback": False},
         network={"uplink": way, "downlink": way, "mtu": 1472},
@@ -373,12 +373,13 @@ def test_every_bound_of_a_text_holds(
     """
     plug(tmp_path, code)
     for written, refused in ((right, False), (wrong, True)):
-        call = f'fading("{written}")' if "File" in bound else f"fading({written})"
-        network = {"uplink": {"impairments": call}}
-        if refused:
-            assert form in refusal(partial(scenario, network=network))
-        else:
-            scenario(network=network)
+        network = {"uplink": f"fading({written})"}
+        with chdir(tmp_path):
+            Path(written).touch()
+            if refused:
+                assert form in refusal(partial(scenario, network=network))
+            else:
+                scenario(network=network)
 
 
 def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) -> None:
@@ -391,8 +392,8 @@ def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) ->
     plug(tmp_path, code)
     for written in ("slip", "slip(-1.5, 4)"):
         assert faults(flown(written)) == []
-    said = refusal(lambda: scenario(control={"trigger": "slip(1)"}))
-    assert said.endswith("expected slip or slip(a, b) with a and b (whole)")
+    said = refusal(lambda: scenario(control={"trigger": "slip(1, 2.5)"}))
+    assert said.endswith("expected slip(a=-2.0, b=3) with b (whole)")
 
 
 def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
@@ -756,7 +757,7 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     """Without a flag, and without a change of Skytether."""
     about = "Sends where the velocity is off its plan by more than so many m/s. (from my_package)"
     listed = run("triggers", folder=tmp_path, path=installed)
-    assert f"slip or slip(mps) with 0 <= mps\n    {about}\n" in listed
+    assert f"slip(mps=0.3) with 0 <= mps\n    {about}\n" in listed
     trigger = ("--control.trigger", "slip & budget(5, 2) | silence(1)")
     flies = ("--vehicle.kind", "rail")
     argv = (*trigger, *flies)

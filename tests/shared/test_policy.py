@@ -8,18 +8,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import helpers
-from skytether.shared.scenario import policies, reading
-from skytether.shared.scenario.policies import (
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.grammar import (
     TEXT_MAX,
+    Call,
     Combination,
-    Policy,
-    PolicyError,
+    Expression,
+    GrammarError,
+    leaves,
 )
 from skytether.shared.scenario.registry import TRIGGERS
 
 FORM = "policies such as 'state_gap & budget(5, 2) | silence(1)'"
-STATE_GAP, ALWAYS = Policy("state_gap", ()), Policy("always", ())
-BUDGET, SILENCE = Policy("budget", (5, 2)), Policy("silence", (0.5,))
+STATE_GAP, ALWAYS = Call("state_gap", (3.6, 1.5)), Call("always")
+BUDGET, SILENCE = Call("budget", (5, 2)), Call("silence", (0.5,))
 
 READ = {
     "state_gap": STATE_GAP,
@@ -27,7 +29,9 @@ READ = {
     "((state_gap))": STATE_GAP,
     "budget(5, 2)": BUDGET,
     "silence( 5e-1 )": SILENCE,
-    "state_gap(.5, 2.)": Policy("state_gap", (0.5, 2.0)),
+    "state_gap(.5, 2.)": Call("state_gap", (0.5, 2.0)),
+    "state_gap(decay_rate=2, epsilon = .5)": Call("state_gap", (0.5, 2.0)),
+    "state_gap(4)": Call("state_gap", (4, 1.5)),
     "state_gap & always": Combination("&", STATE_GAP, ALWAYS),
     "state_gap|\n always": Combination("|", STATE_GAP, ALWAYS),
     # & binds tighter than |, and both from the left.
@@ -45,9 +49,10 @@ READ = {
     ),
 }
 
-PERIODIC = "periodic or periodic(N) with 1 <= N <= 1000000 (whole)"
+PERIODIC = "periodic(N=10) with 1 <= N <= 1000000 (whole)"
 BOUNDED = "budget(packets_per_s, burst) with 0.001 <= packets_per_s <= 1000000 and "
 BOUNDED += "1 <= burst <= 1000000"
+GAP = "state_gap(epsilon=3.6, decay_rate=1.5) with 0 <= epsilon and 0 <= decay_rate"
 REFUSED = {
     # No expression of policies.
     "": ("", FORM),
@@ -55,20 +60,19 @@ REFUSED = {
     "(state_gap": ("(state_gap", FORM),
     "state_gap always": ("state_gap always", FORM),
     "state_gap and always": ("state_gap and always", FORM),
-    "always & (not state_gap)": ("not state_gap", FORM),
+    "always & (not state_gap)": ("always & (not state_gap)", FORM),
     "always & (lambda: state_gap)": ("always & (lambda: state_gap)", FORM),
     "state_gap - 3": ("state_gap - 3", FORM),
-    "state_gap -3": ("state_gap - 3", FORM),
+    "state_gap -3": ("state_gap -3", FORM),
     "3": ("3", FORM),
-    "None": ("None", FORM),
+    "None": ("None", f"a policy; there are {', '.join(TRIGGERS)}"),
     "(state_gap, always)": ("(state_gap, always)", FORM),
     "state_gap(1, 2)(3)": ("state_gap(1, 2)(3)", FORM),
     "1or 2": ("1or 2", FORM),
     "state_gap.test": ("state_gap.test", FORM),
     "state_gap[0]": ("state_gap[0]", FORM),
     "state_gap # always": ("state_gap # always", FORM),
-    "state_gap(*always)": ("state_gap(*always)", FORM),
-    "budget(packets_per_s=5, burst=2)": ("budget(packets_per_s=5, burst=2)", FORM),
+    "state_gap(*always)": ("state_gap(*always)", GAP),
     "\N{FULLWIDTH LATIN SMALL LETTER P}aper": ("\N{FULLWIDTH LATIN SMALL LETTER P}aper", FORM),
     # No such policy.
     "perodic(3)": ("perodic(3)", "a policy; did you mean periodic?"),
@@ -90,12 +94,10 @@ REFUSED = {
     "budget(0, 2)": ("budget(0, 2)", BOUNDED),
     "budget(5, 0.9)": ("budget(5, 0.9)", BOUNDED),
     "silence()": ("silence()", "silence(seconds) with 0.001 <= seconds <= 3600"),
-    "cost_gap(-1)": ("cost_gap(-1)", "cost_gap or cost_gap(c) with 0 <= c"),
-    "deviation(1e999)": ("deviation(1e309)", "deviation or deviation(metres) with 0 <= metres"),
-    "state_gap(3.6)": (
-        "state_gap(3.6)",
-        "state_gap or state_gap(epsilon, decay_rate) with 0 <= epsilon and 0 <= decay_rate",
-    ),
+    "cost_gap(-1)": ("cost_gap(-1)", "cost_gap(c=0.05) with 0 <= c"),
+    "deviation(1e999)": ("deviation(1e999)", "deviation(metres=0.05) with 0 <= metres"),
+    "state_gap(1, epsilon=2)": ("state_gap(1, epsilon=2)", GAP),
+    "state_gap(lambda=2)": ("state_gap(lambda=2)", GAP),
 }
 """Texts that are no trigger, each with the part that is named as wrong and what was expected."""
 
@@ -106,9 +108,9 @@ def refusal(text: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
-def test_what_is_written_is_read(text: str, read: policies.Expression) -> None:
+def test_what_is_written_is_read(text: str, read: Expression) -> None:
     """Names, numbers, &, | and parentheses, as Python reads them."""
-    assert policies.parse(text) == read
+    assert TRIGGERS.parse(text) == read
     control = {"scheme": "committed", "trigger": text}
     assert reading.check({"control": control}, "mine").control.trigger == text
 
@@ -121,10 +123,10 @@ def test_what_is_no_trigger_is_refused_in_one_line(text: str, said: tuple[str, s
 def test_the_longest_trigger_is_read_and_a_longer_one_refused() -> None:
     deep = "(" * 97 + "always" + ")" * 97
     assert len(deep) == TEXT_MAX
-    assert policies.parse(deep) == ALWAYS
+    assert TRIGGERS.parse(deep) == ALWAYS
     assert refusal(deep + " ").endswith(", expected a text of length <= 200")
     longest = " | ".join(["state_gap"] * 16)
-    assert list(policies.policies(policies.parse(longest))) == [STATE_GAP] * 16
+    assert list(leaves(TRIGGERS.parse(longest))) == [STATE_GAP] * 16
 
 
 @pytest.mark.parametrize(
@@ -181,14 +183,14 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
     """Nothing else: no other error, no warning of Python's, and nothing happens."""
     said, found = "", []
     try:
-        found = list(policies.policies(policies.parse(text)))
+        found = list(leaves(TRIGGERS.parse(text)))
         reading.check({"control": {"trigger": text, "scheme": "committed"}}, "mine")
-    except PolicyError:
+    except GrammarError:
         said = refusal(text)
         assert said.startswith("mine: control.trigger: got ")
     assert bool(said) or found
     assert len(said.splitlines()) == bool(said)
-    assert all(TRIGGERS[one.name].takes(one.values) for one in found)
+    assert all(TRIGGERS[one.name].bound(one) == one.values for one in found)
 
 
 def test_nothing_written_is_ever_run() -> None:
@@ -204,14 +206,14 @@ trees = st.recursive(
 )
 
 
-def written(tree: policies.Expression) -> str:
+def written(tree: Expression) -> str:
     """With every parenthesis."""
-    if isinstance(tree, Policy):
+    if isinstance(tree, Call):
         values = ", ".join(map(repr, tree.values))
         return f"{tree.name}({values})"
     return f"({written(tree.left)} {tree.operator} {written(tree.right)})"
 
 
 @given(trees)
-def test_every_combination_can_be_written(tree: policies.Expression) -> None:
-    assert policies.parse(written(tree)) == tree
+def test_every_combination_can_be_written(tree: Expression) -> None:
+    assert TRIGGERS.parse(written(tree)) == tree

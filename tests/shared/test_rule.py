@@ -194,7 +194,7 @@ def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
             "observer_s": 2.0,
         },
         "vehicle": {"exhausted": exhausted, "brake_mps2": 2.0},
-        "network": {"uplink": {"delay": "none"}, "downlink": {"delay": "none"}},
+        "network": {"uplink": "loss(0.1)", "downlink": "loss(0.1)"},
         "link": {"age_max_s": 0.1 * age_max},
     }
     return check(raw, "test")

@@ -70,10 +70,8 @@ OTHER: dict[str, Any] = {
     "vehicle.dead_time_s": 0.1,
     "vehicle.start_m": [1.0, 1.0],
     "vehicle.steady_wind_mps": [0.1, 0.1],
-    "network.uplink.impairments": "constant(0.1)",
-    "network.downlink.impairments": "loss(0.1)",
-    "network.uplink.delay": "none",
-    "network.downlink.delay": "none",
+    "network.uplink": "constant(0.1)",
+    "network.downlink": "loss(0.1)",
     "title": "another",
     "armed": False,
 }

@@ -14,7 +14,7 @@ from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, zones
-from skytether.shared.scenario.policies import PolicyError
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.zones import Zones
 from two_vehicles import with_goals
@@ -141,21 +141,27 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
     [
         ("bix(0, 1, 0, 1)", "did you mean box"),
         ("box(1, 0, 0, 1)", "from less to more"),
-        ("box(0, 1)", "box(x0, x1, y0, y1)"),
-        ("box(0, 1, 0, nan)", "numbers of at most 1e6 m"),
-        ("box(0, 1, 0, one)", "numbers between commas"),
+        ("box(0, 1)", "box(x0, x1, y0, y1, heights…)"),
+        ("box(0, 1, 0, nan)", "box(x0, x1, y0, y1, heights…)"),
+        ("box(0, 1, 0, one)", "box(x0, x1, y0, y1, heights…)"),
         ("cylinder(0, 0, 0)", "cylinder(x, y, radius)"),
         ("polygon(0, 0, 1, 1)", "at least 3 points"),
         ("corridor(0, 0, 0, 1, 0)", "corridor(width"),
+        ("box(0, 2e6, 0, 1)", "numbers of at most 1e+06 m"),
         ("corridor(1, 0, 0, 1, 0, 0, 0)", "without a turn back"),
         ("box(0, 1, 0, 1, 0, 3)", "no heights with model.axes = 2"),
         ("box(0, 1, 0, 1) cylinder(0, 0, 1)", "zones such as"),
     ],
 )
 def test_what_is_no_zone_is_told(text: str, said: str) -> None:
-    with pytest.raises(PolicyError) as refused:
+    with pytest.raises(GrammarError) as refused:
         zones.parse(text, 2)
     assert said in str(refused.value)
+
+
+def parsed(text: str, axes: int = 2) -> zones.Zones:
+    """Zones of a text and its files."""
+    return zones.parse(text, axes, reading.files_of("mission.zones", text))
 
 
 def geojson(features: Any, **more: Any) -> str:
@@ -177,7 +183,7 @@ def test_zones_from_a_map(tmp_path: Path) -> None:
     field = [[-100, -100], [100, -100], [100, 100], [-100, 100]]
     hole = [[-10, -10], [10, -10], [10, 10], [-10, 10]]
     file.write_text(geojson([polygon(square, low_m=0, high_m=30)], origin=[10.0, 50.0]))
-    kept = zones.parse(f'geojson("{file}")', 3)
+    kept = parsed(f'geojson("{file}")', 3)
     (zone,) = kept.zones
     assert zone.corners[2] == pytest.approx(
         [degree_m * 1e-3 * np.cos(np.radians(50.0005)), 111.3195]
@@ -188,7 +194,7 @@ def test_zones_from_a_map(tmp_path: Path) -> None:
     mast = {"type": "Point", "coordinates": [50, 50]}
     file.write_text(geojson([fence, {"geometry": mast, "properties": {"radius_m": 5}}]))
     points = np.array([[0.0, 0.0], [20.0, 0.0], [50.0, 52.0], [200.0, 0.0]])
-    inside = zones.parse(f"geojson({file})", 2).clearance(points).min(axis=1)
+    inside = parsed(f"geojson({file})").clearance(points).min(axis=1)
     assert (inside > 0.0).tolist() == [False, True, False, False]
 
 
@@ -210,7 +216,7 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
         ("[]", "FeatureCollection"),
         (json.dumps({"features": []}), "FeatureCollection"),
         (json.dumps(MEMBER), "FeatureCollection"),
-        (geojson([]), "a feature with a Polygon"),
+        (geojson([]), "a GeoJSON file with a Polygon"),
         (geojson([polygon(SQUARE)], units=None), 'a member "origin" with the longitude'),
         (geojson([polygon(SQUARE)], units="m", origin=[10, 50]), "got both"),
         (geojson([polygon(SQUARE)], units="ft"), '"units": "m" or none, got \'ft\''),
@@ -244,8 +250,8 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
 def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
     file = tmp_path / "map.geojson"
     file.write_text(content)
-    with pytest.raises(PolicyError) as refused:
-        zones.parse(f'geojson("{file}")', 2)
+    with pytest.raises(GrammarError) as refused:
+        parsed(f'geojson("{file}")', 2)
     assert said in str(refused.value)
 
 
@@ -255,7 +261,7 @@ def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -
 
     def corners(points: Any, origin: Any, **more: Any) -> list[list[float]]:
         file.write_text(geojson([polygon(points)], origin=origin, **more))
-        (zone,) = zones.parse(f"geojson({file})", 2).zones
+        (zone,) = parsed(f"geojson({file})").zones
         found: list[list[float]] = zone.corners.round(6).tolist()
         return found
 
@@ -277,14 +283,14 @@ def test_neither_winding_nor_hole_changes_where_a_vehicle_may_be(tmp_path: Path)
     for outer, inner in ((SQUARE, hole), (SQUARE[::-1], hole), (SQUARE, hole[::-1])):
         for kind, free in (("keep_out", [False, False, True]), ("fence", [True, False, False])):
             file.write_text(shape("Polygon", [outer, inner], kind=kind))
-            kept = zones.parse(f"geojson({file})", 2)
+            kept = parsed(f"geojson({file})")
             assert (kept.clearance(places).min(axis=1) > 0.0).tolist() == free
 
 
 def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
     """By the even-odd rule a vehicle would be free within what is enclosed twice."""
     star = "polygon(0, 10, -6, -8, 9.5, 3, -9.5, 3, 6, -8)"
-    with pytest.raises(PolicyError, match="does not cross itself"):
+    with pytest.raises(GrammarError, match="does not cross itself"):
         zones.parse(star, 2)
     zones.parse(U, 2)
 

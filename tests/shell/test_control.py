@@ -35,7 +35,7 @@ class Closing(Proxy):
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         super().change(scenario, keys, now_ns=now_ns)
-        self.finished = scenario.network.uplink.path.loss == 1.0
+        self.finished = scenario.uplink.loss == 1.0
 
 
 def running() -> Running:
@@ -58,7 +58,7 @@ def test_a_process_is_changed_through_its_socket_while_it_is_driven(tmp_path: Pa
     def operate() -> None:
         answers.append(stat.S_IMODE(path.lstat().st_mode))
         with closing(Caller(path)) as caller:
-            answers.append(caller.ask({}).values["network.uplink.loss"])
+            answers.append(caller.ask({}).values["network.uplink"])
             answers.append(caller.ask({"network.uplink.loss": 2}).refused)
             answers.append(caller.ask({"network.uplink.loss": 1}).changed)
 
@@ -68,9 +68,10 @@ def test_a_process_is_changed_through_its_socket_while_it_is_driven(tmp_path: Pa
         shell_ = Shell(endpoint, ("127.0.0.1", 0), control=control)
         run([shell_], on_start=thread.start, on_event=events.append)
         thread.join()
-    refused = "network.uplink.loss: got 2, expected a number <= 1.0"
-    changed = Changed(key="network.uplink.loss", before="0.1", after="1.0")
-    assert answers == [0o600, 0.1, refused, (changed,)]
+    refused = "network.uplink: got 'loss(2)', expected loss(share) with 0 <= share <= 1"
+    before, after = (f"paper(0.4, 0.02, 2.0) & loss({share})" for share in ("0.1", "1"))
+    changed = Changed(key="network.uplink", before=f'"{before}"', after=f'"{after}"')
+    assert answers == [0o600, before, refused, (changed,)]
     assert events == [ChangeRefused(reason=refused), changed]
     assert not path.exists()
 
@@ -135,7 +136,7 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
         caller = Caller(path)
         caller._socket.send(b"{}")
         loop.look()
-        assert b"network.uplink.loss" in caller._socket.recv(9000)
+        assert b"network.uplink" in caller._socket.recv(9000)
         caller.close()
 
 
@@ -342,7 +343,7 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
     codes: list[int] = []
 
     def operate() -> None:
-        calls = [[], ["network.uplink.loss=0.3", "network.downlink.delay=none"], ["control.dt=1"]]
+        calls = [[], ["network.uplink.loss=0.3", "network.downlink=none"], ["control.dt=1"]]
         calls.append(["network.uplink=constant(0.1) & loss(0.6)"])
         codes.extend(command.main(set_keys, [str(path), *call], "set") for call in calls)
         command.main(set_keys, [str(path), "network.uplink=loss(1)"], "set")
@@ -355,10 +356,12 @@ def test_set_prints_what_may_change_what_has_and_what_was_refused(
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert codes == [0, 0, 2, 0]
-    assert lines[:2] == ["network.downlink.burst_s = 0.0", 'network.downlink.delay = "poisson"']
-    assert lines[14:17] == [
-        "network.uplink.loss is 0.3 from now on, it was 0.1",
-        'network.downlink.delay is "none" from now on, it was "poisson"',
+    paper = '"paper(0.4, 0.02, 2.0) & loss({})"'.format
+    assert lines[:5] == [
+        f"network.downlink = {paper(0.1)}",
+        f"network.uplink = {paper(0.1)}",
+        f"network.uplink is {paper(0.3)} from now on, it was {paper(0.1)}",
+        f'network.downlink is "none" from now on, it was {paper(0.1)}',
         (
             'network.uplink is "constant(0.1) & loss(0.6)" from now on, it was '
             '"paper(0.4, 0.02, 2.0) & loss(0.3)"'

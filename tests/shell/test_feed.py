@@ -477,8 +477,8 @@ class Passing(Proxy):
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         super().change(scenario, keys, now_ns=now_ns)
-        self.recorder.append(1, number=round(100 * scenario.network.uplink.loss))
-        self.finished = scenario.network.uplink.loss == 1.0
+        self.recorder.append(1, number=round(100 * scenario.uplink.loss))
+        self.finished = scenario.uplink.loss == 1.0
 
 
 class Seen:
@@ -518,7 +518,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
 
     def losses() -> list[float]:
         return [
-            float(frame.event.after)
+            float(frame.event.after.rpartition("loss(")[2].rstrip(')"'))
             for frame in seen.frames["netem"]
             if isinstance(frame, Said) and isinstance(frame.event, Changed)
         ]
@@ -561,7 +561,7 @@ def test_a_process_tells_its_readers_while_it_is_driven(
         assert isinstance(opened, Opened)
         assert (opened.process, opened.name) == ("netem", "demo")
         scenario = msgspec.toml.decode(opened.scenario, type=schema.Scenario)
-        assert scenario.network.uplink.loss == loss
+        assert scenario.uplink.loss == loss
     assert isinstance(before, Opened)
     columns = columns_of(before.parts["netem"])
     told = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]

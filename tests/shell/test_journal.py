@@ -56,6 +56,9 @@ def driven(folder: Path, ask: Callable[[Caller], Any]) -> tuple[list[Any], list[
     return answers, events
 
 
+LOSSY = "paper(0.4, 0.02, 2.0) & loss({})".format
+
+
 def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
     """Keep what is set in a flight of a scenario."""
     kept_by = begun(folder, scenario).journal
@@ -76,21 +79,21 @@ def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> N
         return json.loads(kept(tmp_path).read_bytes())["values"]
 
     answers, _ = driven(tmp_path, ask)
-    assert answers == [{"network.uplink.loss": 0.25, "network.downlink.loss": 0.5}]
+    assert answers == [{"network.uplink": LOSSY(0.25), "network.downlink": LOSSY(0.5)}]
     assert kept(tmp_path).stat().st_mode & 0o777 == 0o600
 
 
 def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path) -> None:
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
     _, scenario, news = begun(tmp_path)
-    assert scenario.network.uplink.loss == 0.25
-    assert str(news[0]).endswith("as it was set in flight: network.uplink.loss = 0.25")
+    assert scenario.network.uplink == LOSSY(0.25)
+    assert str(news[0]).endswith("as it was set in flight: " + f"network.uplink = '{LOSSY(0.25)}'")
     answers, _ = driven(
         tmp_path,
         lambda caller: (caller.ask({"network.downlink.loss": 0.5}), caller.ask({}).values)[1],
     )
-    assert answers[0]["network.uplink.loss"] == 0.25
-    assert begun(tmp_path).scenario.network.downlink.loss == 0.5
+    assert answers[0]["network.uplink"] == LOSSY(0.25)
+    assert begun(tmp_path).scenario.network.downlink == LOSSY(0.5)
 
 
 def test_what_is_refused_is_not_kept(tmp_path: Path) -> None:
@@ -145,7 +148,7 @@ def test_one_of_another_flight_is_refused_in_words(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    write(tmp_path, DEMO, {"network.uplink.loss": 0.25})
+    write(tmp_path, DEMO, {"network.uplink": LOSSY(0.25)})
     now_s = journal.time.time() + later_s
     monkeypatch.setattr(journal.time, "time", lambda: now_s)
     with pytest.raises(CommandError, match=said) as refused:

@@ -37,7 +37,7 @@ def test_virtual_time_flies_by_machine_code_and_plain_python_does_not() -> None:
     assert all(hasattr(each.func, "dispatcher") for each in COMPILABLE)
 
 
-NOTHING = {"delay": "none", "loss": 0.0}
+NOTHING = ""
 NOISY = {"position_noise_m": 0.05, "velocity_noise_mps": 0.1}
 scenarios = st.fixed_dictionaries(
     {
@@ -45,7 +45,6 @@ scenarios = st.fixed_dictionaries(
             {
                 "scheme": st.sampled_from(["predictive", "committed", "trajectory"]),
                 "feedback": st.booleans(),
-                "epsilon": st.sampled_from([0.01, 0.5]),
                 "trigger": st.sampled_from(["always", "periodic", "heartbeat"]),
             }
         ).filter(lambda control: control["feedback"] or control["scheme"] != "trajectory"),
@@ -66,8 +65,8 @@ scenarios = st.fixed_dictionaries(
         "sensor": st.sampled_from([{}, {}, NOISY, {"delay_s": 0.1}, {"filter": "none"}]),
         "network": st.fixed_dictionaries(
             {
-                "uplink": st.sampled_from([NOTHING, {"delay": "poisson", "loss": 0.5}]),
-                "downlink": st.sampled_from([NOTHING, {"delay": "poisson", "loss": 0.1}]),
+                "uplink": st.sampled_from([NOTHING, "paper(0.4, 0.02, 2.0) & loss(0.5)"]),
+                "downlink": st.sampled_from([NOTHING, "paper(0.4, 0.02, 2.0) & loss(0.1)"]),
             }
         ),
         "link": st.just({"heartbeat_s": 0.2, "timeout_s": 0.5}),

@@ -39,8 +39,7 @@ def flew(name: str = "paper-every-step", **changes: Any) -> Summary:
     return summary(flown, fly(flown))
 
 
-NOTHING = {"delay": "none", "loss": 0.0}
-QUIET = {"uplink": NOTHING, "downlink": NOTHING}
+QUIET = {"uplink": "", "downlink": ""}
 """A network that does nothing."""
 
 HASH = """
@@ -127,7 +126,10 @@ def test_the_summary_counts_what_the_network_saw() -> None:
 
 def test_two_contenders_of_a_seed_meet_the_same_network() -> None:
     met: list[dict[tuple[int, int], tuple[int, bool]]] = []
-    bursts = {"uplink": {"burst_s": 0.5}, "downlink": {"burst_s": 0.5}}
+    bursts = {
+        "uplink": "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 0.5)",
+        "downlink": "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 0.5)",
+    }
     for trigger, scheme in (("always", "predictive"), ("periodic(7)", "committed")):
         control = {"trigger": trigger, "scheme": scheme}
         rows = fly(packaged("paper", duration=20.0, control=control, network=bursts)).netem
@@ -211,7 +213,7 @@ def test_two_vehicles_share_one_server() -> None:
 
 
 def test_a_network_that_loses_everything_is_no_flight() -> None:
-    lost = QUIET | {"uplink": NOTHING | {"loss": 1.0}}
+    lost = QUIET | {"uplink": "loss(1)"}
     flight = fly(packaged("paper", settle=0.0, network=lost))
     assert flight.failure == NoAnswer(vehicle=1, host="netem 1", port=0, waited_s=121.0)
     assert len(flight.client) == 0
@@ -263,7 +265,7 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
 
 def test_what_is_never_flown_costs_no_packets() -> None:
     """Over a round trip of 1.6 s the last 1.3 s of a plan are too old before their turn comes."""
-    slow = {"minimum_s": 0.76}
+    slow = "paper(0.76, 0.02, 2.0) & loss(0.1)"
     long = packaged("demo-committed", duration=30.0, network={"uplink": slow, "downlink": slow})
     assert long.link.age_max_s == 5.0
     found = [summary(long, flight) for flight in fly_batch(long, range(1, 7))]

@@ -19,7 +19,7 @@ from skytether.sim.flight import MIDNIGHT_NS, fly
 
 def scenario(**sections: Any) -> Scenario:
     """Twenty seconds of the demo over 0.2 s each way without loss; sections are laid over."""
-    quick = {"delay": "constant", "minimum_s": 0.2, "loss": 0.0}
+    quick = "constant(0.2)"
     preset = {
         "duration": 20.0,
         "network": {"uplink": quick, "downlink": quick},

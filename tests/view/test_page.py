@@ -30,11 +30,10 @@ from skytether.view.browser.replay import Player
 from skytether.view.controls import (
     THRESHOLDS,
     TRIGGERS,
-    compared,
     cut,
-    is_written,
+    healed,
+    is_cut,
     knobs,
-    texts,
     triggers,
 )
 from skytether.view.frames import of_flight
@@ -105,10 +104,12 @@ def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
     scenario = reading.load("demo")
     model = msgspec.structs.replace(scenario.model, axes=axes)
     control = msgspec.structs.replace(scenario.control, horizon=50)  # fits, whatever the delay
+    trigger = "state_gap & cost_gap | expected_gap & deviation | periodic"
+    control = msgspec.structs.replace(control, scheme="committed", trigger=trigger)
     scenario = msgspec.structs.replace(scenario, model=model, control=control)
     for knob in (*knobs(axes), *THRESHOLDS):
         runs, values = running(knob.process, scenario)
-        assert knob.key in values, knob.label
+        assert knob.read(values) is not None, knob.label
         for number in (knob.low, knob.high, knob.low + 3 * knob.step):
             asked = msgspec.json.encode(knob.write(values, number))
             answer = msgspec.json.decode(runs.answer(asked, now_ns=0), type=Answer)
@@ -134,19 +135,34 @@ def test_every_trigger_that_is_offered_can_be_flown() -> None:
     assert {name for each in TRIGGERS for name in [each.split(" ")[0]]} <= set(registry.TRIGGERS)
 
 
-NETWORK = {
-    f"network.{way}.{key}": value
-    for way in ("uplink", "downlink")
-    for key, value in msgspec.to_builtins(schema.DirectionConfig()).items()
-}
+PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"
+NETWORK = {"network.uplink": PAPER, "network.downlink": PAPER}
 """Values of netem as it tells them."""
 
 
-def test_only_the_thresholds_of_the_trigger_are_shown() -> None:
-    assert compared("cost_gap | silence(1)") == {"control.cost_gap"}
-    assert compared("cost_gap(2) & budget(5, 2) | periodic") == {"control.period"}
-    assert compared("state_gap") == {"control.epsilon", "control.decay_rate"}
-    assert compared("no trigger") == frozenset()
+@pytest.mark.parametrize(
+    ("trigger", "shown"),
+    [
+        ("cost_gap | silence(1)", {"Threshold: cost gap": 0.05}),
+        ("cost_gap(2) & periodic", {"Threshold: cost gap": 2.0, "Rate: steps": 10.0}),
+        ("state_gap(3)", {"Threshold: ε": 3.0, "Threshold: decay λ": 1.5}),
+        ("no trigger", {}),
+    ],
+)
+def test_only_the_thresholds_of_the_trigger_are_shown(
+    trigger: str, shown: dict[str, float]
+) -> None:
+    numbers = {each.label: each.read({"control.trigger": trigger}) for each in THRESHOLDS}
+    found = {label: number for label, number in numbers.items() if number is not None}
+    assert list(found.values()) == list(shown.values())
+    assert all(label.startswith(name) for label, name in zip(found, shown, strict=True))
+
+
+def test_a_direction_without_loss_or_delay_has_no_slider_for_it() -> None:
+    loss, delay, *_ = knobs(2)
+    values = {"network.uplink": "rate(5000)", "network.downlink": "constant(0.1) & rate(5000)"}
+    assert (loss.read(values), delay.read(values)) == (None, 100.0)
+    assert delay.write(values, 200.0) == {"network.downlink": "constant(0.2) & rate(5000)"}
 
 
 def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) -> None:
@@ -156,40 +172,25 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
     flight.ask = lambda process, values: asked.append((process, dict(values)))  # type: ignore[method-assign]
     flight.cut()
     assert not asked, "nothing is known of the network yet"
-    before = {"network.uplink.loss": 0.1, "network.downlink.loss": 0.3}
-    flight.values["netem"] = NETWORK | before
+    before = NETWORK | {"network.downlink": ""}
+    flight.values["netem"] = before
     flight.cut()
-    flight.values["netem"] = NETWORK | asked[0][1]
+    flight.values["netem"] = asked[0][1]
     assert flight.is_cut
     flight.cut()
     flight.heal()
-    cuts = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
+    cuts = {"network.uplink": f"{PAPER} & loss(1)", "network.downlink": "loss(1)"}
     assert asked == [("netem", cuts), ("netem", before)]
     flight.close()
 
 
-def test_a_network_that_is_written_is_cut_and_healed_in_its_text(tmp_path: Path) -> None:
-    """By a text behind it; what stood there comes back, also on a page that came later."""
-    written = {"network.uplink.impairments": "rate(5000)", "network.downlink.loss": 0.3}
-    values = NETWORK | written
-    assert is_written(values)
-    assert not is_written(NETWORK)
-    down = "paper(0.4, 0.02, 2.0) & loss(0.3)"
-    assert texts(values) == {"network.uplink": "rate(5000)", "network.downlink": down}
-    assert texts({}) == {}
-    changed = cut(values)
-    assert changed == {
-        "network.uplink.impairments": "rate(5000) & loss(1)",
-        "network.downlink.loss": 1.0,
-    }
-    asked: list[dict[str, Any]] = []
-    flight = PageFlight("", tmp_path)
-    flight.ask = lambda _, values: asked.append(dict(values))  # type: ignore[method-assign]
-    flight.values["netem"] = values | changed
-    flight.heal()
-    healed = {"network.uplink.impairments": "rate(5000)", "network.downlink.loss": 0.0}
-    assert asked == [healed]
-    flight.close()
+def test_a_page_that_came_later_heals_as_well() -> None:
+    """Also what a slider has cut."""
+    cuts = {"network.uplink": "rate(5000) & loss(1)", "network.downlink": "loss(1.0)"}
+    assert is_cut(cuts)
+    assert cut({"network.uplink": "rate(5000)"}) == {"network.uplink": "rate(5000) & loss(1)"}
+    assert healed(cuts) == {"network.uplink": "rate(5000)", "network.downlink": "loss(0.0)"}
+    assert not is_cut(healed(cuts))
 
 
 def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:

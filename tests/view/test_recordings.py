@@ -642,7 +642,7 @@ def test_a_disk_that_fills_up_costs_the_recording_alone(
 def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
     path, summary = tmp_path / "flight.mcap", tmp_path / "summary.json"
     flags = ["--duration", "3", "--settle", "0", "--json", str(summary), "--record", str(path)]
-    flags += ["--network.uplink.delay", "none", "--network.downlink.delay", "none"]
+    flags += ["--network.uplink", "loss(0.1)", "--network.downlink", "loss(0.1)"]
     assert command.main(fly, ["demo", *flags], "fly") == 0
     back = read(path)
     shown = json.loads(summary.read_text())

@@ -15,8 +15,7 @@ from skytether.shared.wire.protocol import Hello, encode
 from warm import Process, skytether
 
 QUICK = [
-    *("--network.uplink.delay", "none", "--network.downlink.delay", "none", "--settle", "0"),
-    *("--network.uplink.loss", "0", "--network.downlink.loss", "0"),
+    *("--network.uplink", "none", "--network.downlink", "none", "--settle", "0"),
 ]
 """A network that does nothing."""
 SECRET = "6f" * 32

@@ -382,8 +382,8 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
 
 
 FAST = {
-    "uplink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
-    "downlink": {"delay": "constant", "minimum_s": 0.02, "loss": 0.0},
+    "uplink": "constant(0.02)",
+    "downlink": "constant(0.02)",
 }
 
 
@@ -422,12 +422,11 @@ def differences(real: Record, virtual: Record) -> list[str]:
 @pytest.mark.parametrize(
     "control",
     [
-        {"epsilon": 0.05},
+        {"trigger": "state_gap(0.05)"},
         {
             "scheme": "committed",
             "feedback": True,
-            "trigger": "cost_gap",
-            "cost_gap": 1.0,
+            "trigger": "cost_gap(1)",
             "delay_bound": 0.4,
         },
     ],
@@ -442,7 +441,7 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
     machine by 0.1 s can change a decision; then the flight is flown again. No two flights are alike
     to the last bit by chance.
     """
-    none = {"delay": "none", "loss": 0.0}
+    none = ""
     changes = {
         "duration": 5.0,
         "network": {"uplink": none, "downlink": none},

@@ -169,7 +169,7 @@ def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
     strangers(tmp_path, *OLD_NAMES, "skytether")
     skytether = str(Path(sys.executable).with_name("skytether"))
     flags = ["--duration", "3", "--settle", "0"]
-    flags += ["--network.uplink.delay", "none", "--network.downlink.delay", "none"]
+    flags += ["--network.uplink", "loss(0.1)", "--network.downlink", "loss(0.1)"]
     for argv in (
         [skytether, "fly", "demo", *flags],
         [skytether, "sweep", "demo", *flags, "--runs", "1", "--workers", "1", "--out", "swept"],

@@ -17,13 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from io import StringIO
-from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from skytether.shared.base import files
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.air.delays import interpolated
@@ -31,8 +29,6 @@ from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, impairment
 from skytether.shared.scenario.registry import File
 
-FILE_BYTES_MAX = 128 * 1024 * 1024
-"""Largest size of a file [B]."""
 ROWS_MAX = 1_000_000
 """Largest number of rows."""
 PING_EVERY_S = 1.0
@@ -96,75 +92,56 @@ class Trace(Impairment):
             fate.lost = True
 
 
-def recorded_in(file: str, way: Way = "auto") -> RecordedPath:
+@lru_cache(maxsize=16)
+def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
     """Delays that a file holds.
 
     Args:
+        file: its name and content.
         way: of a file of irtt, the delay from client to server (send) or back (receive), which
             needs synchronised clocks; auto: half of the round trip.
 
     Raises:
-        ValueError: it cannot be read, or holds no delays in the order of time.
+        ValueError: it holds no delays in the order of time.
     """
-    return _recorded(file, way, *_state_of(file))
+    name, text = file.name, _text(file)
+    if text.lstrip()[:1] == "{":
+        rows = _of_irtt(name, text, way)
+    elif _PING.search(text[:100_000]):
+        rows = _of_ping(name, text)
+    else:
+        rows = _of_csv(name, text)
+    return _checked(name, *rows)
 
 
-def deliveries_in(file: str) -> Array:
+@lru_cache(maxsize=16)
+def deliveries_in(file: File) -> Array:
     """Times at which packets of DELIVERY_BYTES may go [s], in a file of mahimahi; shape (n,).
 
     Raises:
-        ValueError: it cannot be read, or holds no such times.
+        ValueError: it holds no such times.
     """
-    return _deliveries(file, *_state_of(file))
-
-
-def _state_of(file: str) -> tuple[int, int]:
-    """Time of the last change and size of a file: with others, it is read anew."""
-    try:
-        state = Path(file).stat()
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: cannot be read: {_reason(error)}") from None
-    return state.st_mtime_ns, state.st_size
-
-
-@lru_cache(maxsize=16)
-def _recorded(file: str, way: Way, *_: int) -> RecordedPath:
-    text = _text(file)
-    if text.lstrip()[:1] == "{":
-        rows = _of_irtt(file, text, way)
-    elif _PING.search(text[:100_000]):
-        rows = _of_ping(file, text)
-    else:
-        rows = _of_csv(file, text)
-    return _checked(file, *rows)
-
-
-@lru_cache(maxsize=16)
-def _deliveries(file: str, *_: int) -> Array:
-    times = _table(file, "\n".join(["ms", *_text(file).split()]), [0])[:, 0]
+    name = file.name
+    times = _table(name, "\n".join(["ms", *_text(file).split()]), [0])[:, 0]
     wrong = ~np.isfinite(times) | (times < 0.0) | (np.diff(times, prepend=0.0) < 0.0)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ValueError(
-            f"{file}: row {row + 1}: got {times[row]:g}, expected milliseconds in rising order"
+            f"{name}: row {row + 1}: got {times[row]:g}, expected milliseconds in rising order"
         )
     if times[-1] == 0.0:
-        raise ValueError(f"{file}: got times of 0 alone, expected milliseconds in rising order")
+        raise ValueError(f"{name}: got times of 0 alone, expected milliseconds in rising order")
     return times * 1e-3
 
 
-def _text(file: str) -> str:
+def _text(file: File) -> str:
     try:
-        text = files.read(Path(file), FILE_BYTES_MAX).decode()
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: cannot be read: {_reason(error)}") from None
+        text = file.content.decode()
+    except ValueError as error:
+        raise ValueError(f"{file.name}: cannot be read: {error}") from None
     if not text.strip():
-        raise ValueError(f"{file}: got an empty file, expected delays, see docs/network.md")
+        raise ValueError(f"{file.name}: got an empty file, expected delays, see docs/network.md")
     return text
-
-
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
 
 
 def _table(file: str, text: str, columns: Sequence[int]) -> Array:

@@ -91,7 +91,7 @@ async def _measure(
                 await asyncio.sleep(began_s + number * EVERY_S - loop.time())
                 client.send(netem.address)
                 on_second(loop.time() - began_s)
-            await asyncio.sleep(2.0 * scenario.network.uplink.mean_s + LAST_S)
+            await asyncio.sleep(2.0 * scenario.uplink.mean_s + LAST_S)
     finally:
         back.close()
         forth.close()

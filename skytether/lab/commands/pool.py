@@ -32,11 +32,10 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 import skytether.lab.sweep
-from skytether.lab.journal import Journal, digest, name_of
+from skytether.lab.journal import Journal, name_of
 from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.shared.base import kernel
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, plugins, terminal
 from skytether.shell.command import CommandError
@@ -147,8 +146,7 @@ class Crew:
 
         Raises:
             CommandError: interrupted (with the results so far), or a worker has died.
-            ConfigError: the folder has the results of other settings, or a file on which they
-                depend has changed since the study began.
+            ConfigError: the folder has the results of other settings.
             OSError: the folder cannot be written.
         """
         with closing(Journal(out, settings, kind)) as journal:
@@ -169,8 +167,7 @@ class Crew:
 
             try:
                 if todo:
-                    work = partial(_work, fly, journal.files)
-                    self.share(work, [cells[key] for key in todo], keep)
+                    self.share(partial(_work, fly), [cells[key] for key in todo], keep)
             except Interrupted as interrupted:
                 interrupted.results = results
                 raise
@@ -324,26 +321,12 @@ def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) 
     return function(item)
 
 
-def _work(fly: Callable[[T], R], pins: Mapping[str, str], item: T) -> tuple[R, float]:
-    """Result of a cell, and its CPU time [s]; called in a worker.
-
-    Args:
-        pins: digest of each file that the result depends on, by its path.
-
-    Raises:
-        ConfigError: a file has changed since the work began, or differs on this machine.
-    """
+def _work(fly: Callable[[T], R], item: T) -> tuple[R, float]:
+    """Result of a cell, and its CPU time [s]; called in a worker."""
     kernel.load()
     began_s = time.thread_time()
     result = fly(item)
-    spent_s = time.thread_time() - began_s
-    for file, expected in pins.items():  # afterwards: it may have been saved during the flight
-        if (found := digest(Path(file).read_bytes())) != expected:
-            raise ConfigError(
-                f"{file}: got the content {found}, expected {expected}, "
-                "with which the work began; or another --out"
-            )
-    return result, spent_s
+    return result, time.thread_time() - began_s
 
 
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:

@@ -164,8 +164,7 @@ def _samples(table: Study, table_cells: Cells, scale: ReproductionSize) -> Sampl
     for method in (*studies.METHODS.values, PERIODIC):
         scenario = plan.scenario_of(table.here, EVENT if method == PERIODIC else method)
         if method == PERIODIC:
-            keys = {"trigger": "periodic", "period": steps}
-            control = msgspec.structs.replace(scenario.control, **keys)
+            control = msgspec.structs.replace(scenario.control, trigger=f"periodic({steps})")
             scenario = msgspec.structs.replace(scenario, control=control)
         seeds = range(scenario.seed, scenario.seed + scale.sample_runs)
         samples[method] = scenario, fly_batch(scenario, seeds)

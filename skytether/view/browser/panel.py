@@ -20,9 +20,7 @@ from skytether.view.controls import (
     WAYS,
     Knob,
     Values,
-    compared,
     is_cut,
-    is_written,
     knobs,
     texts,
     triggers,
@@ -231,12 +229,12 @@ class _Slider:
                 self._moved_s = time.monotonic()
                 ask(knob, float(self._slider.value))
 
-    def show(self, values: Values, *, visible: bool) -> None:
+    def show(self, values: Values) -> None:
         """Set the slider to the value, unless the user is moving it."""
-        self._slider.visible = visible and self.knob.key in values
-        if not self._slider.visible or time.monotonic() - self._moved_s < HELD_S:
-            return
         number = self.knob.read(values)
+        self._slider.visible = number is not None
+        if number is None or time.monotonic() - self._moved_s < HELD_S:
+            return
         self._slider.max = max(self._slider.max, number)
         self._slider.min = min(self._slider.min, number)
         if abs(self._slider.value - number) > self.knob.step / 2:
@@ -412,7 +410,7 @@ class Controls:
     def _ask(self, knob: Knob, number: float) -> None:
         for flight in self._flights:
             values = flight.values.get(knob.process, {})
-            if knob.key not in values:
+            if knob.read(values) is None:
                 continue
             changed = knob.write(values, number)
             if knob.process == "netem" and is_cut({**values, **changed}):
@@ -429,8 +427,7 @@ class Controls:
         self._network.show(netem)
         for slider in self._sliders:
             values = flight.values.get(slider.knob.process, {})
-            written = slider.knob.process == "netem" and is_written(netem)
-            slider.show(values, visible=not written)
+            slider.show(values)
         self._cut.disabled = flight.is_cut or "netem" not in flight.values
         self._heal.disabled = not flight.is_cut
         self._answer.content = "".join(
@@ -444,9 +441,8 @@ class Controls:
             scheme = flight.state.scenario.control.scheme
             self._trigger.options = triggers(scheme, trigger)
             assign(self._trigger, trigger)
-        keys = compared(trigger)
         for slider in self._thresholds:
-            slider.show(server, visible=slider.knob.key in keys)
+            slider.show(server)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
