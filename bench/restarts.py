@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.children import HOST, ChildProcess, Lab
-from bench.harness import Lateness, TextTable, progress
+from bench.harness import TextTable, WakeLateness, progress
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying, ModeChanged
@@ -323,7 +323,7 @@ def curves(
 
 def measure(counts: RestartsCounts) -> dict[str, Any]:
     """Reactions to all outages, and the speed around each."""
-    lateness, rng, outages = Lateness(), np.random.default_rng(1), []
+    lateness, rng, outages = WakeLateness(), np.random.default_rng(1), []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-"))
         flight = Processes(stack, Path(folder))

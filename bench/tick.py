@@ -17,9 +17,9 @@ from bench.contestants import Tuning
 from bench.harness import (
     HOT,
     PACED,
-    Lateness,
     Pace,
     TextTable,
+    WakeLateness,
     figures_us,
     interleave,
     progress,
@@ -85,7 +85,7 @@ def mixes() -> dict[str, Scenario]:
 
 def measure(counts: TickCounts) -> dict[str, Any]:
     """All figures of this section."""
-    lateness = Lateness()
+    lateness = WakeLateness()
     tunings = tune(counts, lateness)
     single = {
         name: _single(name, scenario, tunings[name], counts, lateness)
@@ -104,7 +104,7 @@ def measure(counts: TickCounts) -> dict[str, Any]:
     }
 
 
-def tune(counts: TickCounts, lateness: Lateness) -> dict[str, Tuning]:
+def tune(counts: TickCounts, lateness: WakeLateness) -> dict[str, Tuning]:
     """The fastest tuning of OSQP for each flight of `solvers.flights`."""
     return {
         name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
@@ -121,7 +121,7 @@ def fleets(counts: TickCounts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 
 
 def _single(
-    name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: Lateness
+    name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: WakeLateness
 ) -> dict[str, Any]:
     """Time from a decoded observation to a packed horizon, one vehicle; two servers by turns."""
     ours = Airspace(scenario, 1)
@@ -202,7 +202,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
     }
 
 
-def _crowd(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[str, Any]:
+def _crowd(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> dict[str, Any]:
     """Time of a server's tick of many saturated vehicles, by stage [ms]."""
     space = Airspace(scenario, counts.crowd, Stopwatch(time.process_time_ns))
     spent = space.server.stopwatch.spent_ns
@@ -242,7 +242,7 @@ def waker(space: Airspace) -> Callable[[int], None]:
     return lambda _: space.wake()
 
 
-def _scaling(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[str, float]:
+def _scaling(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> dict[str, float]:
     """Median CPU time of a tick [ms], by the number of vehicles."""
     spaces = {count: Airspace(scenario, count) for count in counts.scale}
     spent = interleave(

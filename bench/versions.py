@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from bench import tick
-from bench.harness import HOT, PACED, Lateness, TextTable, progress, us
+from bench.harness import HOT, PACED, TextTable, WakeLateness, progress, us
 from skytether.shared.base import files
 
 ROOT = Path(__file__).parents[1]
@@ -186,7 +186,7 @@ def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
         }
         machines = {side: _ask(worker, "where") for side, worker in workers.items()}
         figures = {contest.title: _compete(contest, workers, rng) for contest in contests(counts)}
-    tunings = tick.tune(counts.osqp, Lateness())
+    tunings = tick.tune(counts.osqp, WakeLateness())
     return {**machines, "contests": figures, "fleets": tick.fleets(counts.osqp, tunings)}
 
 

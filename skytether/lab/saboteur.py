@@ -10,7 +10,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from skytether.lab.faults import Kind, ScheduledFault
+from skytether.lab.faults import FaultKind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.wire.channel import kind as kind_of
@@ -90,11 +90,11 @@ class Saboteur(Endpoint):
     def begin(self, fault: ScheduledFault, now_ns: int) -> None:
         """Apply a fault to packets from now on."""
         self._on.append(fault)
-        if fault.kind is Kind.FLOOD:
+        if fault.kind is FaultKind.FLOOD:
             self._volley_ns = now_ns
-        if fault.kind is Kind.COPY and self._rng.random() < SWIFT:
+        if fault.kind is FaultKind.COPY and self._rng.random() < SWIFT:
             self._swift.add(fault)
-        if fault.kind is Kind.REPLAY:
+        if fault.kind is FaultKind.REPLAY:
             for direction in self._directions(fault):
                 for passed_ns, datagram in self._recorded[direction]:
                     self._replay(fault, datagram, passed_ns, now_ns)
@@ -139,7 +139,7 @@ class Saboteur(Endpoint):
     def wake(self, *, now_ns: int) -> None:
         """Pass delayed packets on, and send forged ones."""
         if self._volley_ns is not None and now_ns >= self._volley_ns:
-            floods = [fault for fault in self._on if fault.kind is Kind.FLOOD]
+            floods = [fault for fault in self._on if fault.kind is FaultKind.FLOOD]
             for fault in floods:
                 for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
                     self._forge(fault.where)
@@ -167,28 +167,28 @@ class Saboteur(Endpoint):
                 continue
             rng, amount = self._rng, fault.amount
             match fault.kind:
-                case Kind.PARTITION:
+                case FaultKind.PARTITION:
                     copies = 0
-                case Kind.LOSS if rng.random() < amount:
+                case FaultKind.LOSS if rng.random() < amount:
                     copies = 0
-                case Kind.BURST:
+                case FaultKind.BURST:
                     left = self._left.get(fault, 0)
                     if not left and rng.random() < 1.0 / amount:
                         left = round(amount)
                     self._left[fault] = max(0, left - 1)
                     copies = 0 if left else copies
-                case Kind.DUPLICATES if rng.random() < amount:
+                case FaultKind.DUPLICATES if rng.random() < amount:
                     copies *= 2
-                case Kind.REORDERING:
+                case FaultKind.REORDERING:
                     delay_ns += seconds_to_ns(amount * rng.random())
-                case Kind.DELAY:
+                case FaultKind.DELAY:
                     delay_ns += seconds_to_ns(amount)
-                case Kind.CORRUPTION if rng.random() < amount:
+                case FaultKind.CORRUPTION if rng.random() < amount:
                     datagram = datagram._replace(payload=self._flipped(datagram.payload))
-                case Kind.REPLAY:
+                case FaultKind.REPLAY:
                     self._replay(fault, datagram, now_ns, now_ns)
                     continue
-                case Kind.COPY:
+                case FaultKind.COPY:
                     self._copy(fault, direction, datagram, now_ns)
                     continue
                 case _:
@@ -215,7 +215,7 @@ class Saboteur(Endpoint):
         swift = fault in self._swift
         if not swift and self._rng.random() >= fault.amount:
             return
-        self.counts[f"packets: {Kind.COPY}"] += 1
+        self.counts[f"packets: {FaultKind.COPY}"] += 1
         socket = COPIER_SOCKET + int(self._rng.integers(COPIERS))
         if direction == "uplink":
             self._send_copy(datagram.payload, datagram.peer, socket, now_ns)
@@ -277,7 +277,7 @@ class Saboteur(Endpoint):
             else clients[int(rng.integers(len(clients)))]
         )
         self._out.append(Datagram(payload, to, socket))
-        self.counts[f"packets: {Kind.FLOOD}"] += 1
+        self.counts[f"packets: {FaultKind.FLOOD}"] += 1
 
     def _hold(self, due_ns: int, datagram: Datagram) -> None:
         if len(self._held) < HELD_MAX:
@@ -331,7 +331,7 @@ class Observer(Endpoint):
                 if payload is not None:
                     self._sent += 1
                     self.send(payload, NETEM, self._sent % ports)
-                    self._saboteur.counts[f"packets: {Kind.CROWD}"] += 1
+                    self._saboteur.counts[f"packets: {FaultKind.CROWD}"] += 1
         self._volley_ns = now_ns + FLOOD_NS if self._on else None
 
     def next_wake_ns(self) -> int | None:

@@ -32,8 +32,8 @@ from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
 from bench.harness import (
     HOT,
     PACED,
-    Lateness,
     TextTable,
+    WakeLateness,
     interleave,
     machine,
     refresh,
@@ -183,7 +183,7 @@ def test_contestants_take_turns_at_the_same_problems() -> None:
     """Hot in a row, of which the first only warms up; paced one by one, each after a pause."""
     done: list[tuple[str, int]] = []
     contest = {name: lambda i, name=name: done.append((name, i)) for name in "ab"}
-    lateness = Lateness()
+    lateness = WakeLateness()
     spent = interleave(contest, 3, PACED, lateness, "paced")
     assert [i for _, i in done] == [0, 0, 1, 1, 2, 2]
     assert {len(durations) for durations in spent.values()} == {3}

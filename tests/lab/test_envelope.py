@@ -26,13 +26,13 @@ from skytether.lab.envelope import (
     settling_s,
     worst_first,
 )
-from skytether.lab.journal import Journal
+from skytether.lab.journal import StudyJournal
 from skytether.server.controller import Controller
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
@@ -365,9 +365,9 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     )
     table = reading.to_table(reading.load("demo-committed"))
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
-        lay({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
-    lay({key.replace("__", "."): value for key, value in BLIND.items()}, table)
-    lay({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
+        set_keys({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
+    set_keys({key.replace("__", "."): value for key, value in BLIND.items()}, table)
+    set_keys({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
     scenario = msgspec.convert(table, Scenario)  # unchecked: it would be refused
     verdict = judge(scenario, flight.fly(scenario).client)
     assert verdict.outcome == "flyaway"
@@ -454,7 +454,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint("flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
-    with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
+    with closing(StudyJournal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
         journal.add("1", EnvelopePoint("astray", 1.25, 1.0, 0.0))
         journal.add("0", lost)
     assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
@@ -466,7 +466,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
 def test_another_seed_does_not_go_on_in_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Journal(tmp_path, DEMO.settings(), EnvelopePoint).close()
+    StudyJournal(tmp_path, DEMO.settings(), EnvelopePoint).close()
     assert (
         main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
         == 2

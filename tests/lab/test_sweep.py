@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from helpers import refusal, refused_before_writing, until
 from skytether.__main__ import main
 from skytether.lab import figures
-from skytether.lab.journal import Journal, sealed
+from skytether.lab.journal import StudyJournal, sealed
 from skytether.lab.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, parse_axis
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
@@ -220,9 +220,9 @@ OTHERS = {
 }
 
 
-def journal_of(plan: Sweep, folder: Path) -> Journal[Runs]:
+def journal_of(plan: Sweep, folder: Path) -> StudyJournal[Runs]:
     """The journal of a sweep."""
-    return Journal(folder, plan.settings(), Runs)
+    return StudyJournal(folder, plan.settings(), Runs)
 
 
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)

@@ -16,7 +16,7 @@ from skytether.lab.adversary import (
     Approach,
     Climb,
     Climbed,
-    Kind,
+    MoveKind,
     Moves,
     climb,
     dumps,
@@ -95,7 +95,7 @@ def adversary(argv: Sequence[str]) -> None:
     1, and the fewest moves with which it is not are printed; --attack flies them again.
     """
     options = command.parse(AdversaryOptions(), argv, "skytether adversary", adversary.__doc__)
-    if not isinstance(options.config.given_reference(), Mission):
+    if not isinstance(options.config.unallocated_reference(), Mission):
         said = f"{options.scenario}: got no mission, expected one, such as swap"
         raise CommandError(said, command.CONFIGURATION)
     title = f"{options.scenario}, seed {options.config.seed}"
@@ -174,16 +174,16 @@ def _moves(text: str) -> Moves:
         raise ConfigError(f"--attack: {text}: {error}") from None
 
 
-def _kinds(text: str) -> tuple[Kind, ...]:
+def _kinds(text: str) -> tuple[MoveKind, ...]:
     """Kinds that a text names.
 
     Raises:
         CommandError: it names something else.
     """
     try:
-        return tuple(map(Kind, dict.fromkeys(text.split(","))))
+        return tuple(map(MoveKind, dict.fromkeys(text.split(","))))
     except ValueError:
-        expected = f"expected some of {','.join(Kind)}"
+        expected = f"expected some of {','.join(MoveKind)}"
         raise CommandError(f"--with: got {text}, {expected}", command.CONFIGURATION) from None
 
 

@@ -16,7 +16,7 @@ from skytether.lab import margins as lab
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
 from skytether.lab.maps import Box, MapPoint
-from skytether.lab.margins import Limit, Margin
+from skytether.lab.margins import Margin, MarginLimit
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -92,7 +92,7 @@ def margins(argv: Sequence[str]) -> None:
         ) as flyers:
             (trigger,) = flyers.map(lab.clocked_trigger, [scenario])
             flyers.advance(1)
-            parts: list[Callable[[], Margin | Limit]] = [
+            parts: list[Callable[[], Margin | MarginLimit]] = [
                 partial(lab.margin, each, name, trigger, options.runs)
                 for name, each in vehicles.items()
             ]
@@ -102,7 +102,7 @@ def margins(argv: Sequence[str]) -> None:
     except Interrupted as interrupted:  # nothing is kept of what was flown
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
     flown = [each for each in results if isinstance(each, Margin)]
-    limits = [each for each in results if isinstance(each, Limit)]
+    limits = [each for each in results if isinstance(each, MarginLimit)]
     if options.json is not None:
         about = {"scenario": options.scenario, "trigger": trigger}
         content = msgspec.json.encode(about | {"margins": flown, "limits": limits})
@@ -113,7 +113,7 @@ def margins(argv: Sequence[str]) -> None:
         _map(options, options.maps, trigger)
 
 
-def _fly(part: Callable[[], Margin | Limit]) -> Margin | Limit:
+def _fly(part: Callable[[], Margin | MarginLimit]) -> Margin | MarginLimit:
     """Result of a part; called in a worker."""
     return part()
 
@@ -215,7 +215,7 @@ def _with_interval(value: float | None, half: float | None) -> str:
     return f"{value:.4f}" + ("" if half is None else f" ± {half:.4f}")
 
 
-def _show_limits(limits: Sequence[Limit]) -> None:
+def _show_limits(limits: Sequence[MarginLimit]) -> None:
     """Print a row for each limit."""
     rows = []
     for each in limits:

@@ -32,7 +32,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 import skytether.lab.sweep
-from skytether.lab.journal import Journal, name_of
+from skytether.lab.journal import StudyJournal, name_of
 from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.shared.base import kernel
@@ -149,7 +149,7 @@ class Crew:
             ConfigError: the folder has the results of other settings.
             OSError: the folder cannot be written.
         """
-        with closing(Journal(out, settings, kind)) as journal:
+        with closing(StudyJournal(out, settings, kind)) as journal:
             names = {key: name_of(key) for key in cells}
             results = {
                 k: journal.results[name] for k, name in names.items() if name in journal.results
