@@ -319,7 +319,7 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("demo",), "demo: got no mission, expected one, such as swap"),
+        (("demo",), "demo: expected a mission, such as swap"),
         (("swap", "--with", "rain"), "--with: got rain, expected some of delays,losses"),
         (("swap", "--tries", "0"), "--tries: got 0, expected 1 to"),
         (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),

@@ -130,9 +130,9 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
             each.fly()
         np.testing.assert_array_equal(heard.x, fleet.x)
     shape = (2, count, 2, scenario.control.horizon)
-    assert [each.shape for each in first.heard()] == [shape] * 2
-    assert [each.shape for each in later.heard(2)] == [shape] * 2
-    gradient, guess = later.heard()
+    assert [each.shape for each in first.recorded()] == [shape] * 2
+    assert [each.shape for each in later.recorded(2)] == [shape] * 2
+    gradient, guess = later.recorded()
     assert gradient.shape == guess.shape == (2, 2 * count, *shape[2:])
 
 

@@ -300,7 +300,7 @@ def test_a_changed_digit_in_a_journal_is_refused(
     at = two.index('"rmse_x":0.') + 11
     file.write_text(one + two[:at] + str(9 - int(two[at])) + two[at + 1 :])
     assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 2
-    said = f"calibrate: {file}: line 2 is not what was written: its checksum is wrong"
+    said = f"calibrate: {file}: line 2 has been altered: its checksum is wrong"
     assert capsys.readouterr().err.strip() == said
 
 

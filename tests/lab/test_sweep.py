@@ -277,7 +277,7 @@ def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:
         journal.add("one", ())
     with (tmp_path / "journal.jsonl").open("ab") as file:
         file.write(sealed(b'["one", {}]'))
-    said = r"journal.jsonl: line 2 is not what was written: Expected `array`, got `object`"
+    said = r"journal.jsonl: line 2 has been altered: Expected `array`, got `object`"
     with pytest.raises(ConfigError, match=said):
         journal_of(ONE, tmp_path)
 
@@ -292,7 +292,7 @@ def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
     whole = file.read_bytes()
     for place in range(len(whole) - 1):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
-        with pytest.raises(ConfigError, match=r"line \d is not what was written"):
+        with pytest.raises(ConfigError, match=r"line \d has been altered"):
             journal_of(ONE, tmp_path)
 
 
@@ -306,7 +306,7 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     file.write_text(file.read_text().replace('"steps":40', '"steps":41'))
     capsys.readouterr()
     assert main([*argv, "--out", str(tmp_path)]) == 2
-    said = f"sweep: {file}: line 1 is not what was written: its checksum is wrong\n"
+    said = f"sweep: {file}: line 1 has been altered: its checksum is wrong\n"
     assert capsys.readouterr().err == said
 
 

@@ -39,8 +39,7 @@ class CalibrateOptions:
     """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
     xy."""
     packets: float = 0.1
-    """Largest share of steps that may send; with the objective rmse, and a trigger that looks at
-    the state."""
+    """Largest event ratio; with the objective rmse, and a trigger that uses the state."""
     effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""
