@@ -197,7 +197,7 @@ def _foresee(
         age = k - observed
         assert age <= settings.age_max  # the controller ensures it; `track` holds no more steps
         # If the bound is so large that no plan could be flown, nothing would be sent, and no
-        # delivery could ever show that the delay has become smaller. So it starts anew.
+        # acknowledgement could ever show that the delay has become smaller. So it is reset.
         if bound[row] > age and age + bound[row] > settings.age_max:
             bound[row], sent.bound.seen[row] = 0, 0
         lost += update_delay_and_loss(sent, clock, row)

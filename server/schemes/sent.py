@@ -71,7 +71,7 @@ class Sent(NamedTuple):
     observed: I1
     """Step of the newest observation of each, or -1; shape (capacity,)."""
     delivery: Annotated[NDArray[np.void], records(DELIVERY, 1)]
-    """Shape (capacity,)."""
+    """Delivery state of each vehicle; shape (capacity,)."""
     plans: Annotated[NDArray[np.void], records(SENT_PLAN, 2)]
     """Newest plans, in a ring: plan n has index n modulo `ring`; shape (capacity, ring)."""
     bound: DelayBound

@@ -105,9 +105,9 @@ class ReplayMemory(NamedTuple):
     sent: Sent
     """Tracker of which horizons are in force, in flight or lost."""
     seen: Annotated[NDArray[np.void], records(OBSERVATIONS, 1)]
-    """Shape (capacity,)."""
+    """Newest observations; shape (capacity,)."""
     state: Annotated[NDArray[np.void], records(AXIS_STATE, 2)]
-    """Shape (capacity, axes)."""
+    """Newest observations on each axis; shape (capacity, axes)."""
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4

@@ -15,7 +15,7 @@ def _plain(value: Any) -> Any:
     """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
 
     A text that a spreadsheet would take as a formula gets an apostrophe in front. Control
-    characters are replaced, so that they cannot affect a terminal.
+    characters are escaped by `printable`, so that they cannot affect a terminal.
     """
     if isinstance(value, bool):
         return str(value).lower()

@@ -359,21 +359,23 @@ class Climb:
 
     scenario: Scenario
     kinds: tuple[MoveKind, ...]
-    """Kinds of moves that the adversary may do."""
+    """Kinds of moves that the adversary may make."""
     number: int
-    """Number of the climb, from which all its chance follows."""
+    """Number of the climb, the seed of its random numbers."""
     tries: int
     """Number of flights."""
     moves: int = MOVES_MAX
     """Largest number of moves."""
     patience: int = PATIENCE
-    """Tries without gain after which it begins anew; 0: all moves are drawn at random."""
+    """Tries without improvement after which the search restarts; 0: all moves are random."""
 
     @property
     def seeks_zones(self) -> bool:
-        """Whether it brings vehicles near to zones: every other one, where there are any."""
-        may = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
-        return may and bool(self.number % 2)
+        """Whether the climb minimises the distance from zones: every second one, if there are
+        any.
+        """
+        has_zones = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
+        return has_zones and bool(self.number % 2)
 
 
 class Climbed(NamedTuple):
@@ -385,17 +387,17 @@ class Climbed(NamedTuple):
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:
-    """Fly a mission against the adversary."""
+    """Fly a mission with the adversary's moves."""
     return Raid(scenario, moves).run()
 
 
 def spare_m(scenario: Scenario, found: Approach) -> float:
-    """Distance beyond what is asked for, between vehicles or from zones [m]; negative: not kept."""
+    """Smallest distance minus the required one, between vehicles or from zones [m]."""
     return min(found.apart.away_m - scenario.mission.separation_m, found.clear.away_m)
 
 
 def climb(task: Climb) -> Climbed:
-    """Search for the moves that bring vehicles nearest."""
+    """Search for the moves that bring two vehicles, or a vehicle and a zone, nearest."""
     scenario, rng = task.scenario, stream(task.scenario.seed, "climb", task.number)
     draws, spares_m = MoveSampler(task, rng), list[float]()
     best: Approach | None = None

@@ -161,7 +161,7 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Claim, judged in a case."""
+    """Result of a claim in a case."""
 
     claim: Claim
     """Claim that is judged."""

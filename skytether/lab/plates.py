@@ -279,7 +279,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
 
     rows = [row(EVENT, (*values, None), runs) for values, runs in flown.items()]
     rows += [row("periodic", (None, None, *values), runs) for values, runs in periodic.items()]
-    title = "Fig. 5 as curves: what a packet buys"
+    title = "Fig. 5 as curves: RMSE over event ratio"
     return picture(figure, "fig5-pareto", title, says, rows_csv(rows))
 
 
@@ -318,7 +318,7 @@ def curve(study: Study, cells: Cells) -> Plate:
         f"values and worse at {worse} (95 % intervals apart)."
     )
     if failed:
-        says += f" {failed} runs never got a session and count in no mean."
+        says += f" {failed} runs without a session are left out of the means."
     rows = [
         {
             study.name: value,

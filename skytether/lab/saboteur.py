@@ -1,7 +1,7 @@
-"""Attackers: a man in the middle between vehicles and netem, and an observer beside them.
+"""Attackers: a man in the middle between vehicles and netem, and an observer on another host.
 
-Neither can read packets. They pass unless a fault is active (`lab.faults`): then they are lost,
-duplicated, delayed, altered or replayed, or a stranger sends further packets.
+Neither can read packets. Without an active fault (`lab.faults`) packets pass unchanged. During one
+they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional packets.
 """
 
 from collections import Counter, deque
@@ -34,11 +34,11 @@ ones, and the latter's count."""
 COPIER_SOCKET, COPIERS = 300, 16
 """First number and count of the sockets that send copies and receive the answers."""
 OTHER_PORTS = 1000
-"""Number of sockets from those of the vehicles to those that NAT gives them next."""
+"""Offset from a vehicle's socket to the one after NAT has given it another port."""
 CROWD_PORTS = (100, 600)
 """Fewest and most ports from which an observer sends."""
 HELLOS = 0.8
-"""Share of handshakes among an observer's copies: the server answers them all."""
+"""Share of handshake packets among an observer's copies; the server answers each of them."""
 COPY_S = 0.3
 """Longest delay of a copy, or of an answer to one [s]."""
 SWIFT = 0.5
@@ -253,7 +253,7 @@ class Saboteur(Endpoint):
         return bytes(flipped)
 
     def _forge(self, where: str) -> None:
-        """Send packets that a stranger can make: random bytes, or altered recorded packets."""
+        """Send forged packets: random bytes, or altered copies of recorded packets."""
         rng = self._rng
         recorded = self._recorded["downlink" if where == "server" else "uplink"]
         payload = rng.bytes(int(rng.integers(1, 600)))
@@ -290,13 +290,13 @@ class Saboteur(Endpoint):
 
 
 class Observer(Endpoint):
-    """Attacker on a host of his own who sends copies of vehicles' packets to netem from many ports.
+    """Attacker on another host that sends copies of vehicles' packets to netem from many ports.
 
     The answers go to the vehicles under their server's address.
 
     Args:
         rng: random generator.
-        saboteur: shows him the packets, and forges the address.
+        saboteur: man in the middle, which gives access to packets and forges addresses.
     """
 
     def __init__(self, rng: np.random.Generator, saboteur: Saboteur) -> None:

@@ -73,8 +73,8 @@ REKEY_NS = 4 * SECOND_NS
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
 """Time after which the server has forgotten clock measurements from before a step [ns]."""
 FLOWS = 128
-"""Number of netem's places: more than one host holds against others, and fewer than an observer has
-ports."""
+"""Number of netem's places for flows: more than one host can occupy alone, and fewer than an
+observer has ports."""
 COMPUTE_NS = MILLISECOND_NS
 """Computing time of the server per step [ns]."""
 
@@ -183,7 +183,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
 
     trial: Trial
     failure: str = ""
-    """Violation or exception that ended it; empty for none."""
+    """Violation or exception that ended the trial; empty if there was none."""
     invariant: str = ""
     """Name of the violated invariant, or `raises` for an exception."""
     flown_s: float
