@@ -278,7 +278,7 @@ def test_the_smallest_error_is_searched_for_and_shown(
     assert f"{best.values[ONLY]['rmse_xy']:.4f}" in said
     assert f"{best.values[ONLY]['event_ratio']:.4f}" in said
     assert main([*argv, "--packets", "0.2", "--generations", "2", "--out", str(tmp_path)]) == 2
-    assert "packets: got 0.2, expected 0.3, to go on there" in capsys.readouterr().err
+    assert "packets: got 0.2, expected 0.3 to continue there" in capsys.readouterr().err
 
 
 def test_another_search_in_the_same_folder_is_refused(
@@ -286,7 +286,7 @@ def test_another_search_in_the_same_folder_is_refused(
 ) -> None:
     """It would be told scores of other flights."""
     assert main([*ARGV, "--settle", "1", "--out", str(searched)]) == 2
-    said = f"{searched}: settle: got 1.0, expected 0.0, to go on there; or another --out"
+    said = f"{searched}: settle: got 1.0, expected 0.0 to continue there; or choose another --out"
     assert capsys.readouterr().err.strip() == f"calibrate: {said}"
 
 
@@ -319,7 +319,7 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
     assert main([*argv, "--generations", "2"]) == 2
     said = capsys.readouterr().err
     assert f"out: files.{table}: got " in said
-    assert said.endswith(", to go on there; or another --out\n")
+    assert said.endswith(" to continue there; or choose another --out\n")
 
 
 def test_a_trajectory_edited_while_a_search_runs_ends_it(

@@ -575,7 +575,7 @@ def test_other_weights_are_another_comparison(
     assert main(["compare", "--quick", "--weights", str(file), "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"compare: {out / 'scouts' / 'target' / 'round-0'}: grid: got [")
-    assert said.endswith("], to go on there; or another --out\n")
+    assert said.endswith("] to continue there; or choose another --out\n")
 
 
 def test_weights_that_nobody_has_searched_for_are_refused(

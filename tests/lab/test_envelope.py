@@ -217,9 +217,9 @@ UNPLANNED = until(400)
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        (along(held, UNPLANNED), "at 20.05 s it is commanded 0.3 m/s without a plan, where"),
-        (along(slack, UNPLANNED), "at 20.05 s it is commanded 1.55 m/s without a plan, where"),
-        (along(restarted, UNPLANNED), "at 21.00 s it is commanded 1.6 m/s without a plan, where"),
+        (along(held, UNPLANNED), "at 20.05 s its command is 0.3 m/s without a plan, while"),
+        (along(slack, UNPLANNED), "at 20.05 s its command is 1.55 m/s without a plan, while"),
+        (along(restarted, UNPLANNED), "at 21.00 s its command is 1.6 m/s without a plan, while"),
     ],
     ids=["held", "too slow", "begun anew"],
 )
@@ -263,8 +263,12 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
 @pytest.mark.parametrize(
     ("moves_mps", "has_mps", "said"),
     [
-        (0.5, 0.0, "m without a plan, where braking takes 0.311 m"),
-        (0.0, 0.5, "at 20.05 s it has 0.5 m/s without a plan, where braking leaves 0.471 m/s"),
+        (0.5, 0.0, "m without a plan, while braking takes at most 0.311 m"),
+        (
+            0.0,
+            0.5,
+            "at 20.05 s its speed is 0.5 m/s without a plan, while braking allows 0.471 m/s",
+        ),
     ],
 )
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
@@ -471,8 +475,8 @@ def test_another_seed_does_not_go_on_in_the_folder(
         main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
         == 2
     )
-    said = f"envelope: {tmp_path}: seed: got 2, expected 1, to go on there; or another --out\n"
-    assert capsys.readouterr().err == said
+    said = "seed: got 2, expected 1 to continue there; or choose another --out"
+    assert capsys.readouterr().err == f"envelope: {tmp_path}: {said}\n"
 
 
 @pytest.mark.parametrize(

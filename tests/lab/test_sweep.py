@@ -229,7 +229,7 @@ def journal_of(plan: Sweep, folder: Path) -> StudyJournal[Runs]:
 def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
     journal_of(ONE, tmp_path).close()
     told = refusal(lambda: journal_of(other, tmp_path))
-    assert told == f"{tmp_path}: {said}, to go on there; or another --out"
+    assert told == f"{tmp_path}: {said} to continue there; or choose another --out"
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
