@@ -491,7 +491,7 @@ def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
 
 
 def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
-    """Fly one."""
+    """Fly one cell: a seed and a network; called in a worker."""
     seed, network = cell
     when = deaths(seed, options.duration) if network == MORTAL else []
     scenario = swap_scenario(network, options, seed)
@@ -603,7 +603,7 @@ def published_scenario(
 
 
 def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) -> MissionFlight:
-    """Fly one."""
+    """Fly one cell: a seed, a task and a network; called in a worker."""
     seed, (name, network) = cell
     with tempfile.TemporaryDirectory() as folder:
         task = TASKS[name]
