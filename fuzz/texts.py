@@ -47,7 +47,7 @@ class Text(Target):
     """Target that takes text.
 
     Args:
-        known: texts to begin with.
+        known: texts that are mutated.
         words: replacements for tokens, besides the words of these texts.
     """
 
@@ -67,7 +67,9 @@ class Text(Target):
 
 
 class ScenarioFile(Text):
-    """Target for a scenario file: it raises `ConfigError`, or it can be agreed upon and flown."""
+    """Target for a scenario file: it raises `ConfigError`, or gives a scenario that can be
+    flown.
+    """
 
     code = (
         reading,
@@ -192,7 +194,7 @@ class ControlTarget(Text, EndpointInFlight):
             assert bool(said.changed) == (running.scenario != before), payload.hex()
             assert not (said.refused and said.changed), payload.hex()
             reading.check(reading.to_table(running.scenario), known=running.scenario)
-        running._endpoint.events()  # no other sender asks netem
+        running._endpoint.events()  # nobody else empties netem's events
 
 
 class LogLines(Text):

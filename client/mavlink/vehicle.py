@@ -150,7 +150,7 @@ def altitude(scenario: Scenario, number: int = 1) -> float:
         return float(takeoff_m)
     if scenario.model.axes == 2:
         return PLANE_ALTITUDE_M
-    start = float(scenario.given_reference(number)(np.zeros(()))[2, 0])
+    start = float(scenario.unallocated_reference(number)(np.zeros(()))[2, 0])
     if start < ALTITUDE_MIN_M:
         expected = f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground"
         raise ConfigError(f"mavlink.takeoff_m: got 'auto' at altitude {start:g} m, {expected}")

@@ -306,7 +306,7 @@ def _vehicles(options: FleetOptions) -> int:
     """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
-    mission = options.config.given_reference()
+    mission = options.config.unallocated_reference()
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (None, count):

@@ -15,7 +15,7 @@ from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError, FlightError
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell import plugins, temporary
@@ -165,7 +165,7 @@ def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario
 def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """Table with plain values of keys laid over it."""
     plain: dict[str, Any] = msgspec.to_builtins(dict(keys), enc_hook=_plain)
-    lay(dict(flat(plain)), table)
+    set_keys(dict(flat(plain)), table)
     return table
 
 

@@ -26,7 +26,7 @@ from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, NoFailsafe, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 from skytether.shell.options import Argument, asks_help, key_values, read
@@ -129,7 +129,7 @@ def parse(
     name = options.scenario
     base = reading.load_base(name)
     table = reading.to_table(base)
-    lay(values, table)
+    set_keys(values, table)
     read_scenario = reading.check if is_final else reading.convert
     source = name if table == reading.to_table(base) else f"{name} and the command line"
     checked = read_scenario(table, source)

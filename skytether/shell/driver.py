@@ -23,7 +23,7 @@ from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, ma
 from skytether.shared.core.events import Event, Fault, HostFound, HostMissing
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shell.batch import BATCH_MAX, Batch, Segments
+from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.memory import MemoryFile
@@ -137,12 +137,12 @@ class Shell:
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """Buffer for every datagram: to copy out of it costs less than a new one of full size."""
-        self._batches: dict[int, Batch | None] = {}
+        self._batches: dict[int, DatagramBatch | None] = {}
         """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
         """Counts of arrivals by socket, of an endpoint with `patience_ns`."""
-        self._crowded: dict[int, Batch] = {}
+        self._crowded: dict[int, DatagramBatch] = {}
         """Sockets that are read in slices of time, and the arrays that read them."""
         self._heard_ns = 0
         """Newest time that the endpoint was given [ns]; later ones may not be earlier."""
@@ -311,16 +311,16 @@ class Shell:
         if self._crowded and self._slices:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
-    def _batch(self, sock: socket) -> Batch | None:
+    def _batch(self, sock: socket) -> DatagramBatch | None:
         """Arrays of the socket's family, made when they are first used."""
         if sock.family not in self._batches:
             try:
-                self._batches[sock.family] = Batch(sock.family)
+                self._batches[sock.family] = DatagramBatch(sock.family)
             except OSError:
                 self._batches[sock.family] = None
         return self._batches[sock.family]
 
-    def _read_batch(self, number: int, batch: Batch) -> list[tuple[int, Datagram]]:
+    def _read_batch(self, number: int, batch: DatagramBatch) -> list[tuple[int, Datagram]]:
         """Datagrams that one call reads from a socket, each with the time at which it came [ns]."""
         self._stopwatch.start()
         payloads, raws, came_ns = batch.receive(self._sockets[number])

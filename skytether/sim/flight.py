@@ -37,7 +37,7 @@ from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.scenario.dotted import whole
+from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -401,8 +401,10 @@ def plan_changes(
 
     def change(values: Mapping[str, Any]) -> None:
         for i, (host, each) in enumerate(running.items()):
-            here = each.changeable if i else each.changeable | ({*map(whole, values)} - changeable)
-            if own := {key: value for key, value in values.items() if whole(key) in here}:
+            here = (
+                each.changeable if i else each.changeable | ({*map(text_key, values)} - changeable)
+            )
+            if own := {key: value for key, value in values.items() if text_key(key) in here}:
                 with suppress(ConfigError):  # the refusal is reported as an event
                     world.act(host, partial(each.change, own))
 

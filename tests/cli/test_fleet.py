@@ -15,7 +15,7 @@ from PIL import Image
 from helpers import SKYTETHER, ran, refused
 from skytether.cli.fleet import STAGES
 from skytether.client.endpoint import Client
-from skytether.client.fleet import Fleet
+from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
@@ -66,7 +66,7 @@ def flown(count: int, *, together: bool) -> Rows:
     )
     netem = world.add("netem", Proxy(GUSTY, server=server))
     vehicles, sink = clients(GUSTY, count, netem)
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     if together:
         world.add("fleet", fleet)
     else:
@@ -89,7 +89,7 @@ def test_a_fleet_flies_as_its_vehicles_would_alone() -> None:
 
 def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() -> None:
     vehicles, _ = clients(GUSTY, 3, ("nowhere", 1))
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     assert fleet.next_wake_ns() == 0
     fleet.wake(now_ns=SECOND_NS)
     assert [datagram.socket for datagram in fleet.outbox()] == [0, 1, 2]
@@ -110,7 +110,7 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
 
 def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -> None:
     vehicles, _ = clients(GUSTY, 2, ("server", 1))
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
     assert [client.dropped.total() for client in vehicles] == [0, 1]
     assert fleet.figures()["by_vehicle"]["2"] == {

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from skytether.shared.scenario.mission import given, written
+from skytether.shared.scenario.mission import format_goals, parse_goals
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.controls import (
@@ -510,9 +510,9 @@ class _Mission:
     def _guide(self, place: NDArray[Any]) -> None:
         """Send the chosen vehicle to a place [m; shape (axes,) at least]."""
         values = self._flight.values.get("server", {})
-        goals = given(values.get(GUIDED, ""), self._axes)
+        goals = parse_goals(values.get(GUIDED, ""), self._axes)
         goals[self._vehicle()] = np.round(place[: self._axes], 2)
-        self._ask({GUIDED: written(goals)})
+        self._ask({GUIDED: format_goals(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
         """Take a corner of a box; the second corner completes it."""
