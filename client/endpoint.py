@@ -493,10 +493,12 @@ class Client(Endpoint):
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:
     """Figures of several clients in one process, see `Endpoint.figures`."""
+    others = clients[VEHICLES_TOLD_MAX:]
     return {
         "vehicles": len(clients),
         "missed": sum(client.missed for client in clients),
         "by_vehicle": {
             str(client.vehicle): client.vehicle_figures() for client in clients[:VEHICLES_TOLD_MAX]
         },
+        "others_dropped": by_name(sum((client.dropped for client in others), Counter())),
     }
