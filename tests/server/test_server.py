@@ -48,6 +48,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     Refusal,
+    Time,
     Welcome,
     decode,
     encode,
@@ -596,6 +597,23 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
             assert not keeps or kept.setdefault(session.row, session.vehicle) == session.vehicle
         assert len(sessions) + len(sessions.welcomed_vehicles) <= 3
         assert len(sessions.rows) == len(sessions)
+
+
+def test_a_time_of_day_that_was_under_way_for_2_s_narrows_a_clock_by_2_ms_less() -> None:
+    bounds_ms = []
+    for late_ns in (0, 2 * SECOND_NS):
+        vehicles = Vehicles(scenario())
+        welcome, epoch_ns = vehicles.open(), vehicles.now_ns
+        vehicles.epochs_ns[welcome.session] = epoch_ns
+        slow_us = stamp_us(200 * MILLISECOND_NS - epoch_ns)  # a round trip of 200 ms
+        vehicles.say(vehicles.told(welcome, 0)._replace(backward_us=slow_us))
+        vehicles.now_ns += late_ns
+        vehicles.server.learn_time(vehicles.now_ns, 0, now_ns=vehicles.now_ns)
+        vehicles.say(Time(1, welcome.session, 0, stamp_us(epoch_ns), error_us=1000))
+        vehicles.tick()
+        bounds_ms.append(vehicles.server.figures()["by_vehicle"]["1"]["clock_bound_ms"])
+    assert bounds_ms[0] < 2.0
+    assert bounds_ms[1] - bounds_ms[0] == pytest.approx(2.0, abs=0.1)
 
 
 def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
