@@ -121,8 +121,12 @@ class Reception:
         self._report_ns = 0
         """Time from which these may be reported again."""
 
-    def hear(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it."""
+    def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
+        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it.
+
+        Returns:
+            Why it was dropped; None if it was not.
+        """
         self._stopwatch.start()
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
@@ -131,17 +135,20 @@ class Reception:
             self._unauthenticated += 1
             if now_ns >= self._report_ns:
                 self._report_unauthenticated(datagram.peer, error.reason, now_ns)
-            return
+            return error.reason
         finally:
             self._stopwatch.lap("open")
         if call is None:
             self._out += self._gate.outbox()
-            return
+            return None
+        dropped = None
         try:
             self._take(call, datagram.peer, now_ns)
         except ProtocolError as error:
-            self.dropped[error.reason] += 1
+            dropped = error.reason
+            self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
+        return dropped
 
     def _take(self, call: GateCall, address: Address, now_ns: int) -> None:
         """Process one message.

@@ -27,6 +27,15 @@ class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} = {value}: {self.meaning}{expected}"
 
 
+class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
+    """Base of the events about parameters of an autopilot."""
+
+    parameters: tuple[AutopilotParameter, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters)
+
+
 class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
     """The client has heard the vehicle's autopilot for the first time."""
 
@@ -39,14 +48,8 @@ class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
 
 
-class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
+class ParametersRead(ParametersEvent, frozen=True, kw_only=True):
     """The client has read the parameters that decide how the autopilot reacts to silence."""
-
-    parameters: tuple[AutopilotParameter, ...]
-
-    def __str__(self) -> str:
-        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
-        return "\n".join(lines)
 
 
 class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
@@ -192,15 +195,10 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
 
 
-class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not armed because its autopilot would react unsafely to silence."""
-
-    parameters: tuple[AutopilotParameter, ...]
-    """Parameters that are unsafe, or could not be set."""
-
-    def __str__(self) -> str:
-        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
-        return "\n".join(lines)
+class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
+    """A vehicle is not armed because its autopilot would react unsafely to silence, by parameters
+    that are unsafe or could not be set.
+    """
 
     @property
     def brief(self) -> str:

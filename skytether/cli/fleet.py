@@ -27,6 +27,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, plugins, terminal
@@ -101,6 +102,8 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Packets that the network lost, both ways."""
     dropped: int
     """Packets that the kernels' and netem's full queues dropped, which no scenario asks for."""
+    drops: dict[str, dict[str, int]]
+    """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     tick_ms_p50: float
     """Median time that a server's tick took, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
@@ -371,6 +374,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
         + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
+        drops=drops(counted),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
@@ -405,6 +409,7 @@ def _show(summary: FleetSummary, title: str) -> None:
             ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),
         ),
         ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        *terminal.drops(s.drops),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
         ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
         (

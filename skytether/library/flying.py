@@ -4,7 +4,6 @@ import threading
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any
 
@@ -105,7 +104,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     """Fly a scenario once for each seed in virtual time, several times faster than one by one.
 
     Each flight equals that of `fly` with the same seed, to the last bit, except for the plans,
-    which are not recorded, and `Summary.drops`, which is None.
+    which are not recorded.
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
@@ -128,9 +127,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     from skytether.sim import flight  # imports the planner and numba, which takes a while
 
     records = flight.fly_batch(flown, numbers)
-    # A batch has one server, whose figures are those of all its flights together.
-    own = (replace(record, figures={}) for record in records)
-    return [Flight(run, record, name=name) for run, record in zip(each, own, strict=True)]
+    return [Flight(run, record, name=name) for run, record in zip(each, records, strict=True)]
 
 
 def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:

@@ -168,6 +168,8 @@ by_vehicle/{vehicle}/horizons client_horizons_total
     Horizons received.
 by_vehicle/{vehicle}/dropped/{reason} client_dropped_datagrams_total
     Datagrams that were not the server's, came too late or could not be read, by reason.
+others_dropped/{reason} client_dropped_datagrams_total vehicle=others
+    Datagrams that were not the server's, came too late or could not be read, by reason.
 by_vehicle/{vehicle}/autopilot/armed autopilot_armed
     Whether the autopilot is armed: 1 or 0.
 by_vehicle/{vehicle}/autopilot/mode_number autopilot_mode

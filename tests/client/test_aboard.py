@@ -24,7 +24,7 @@ from airborne import (
 )
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
-from skytether.client.mavlink.port import VELOCITY_ALONE
+from skytether.client.mavlink.setpoints import VELOCITY_ALONE
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError

@@ -226,10 +226,16 @@ def test_a_flight_that_failed_says_why_and_comes_back(tmp_path: Path) -> None:
 def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
     one, other = fly_batch("demo", np.array([1, 5]), **SHORT)
     assert one.record.trace_hash() == flown.record.trace_hash()
-    alone = fly("demo", seed=5, **SHORT).summary
-    assert alone.drops is not None
-    assert other.summary == msgspec.structs.replace(alone, drops=None)
+    assert other.summary == fly("demo", seed=5, **SHORT).summary
     assert (other.scenario.seed, other["plan.input_mps"].shape) == (5, (0, 2, 80))
+
+
+def test_each_flight_of_a_batch_has_its_own_drops() -> None:
+    damaged = "paper(0.1, 0.02, 2.0) & corrupt(0.3) & loss(0.1)"
+    keys = {**SHORT, "network.uplink": damaged, "network.downlink": damaged}
+    together = [each.summary.drops for each in fly_batch("demo", range(1, 4), **keys)]
+    assert together == [fly("demo", seed=seed, **keys).summary.drops for seed in range(1, 4)]
+    assert all(drops and drops.keys() == {"server", "netem", "client"} for drops in together)
 
 
 def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
