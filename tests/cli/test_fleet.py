@@ -111,7 +111,7 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
 
 def test_drops_of_vehicles_without_figures_of_their_own_are_added_up() -> None:
     vehicles, _ = clients(GUSTY, VEHICLES_TOLD_MAX + 2, ("server", 1))
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     for number in range(len(vehicles)):
         fleet.receive(Datagram(b"?", ("server", 1), number), now_ns=0)
     assert fleet.figures()["others_dropped"] == {"not a message": 2}
