@@ -33,6 +33,7 @@ from skytether.view.rows import Columns, arrays, readable
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 PARTS = ("client", "server", "netem", "plan")
@@ -132,14 +133,21 @@ class Flight:
         return self.record.failure
 
     @extras.named()
-    def plot(self) -> "Figure":
-        """Picture of the flight: the path over the reference, and the times of uplink packets.
+    def plot(self, ax: "Axes | None" = None) -> "Figure":
+        """Picture of the flight: the path over the reference, and the packets in each second.
+
+        Args:
+            ax: axes of matplotlib on which the path alone is drawn, such as those of a figure as
+                wide as a paper's column; a figure of its own unless given.
 
         Raises:
             FlightError: no step was flown.
         """
         if not len(self.record.client):
             raise FlightError(f"{self.name}: no step was flown: {self.failure or 'no vehicle'}")
+        if ax is not None:
+            figures.draw_path(ax, self.scenario, self.record)
+            return ax.figure.canvas.figure
         title = f"{self.name}, seed {self.scenario.seed}"
         return figures.drawn({title: (self.scenario, self.record)})
 

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import skytether
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
@@ -233,10 +234,21 @@ def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
 
 
 def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
-    plane, sent = flown.plot().axes
-    assert plane.get_title() == "demo, seed 1"
+    plane, packets = flown.plot().axes
+    assert plane.get_title().startswith("demo, seed 1")
     assert np.array_equal(plane.lines[1].get_xydata(), flown["position_m"])
-    assert "sent at" in sent.get_xlabel()
+    for way, stairs in enumerate(packets.patches):
+        counts, edges_s, _ = stairs.get_data()
+        assert counts.sum() == (flown["netem.direction"] == way).sum()
+        assert set(np.diff(edges_s)) == {1.0}
+
+
+def test_a_flights_path_is_drawn_on_axes_that_are_given(flown: skytether.Flight) -> None:
+    figure = Figure(figsize=(3.4, 3.0))
+    left, right = figure.subplots(1, 2)
+    assert flown.plot(ax=right) is figure
+    assert not left.lines
+    assert np.array_equal(right.lines[1].get_xydata(), flown["position_m"])
 
 
 def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
