@@ -1,5 +1,6 @@
 """Flight from Python: its arrays, summary and events, its picture and its file."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -7,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -233,6 +235,24 @@ class Flight:
             f"{name:{name_width}}  {shape:{shape_width}}  {unit}" for name, shape, unit in rows
         )
         return "\n".join([repr(self), *(line.rstrip() for line in lines)])
+
+
+@extras.named()
+def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
+    """Table of flights: one row each, one column for each field of `Summary` that is one value.
+
+    Raises:
+        ExtraMissing: pandas is not installed.
+    """
+    import pandas as pd
+
+    return pd.DataFrame([values(each.summary) for each in flights])
+
+
+def values(summary: Summary) -> dict[str, Any]:
+    """Fields of a summary that are one value: not `modes` and `drops`, which are tables."""
+    fields = msgspec.structs.asdict(summary)
+    return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
 
 
 def _no_rows(scenario: Scenario) -> dict[str, Table]:

@@ -19,7 +19,7 @@ import skytether
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
 from skytether.cli import processes
 from skytether.shared.core.events import NoAnswer, ReferenceTooFast
-from skytether.shared.telemetry.summary import summarise
+from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
@@ -267,12 +267,29 @@ def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
     assert "input_x_mps_79" in flown.to_pandas("plan")
 
 
+def test_flights_are_rows_of_a_table(flown: skytether.Flight) -> None:
+    pytest.importorskip("pandas")
+    swept = skytether.Swept({"control.trigger": "always"}, flown.scenario, (flown.summary,) * 2)
+    for table, rows in ((skytether.table([flown]), 1), (swept.to_pandas(), 2)):
+        assert list(table["rmse_xy"]) == [flown.summary.rmse_xy] * rows
+        assert table["seed"].dtype.kind == "i"
+    assert swept.to_pandas().columns[0] == "control.trigger"
+    assert set(skytether.table([flown]).columns) == set(Summary.__struct_fields__) - {
+        "modes",
+        "drops",
+    }
+
+
 def test_without_pandas_it_says_what_to_install(
     flown: skytether.Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'$"):
         flown.to_pandas()
+    with pytest.raises(ImportError, match=r"'skytether\[pandas\]'$"):
+        skytether.table([flown])
+    with pytest.raises(ImportError, match=r"'skytether\[pandas\]'$"):
+        skytether.Swept({}, flown.scenario, ()).to_pandas()
 
 
 def test_a_server_of_ones_own_is_flown() -> None:
