@@ -61,7 +61,7 @@ LIGHT = "Light page"
 AS_PREFERRED = f"""<img hidden src="data:," onerror="
 const label = [...document.querySelectorAll('label')].find(each => each.textContent === '{LIGHT}');
 const prefers = matchMedia('(prefers-color-scheme: light)').matches;
-if (prefers && !label.control.checked) label.click();
+if (prefers && !label.control.checked) label.control.click();
 ">"""
 """HTML that makes the page light in a browser that prefers it; only the browser knows."""
 
