@@ -21,13 +21,8 @@ INSTALL = install() { \
 # Tests start hundreds of processes; none shall compile anew what another has.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Kernels are compiled once, the server's beside the laboratory's, and so are the tests, whose asserts
-# pytest rewrites: not by each of its workers.
-LOAD = from skytether.shared.base import kernel; kernel.load()
-KERNELS = echo "compiling what has changed of the control loops (a minute or two after a fresh set-up)"; \
-	$(BIN)/python -c "import skytether.sim.flight, skytether.quadrotor.loops; $(LOAD)" & \
-	$(BIN)/pytest --collect-only -qq >/dev/null & \
-	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
+# pytest compiles kernels before its first test, and rewrites the tests' asserts: not by each of its workers.
+KERNELS = $(BIN)/pytest --collect-only -qq >/dev/null
 
 .PHONY: help setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench fuzz clean
 
@@ -91,7 +86,6 @@ docker-test: setup  ## the three containers, and what they survive; needs a Dock
 	$(BIN)/pytest -q -rs -m docker
 
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
-	@$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"
 	$(BIN)/pytest -q -rs -m browser
 
 autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs
