@@ -30,8 +30,8 @@ UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of what all flights share."""
 TIME = "time of flight [s]"
 """Label of most plots' horizontal axis."""
-EDGE = 1.1
-"""Range of a plot of positions, over what is drawn in it."""
+UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
+"""Series of a plot that only widens its range: another range would make the browser begin anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,6 +272,8 @@ class Plots:
                     "points": {"show": False},
                 }
                 series.append(shown)
+        if plot.equal:
+            series.append(UNSEEN)
         scales: dict[str, uplot.Scale] = {"x": {"time": False}}
         if plot.log:
             scales["y"] = {"distr": 3}
@@ -298,30 +300,28 @@ class Plots:
 
     def draw(self, looks: Sequence[Look]) -> None:
         """Redraw the flights; the first one determines the times."""
-        equal: list[tuple[viser.GuiUplotHandle, tuple[float, float]]] = []
-        for plot, handle in zip(self._plots, self._handles, strict=True):
+        drawn = []
+        for plot in self._plots:
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
                 data.extend(line.values(look) for line in plot.lines if not (line.once and place))
-            shown: Any = drawable(begun(cropped(data) if plot.crop else data))
+            drawn.append(begun(cropped(data) if plot.crop else data))
+        equal = [data for plot, data in zip(self._plots, drawn, strict=True) if plot.equal]
+        for data, ends in zip(equal, spans([data[1:] for data in equal]), strict=True):
+            data.append(np.resize(ends, len(data[0])))
+        for handle, data in zip(self._handles, drawn, strict=True):
+            shown: Any = drawable(data)
             handle.data = shown
-            if plot.equal and not np.isnan(data[1:]).all():
-                equal.append((handle, (float(np.nanmin(data[1:])), float(np.nanmax(data[1:])))))
-        for (handle, _), span in zip(equal, spans([ends for _, ends in equal]), strict=True):
-            if handle.scales and handle.scales.get("y") != {"range": span}:
-                handle.scales = {**handle.scales, "y": {"range": span}}
 
 
-def spans(ends: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Ranges of the same width that contain the given ones, each around its middle.
-
-    Width and middles are rounded, so that they change seldom: the browser then makes a plot anew.
-    """
-    widest = EDGE * max((high - low for low, high in ends), default=0.0)
-    grain = 10.0 ** np.floor(np.log10(max(widest, 1e-3))) / 2
-    half = grain * np.ceil(widest / grain / 2 + 0.5)
-    middles = [grain * np.round((low + high) / 2 / grain) for low, high in ends]
-    return [(float(middle - half), float(middle + half)) for middle in middles]
+def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
+    """Ranges of the same width that contain the values of each plot, around their middles."""
+    together = [np.concatenate(lines) for lines in plots]
+    known = [values[~np.isnan(values)] for values in together]
+    known = [values if len(values) else np.zeros(1) for values in known]
+    half = max((float(np.ptp(values)) / 2 for values in known), default=0.0)
+    middles = [float(values.min() + values.max()) / 2 for values in known]
+    return [(middle - half, middle + half) for middle in middles]
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:

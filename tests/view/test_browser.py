@@ -39,6 +39,9 @@ from skytether.figures.page import Table, rendered
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
 PICTURES = Path("page-test")
+RANGES = """() => Object.values(window.__viserTestpoints.uplots).slice(0, 2).map(({chart}) =>
+    [chart.data[0].at(-1) - chart.scales.x.max, chart.scales.y.max - chart.scales.y.min])"""
+"""Of the plots of x and y: newest time beyond the shown ones [s], and height of the range [m]."""
 WIDTHS = (("narrow", 2), ("wide", 9))
 """Tables of a report and their numbers of columns."""
 
@@ -380,4 +383,7 @@ def test_a_duel_shows_all(browser: "sync_api.Browser") -> None:
         for place, name in enumerate(names):
             assert status(page, place).startswith(name)
             assert page.locator(".u-legend").first.get_by_text(name, exact=True).count() == 1
+        (late_s, x_m), (_, y_m) = page.evaluate(RANGES)
+        assert abs(late_s) < 1.0, "the times are those of the newest data"
+        assert y_m == pytest.approx(x_m, rel=0.2)
         picture(page, PICTURES / "duel-dark-wide.png")

@@ -251,12 +251,13 @@ def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
 
 
 def test_plots_of_positions_have_ranges_of_the_same_width() -> None:
-    (x_low, x_high), (y_low, y_high) = plots.spans([(-2.0, 2.0), (99.5, 101.0)])
-    assert x_high - x_low == y_high - y_low
-    assert (x_low <= -2.0, x_high >= 2.0, y_low <= 99.5, y_high >= 101.0) == (True,) * 4
-    assert plots.spans([(-2.01, 1.98), (99.4, 101.1)])[0] == (x_low, x_high), "it stays"
-    (still,) = plots.spans([(1.0, 1.0)])
-    assert still[0] < 1.0 < still[1]
+    nan = np.nan
+    wide, narrow = (
+        [np.array([nan, -2.0, 1.0]), np.array([2.0, nan, 0.0])],
+        [np.array([99.0, 100.0])],
+    )
+    assert plots.spans([wide, narrow]) == [(-2.0, 2.0), (97.5, 101.5)]
+    assert plots.spans([[np.array([nan])]]) == [(0.0, 0.0)]
 
 
 def test_a_plot_with_gaps_reaches_a_browser() -> None:
