@@ -212,7 +212,10 @@ def test_a_player_shows_any_time_of_a_flight() -> None:
     player.plays = False
     second_ns = 1_000_000_000
     player.seek(0)
+    shown_ns = set()
+    flight.take = lambda *frame: shown_ns.add(player.at_ns) or PageFlight.take(flight, *frame)  # type: ignore[method-assign, func-returns-value]
     player.advance(6 * second_ns)
+    assert shown_ns == {0}, "a time is shown before its frames are"
     forwards = flight.state.vehicles[1].trail()
     player.seek(9 * second_ns)
     assert len(flight.state.vehicles[1].trail()) > len(forwards)
