@@ -62,9 +62,9 @@ def prepare(kernels: Sequence["Missing"]) -> None:
         return
     from skytether.shell.compiling import compile_kernels
 
-    title = "compiling the control loops, once on this machine"
-    print(f"{title}: it takes up to a minute", file=sys.stderr, flush=True)
-    with progress(title, len(kernels), "kernels") as bar:
+    said = "compiling control loops, which this machine then keeps: it takes up to a minute"
+    print(said, file=sys.stderr, flush=True)
+    with progress("compiling", len(kernels), "kernels") as bar:
         done = count(1)
         compile_kernels(kernels, lambda: bar(next(done)))
 

@@ -292,6 +292,19 @@ def test_a_second_scenario_is_judged_as_it_is_flown(
     assert "fenced.toml: fence.radius_m: got 6.0, expected more" in capfd.readouterr().err
 
 
+def test_a_flight_is_compared_with_several_others(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["fly", "demo", "--virtual", "--duration", "4", "--settle", "0"]
+    argv += ["--beside", "demo-paper", "--beside", "demo-no-compensation"]
+    assert main([*argv, "--figure", str(tmp_path / "three.svg")]) == 0
+    told = capfd.readouterr().out
+    drawn = (tmp_path / "three.svg").read_text()
+    for name in ("demo", "demo-paper", "demo-no-compensation"):
+        assert f"{name}, in virtual time, seed 1" in told
+        assert f"<!-- {name}, in virtual time, seed 1" in drawn
+
+
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     file = tmp_path / "real.json"
     run = skytether("fly", "demo-committed", *QUICK, "--duration", "3", "--json", str(file))
