@@ -19,7 +19,7 @@ from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
 from skytether.shared.scenario import contradictions, grammar, mission, reading, reference, zones
-from skytether.shared.scenario.air import traces
+from skytether.shared.scenario.air import pings, recorded, traces
 from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, File
@@ -112,7 +112,7 @@ class NamedFiles(Text):
     values that can be flown.
     """
 
-    code = (reference, mission, zones, traces, keys)
+    code = (reference, mission, zones, recorded, pings, traces, keys)
     largest = 20_000
 
     def __init__(self, folder: Path) -> None:
@@ -129,12 +129,25 @@ class NamedFiles(Text):
             "vehicle,t,x,y\n1,0,0,0\n1,5,4,4\n2,0,9,0\n",
             f'{{"type":"FeatureCollection","units":"m","features":[{box},{point}]}}',
             "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
+            "timestamp,rtt\n1700000000000,20\n1700000000200,-1\n",
             "\n".join(map(row.format, (1, 2, 4))),
+            (
+                f"PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.\n[17.2] {row.format(65535)}\n"
+                "2 packets transmitted, 1 received, 50% packet loss, time 812ms"
+            ),
+            (
+                "Pinging 192.0.2.1 with 32 bytes of data:\nReply from 192.0.2.1: time<1ms\nlost\n\n"
+                "    Packets: Sent = 4, Received = 2, Lost = 2 (50% loss)"
+            ),
+            (
+                "$ fping -p 200 h\nh : [0], 64 bytes, 20.1 ms\nh : [1], timed out\n"
+                "h : xmt/rcv/%loss = 3/1/66%"
+            ),
             f'{{"round_trips":[{trip % 5},{trip % 9}]}}',
             "0\n3\n3\n17\n",
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
-        kinds = b"\0\1\2\3\3\3\4\5"
+        kinds = b"\0\1\2" + 7 * b"\3" + b"\4\5"
         known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
 
@@ -151,8 +164,9 @@ class NamedFiles(Text):
                     file = File("it", payload[1:])
                     zones.parse("geojson(it)", 2, (file,)).clearance(np.zeros((2, 2)))
                 case 3:
-                    found = traces.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
-                    assert np.isfinite(found.delay_s[~found.lost]).all()
+                    found = recorded.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
+                    assert np.isfinite(found.delay_s).all()
+                    assert (np.diff(found.time_s) > 0.0).all()
                 case 4:
                     times_s = traces.deliveries_in.__wrapped__(File("it", payload[1:]))
                     assert np.isfinite(times_s).all()
