@@ -23,7 +23,7 @@ from skytether.shared.law.model import Array
 
 ROWS_MAX = 1_000_000
 """Largest number of packets in a file."""
-LINES_MAX = 4 * ROWS_MAX
+LINES_MAX = 2 * ROWS_MAX
 """Largest number of lines of a file."""
 LINE_MAX = 400
 """Number of characters of a line that are read."""
@@ -233,41 +233,51 @@ def _other(log: Log, _: re.Match[str]) -> None:
 
 _AT, _NUMBER = r"(?:\[(?P<at>\d{1,12}\.\d{1,9})\] )?", r"\d{1,9}(?:[.,]\d{1,9})?"
 _TIME = rf"(?P<sign>[=<])(?P<ms>{_NUMBER}) ?ms?\b"
-_TABLE: tuple[tuple[str, Callable[[Log, "re.Match[str]"], None]], ...] = (
-    # $ ping -i 0.2 192.0.2.1; $ fping -D -p 200 192.0.2.1
-    (rf".*\b(?P<program>f?ping)6? (?:.* )?-(?P<flag>[ip]) ?(?P<value>{_NUMBER})\b", _command),
-    # PING example (192.0.2.1) 56(84) bytes of data.
-    (r"PING(?P<six>6?)\b(?!:)(?:.*\)(?P<colon>:) \d)?", _head),
-    # 34 packets transmitted, 20 received, 41% packet loss, time 5812ms
-    (
-        r"(?P<sent>\d{1,9}) [^\d,]+, (?P<came>\d{1,9}) [^\d,]+, [^%]*%(?:.* (?P<ms>\d{1,12}) ?ms)?",
-        _summary,
-    ),
-    # 192.0.2.1 : xmt/rcv/%loss = 12/8/33%, min/avg/max = 0.038/0.043/0.049
-    (r"\S+\s+: xmt/rcv/%loss = (?P<sent>\d{1,9})/(?P<came>\d{1,9})/", _counts),
-    #     Packets: Sent = 4, Received = 2, Lost = 2 (50% loss),
-    (r"\s+[^=]*= (?P<sent>\d{1,9}), [^=]*= (?P<came>\d{1,9}), [^=]*= \d", _counts),
+_TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
+    # [1700000000.020000] 64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=20.0 ms; busybox: seq=0
+    # no answer yet for icmp_seq=2; Request timeout for icmp_seq 3
+    ("eq", rf"{_AT}.*?\b(?:icmp_)?[sr]eq[= ](?P<number>\d{{1,9}})\b(?:.*?{_TIME})?", _numbered),
     # [1700000000.02000] 192.0.2.1 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss); … : [1], timed out
     (
+        "],",
         (
             rf"{_AT}(?P<peer>\S+)\s+: (?P<copy>duplicate for )?\[(?P<number>\d{{1,9}})\], "
             rf"(?:\d+ bytes, )?(?:(?P<sign>)(?P<ms>{_NUMBER}) ms|timed out)"
         ),
         _fping,
     ),
-    # [1700000000.020000] 64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=20.0 ms; busybox: seq=0
-    # no answer yet for icmp_seq=2; Request timeout for icmp_seq 3
-    (rf"{_AT}.*?\b(?:icmp_)?[sr]eq[= ](?P<number>\d{{1,9}})\b(?:.*?{_TIME})?", _numbered),
     # Reply from 192.0.2.1: bytes=32 time<1ms TTL=64
-    (rf".*?{_TIME}", _listed),
+    ("m", rf".*?{_TIME}", _listed),
+    # $ ping -i 0.2 192.0.2.1; $ fping -D -p 200 192.0.2.1
+    (
+        " -",
+        (
+            r"(?>.*?\b(?P<program>f?ping)6? )(?:.* )?"
+            rf"-(?P<flag>[ip]) ?(?P<value>{_NUMBER})(?!\S)"
+        ),
+        _command,
+    ),
+    # PING example (192.0.2.1) 56(84) bytes of data.
+    ("PING", r"PING(?P<six>6?)\b(?!:)(?:.*\)(?P<colon>:) \d)?", _head),
+    # 34 packets transmitted, 20 received, 41% packet loss, time 5812ms
+    (
+        "%",
+        r"(?P<sent>\d{1,9}) [^\d,]+, (?P<came>\d{1,9}) [^\d,]+, [^%]*%(?:.* (?P<ms>\d{1,12}) ?ms)?",
+        _summary,
+    ),
+    # 192.0.2.1 : xmt/rcv/%loss = 12/8/33%, min/avg/max = 0.038/0.043/0.049
+    ("rcv", r"\S+\s+: xmt/rcv/%loss = (?P<sent>\d{1,9})/(?P<came>\d{1,9})/", _counts),
+    #     Packets: Sent = 4, Received = 2, Lost = 2 (50% loss),
+    ("= ", r"\s+[^=]*= (?P<sent>\d{1,9}), [^=]*= (?P<came>\d{1,9}), [^=]*= \d", _counts),
     # Pinging example [192.0.2.1] with 32 bytes of data:
-    (r"\S.* \d{1,6} .*:\s*$", _list_head),
-    (r"\s*$", _empty),
+    (":", r"(?>\S.*? \d{1,6} ).*:$", _list_head),
+    ("", r"$", _empty),
     # Request timed out.
-    (r".", _other),
+    ("", r".", _other),
 )
-LINES = tuple((re.compile(pattern), act) for pattern, act in _TABLE)
-"""Kinds of lines, the first that fits is taken, and what each does."""
+LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
+"""Kinds of lines, of which the first that fits is taken: what is in each (a quick look), its form,
+and what it does to the log. No form takes longer than its line is long."""
 _PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|\b56 data bytes\b")
 
 
@@ -298,11 +308,12 @@ def runs(text: str) -> list[Run]:
         LogError: it contradicts itself, or is too long.
     """
     log = Log()
-    for number, line in enumerate(StringIO(text), 1):
+    for number, whole in enumerate(StringIO(text), 1):
         if number > LINES_MAX:
             raise LogError(f"got more than {LINES_MAX} lines, expected at most so many")
-        for pattern, act in LINES:
-            if found := pattern.match(line[:LINE_MAX].rstrip()):
+        line = whole[:LINE_MAX].rstrip()
+        for needle, pattern, act in LINES:
+            if needle in line and (found := pattern.match(line)):
                 try:
                     act(log, found)
                 except LogError as error:
