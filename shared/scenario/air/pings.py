@@ -74,10 +74,11 @@ class Run:
         """Number counted on over wraps; None where it belongs to a new run."""
         if self.last < 0:
             return number
-        wrapped = number + WRAP * round((self.last - number) / WRAP)
+        wrap = WRAP if number < WRAP else 0
+        wrapped = number + wrap * round((self.last - number) / WRAP)
         if wrapped >= 0 and abs(wrapped - self.last) <= NEAR:
             return wrapped
-        ahead = number + self.last - self.last % WRAP
+        ahead = number + wrap * (self.last // WRAP)
         return ahead if ahead > self.last else None
 
     def timed(self) -> tuple[Array, Array]:
@@ -278,7 +279,7 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
 LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
 """Kinds of lines, of which the first that fits is taken: what is in each (a quick look), its form,
 and what it does to the log. No form takes longer than its line is long."""
-_PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|\b56 data bytes\b")
+_PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|^PING6?\b", re.MULTILINE)
 
 
 def _number(text: str) -> float:
@@ -319,7 +320,7 @@ def runs(text: str) -> list[Run]:
                 except LogError as error:
                     raise LogError(f"line {number}: {error}") from None
                 break
-    return [run for run in log.runs if run.last >= 0 and (run.numbered or run.answered())]
+    return [run for run in log.runs if run.last >= run.low() and (run.numbered or run.answered())]
 
 
 def joined(found: Sequence[Run]) -> tuple[Array, Array]:

@@ -120,7 +120,6 @@ _DELAYS = {"delay": 1.0, "rtt": 0.5}
 """Names of columns, before their unit, and what makes a delay a one-way delay."""
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _NAME = re.compile(r"([a-z]+)(?:[ _]?[\[(]?(s|sec|ms|msec|us|µs|ns)[\])]?)?", re.IGNORECASE)
-EXPECTED = "a time, such as time_s or timestamp, and a delay, such as delay_s, rtt_s or rtt_ms"
 
 
 def table(text: str, columns: Sequence[int], delimiter: str = ",") -> Array:
@@ -183,8 +182,10 @@ def _of_csv(text: str) -> RecordedPath:
     time = next((name for name in _TIMES if name in kinds), "")
     delay = next((name for name in _DELAYS if name in kinds), "")
     if not time or not delay:
-        given = ",".join(names)[:60]
-        raise ValueError(f"got the first line {given!r}, expected the columns of {EXPECTED}")
+        raise ValueError(
+            f"got the first line {','.join(names)[:60]!r}, expected the columns of a time, such as "
+            "time_s or timestamp, and of a delay, such as delay_s, rtt_s or rtt_ms"
+        )
     (time_at, time_unit), (delay_at, delay_unit) = kinds[time], kinds[delay]
     columns = [time_at, delay_at, *([kinds["lost"][0]] if "lost" in kinds else [])]
     rows = table(text, columns, delimiter)
@@ -258,6 +259,7 @@ class _Irtt(msgspec.Struct):
     round_trips: list[_Trip]
 
 
+_LOST = (np.nan, np.nan)
 CLOCKS_S = 1e-3
 """Largest error of a one-way delay of irtt that does not show that clocks differ [s]."""
 
@@ -282,9 +284,6 @@ def _of_irtt(text: str, way: Way) -> RecordedPath:
         f"way={way} within the round trip; the clocks of the two ends differ: take way=auto",
     )
     return _checked(times, np.clip(delays, 0.0, None))
-
-
-_LOST = (np.nan, np.nan)
 
 
 # -- what they have in common ---------------------------------------------------------------------
