@@ -95,8 +95,10 @@ def text_in(file: File) -> str:
             content = unzip.decompress(content, TEXT_BYTES_MAX)
         except zlib.error as error:
             raise ValueError(f"cannot be read: {error}") from None
-        if not unzip.eof:
-            raise ValueError(f"got a cut file, or more than {TEXT_BYTES_MAX} bytes when unzipped")
+        if not unzip.eof or unzip.unused_data:
+            raise ValueError(
+                f"got a cut file, several, or more than {TEXT_BYTES_MAX} bytes unzipped"
+            )
     if content[:4] in {*CAPTURES, CAPTURES_NEW}:
         raise ValueError("got a capture of packets, expected a log: see skytether probe --from")
     try:
