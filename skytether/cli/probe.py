@@ -254,7 +254,7 @@ def _content(path: Path) -> bytes:
         raise CommandError(f"--from: {path}: cannot be read: {reason}", CONFIGURATION) from None
 
 
-# -- what is printed and written ------------------------------------------------------------------
+# -- what is checked, written and printed ---------------------------------------------------------
 
 
 def _say(event: Event) -> None:

@@ -152,7 +152,7 @@ def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     time_s, delay_s = _points(way.sent_ns, way.came_ns)
     found = _alone(way, time_s, delay_s, None)
     least_s = float(delay_s[way.came].min())
-    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, 0.0), found, found
+    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), found, found
 
 
 def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
