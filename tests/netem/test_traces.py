@@ -261,6 +261,7 @@ def test_more_than_two_wraps_are_counted() -> None:
         (IPUTILS.replace("6 packets", "3 packets"), "line 10: got a summary of 3 sent and 1"),
         (IPUTILS.replace("1 received", "0 received"), "line 10: got a summary of 6 sent and 0"),
         (IPUTILS.replace("1 received", "3 received"), "but 1 answers above it, expected a line"),
+        (WINDOWS.replace("\n", "\n08:00:00 "), "line 9: got a summary of 4 sent and 3 received"),
         ("PING h (h) 56(84) bytes\n\n3 packets x, 3 y, 0% z, time 9ms\n", "log without -q"),
         (FPING.replace("192.0.2.1 : [2]", "192.0.2.7 : [2]"), "line 2: got answers of 192.0.2.1"),
         (TIMED.replace("1700000000.65", "1699990000.65"), "line 4: got a time 9999.58 s before"),

@@ -269,7 +269,7 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
     # 192.0.2.1 : xmt/rcv/%loss = 12/8/33%, min/avg/max = 0.038/0.043/0.049
     ("rcv", r"\S+\s+: xmt/rcv/%loss = (?P<sent>\d{1,9})/(?P<came>\d{1,9})/", _counts),
     #     Packets: Sent = 4, Received = 2, Lost = 2 (50% loss),
-    ("= ", r"\s+[^=]*= (?P<sent>\d{1,9}), [^=]*= (?P<came>\d{1,9}), [^=]*= \d", _counts),
+    ("= ", r"[^=]*= (?P<sent>\d{1,9}), [^=]*= (?P<came>\d{1,9}), [^=]*= \d", _counts),
     # Pinging example [192.0.2.1] with 32 bytes of data:
     (":", r"(?>\S.*? \d{1,6} ).*:$", _list_head),
     ("", r"$", _empty),
