@@ -24,7 +24,7 @@ from skytether.netem.proxy import Proxy
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.scenario.air.traces import recorded_in
+from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
 from skytether.shell.udp import leads_back
