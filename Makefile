@@ -28,7 +28,7 @@ KERNELS = $(BIN)/python -c "import skytether.sim.flight, skytether.quadrotor.loo
 	$(BIN)/pytest --collect-only -qq >/dev/null & \
 	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
 
-.PHONY: setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench fuzz clean
+.PHONY: setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench figures fuzz clean
 
 setup: $(STAMP)  ## the environment alone
 
@@ -95,6 +95,9 @@ autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= nam
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
 	$(BIN)/python -m bench
+
+figures: setup  ## the measured numbers of README and docs/, beside those made anew; goes on after Ctrl-C (an hour)
+	$(BIN)/python -m bench.figures
 
 $(BENCH_STAMP): $(STAMP) locks/bench.lock
 	$(INSTALL) --require-hashes -r locks/bench.lock
