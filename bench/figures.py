@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import zip_longest
@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 import tyro
 
-from bench.harness import refresh
+from bench.harness import TextTable, refresh
 from skytether.cli.fly import FlyOptions
 from skytether.lab import sweep
 from skytether.lab.commands import tables
@@ -43,6 +43,7 @@ PLACEHOLDER = re.compile(r"\{([a-z]\w*)\.([\w.+]+)(?:([*/])([\d.]+))?\}")
 """
 NUMBER = r"-?\d+(?:\.\d+)?"
 MARKED = r"(?<=<!-- table: {} -->\n).*?(?=<!-- end -->)"
+STATISTICS = {"mean": np.mean, "median": np.median, "least": np.min, "most": np.max}
 CHUNK = 10
 """Number of flights in a task."""
 
@@ -55,7 +56,7 @@ class Figure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: Literal["fast", "slow"] = "slow"
     """`fast`: some seconds, made by the tests as well; `slow`: by `make figures` alone."""
     minutes: float = 0.1
-    """Time that it takes on two cores."""
+    """Time that it takes on two cores; shorter ones are made first."""
     text: str = ""
     """Text of the page with placeholders for its numbers; any white space fits any other."""
     commands: Mapping[str, str] = {}
@@ -96,9 +97,8 @@ class Number(NamedTuple):
     def is_within(self, tolerance: float) -> bool:
         """Whether the found number is the written one, but for rounding and a relative change."""
         written = float(self.written)
-        return self.rounded() == self.written or abs(self.found - written) <= tolerance * abs(
-            written
-        )
+        change = abs(self.found - written)
+        return self.rounded() == self.written or change <= tolerance * abs(written)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,24 +162,18 @@ def cells(figure: Figure) -> dict[tuple[str, int], Flights]:
 def statistic(runs: Sequence[Mapping[str, Any]], path: str) -> float:
     """Statistic of a figure over some summaries; see PLACEHOLDER."""
     *names, kind = path.split(".")
-    if kind not in ("median", "least", "most", "half"):
+    if kind not in (*STATISTICS, "half"):
         names, kind = [*names, kind], "mean"
     values = []
     for run in runs:
         value: Any = run
         for name in names:
-            value = sum(value[each] for each in name.split("+")) if "+" in name else value[name]
+            parts = [value[each] for each in name.split("+")]
+            value = sum(parts) if len(parts) > 1 else parts[0]
         values.append(np.nan if value is None else float(value))
-    match kind:
-        case "half":
-            return float(interval(values)[1] or np.nan)
-        case "median":
-            return float(np.median(values))
-        case "least":
-            return min(values)
-        case "most":
-            return max(values)
-    return float(np.mean(values))
+    if kind == "half":
+        return float(interval(values)[1] or np.nan)
+    return float(STATISTICS[kind](np.array(values)))
 
 
 def compare(figure: Figure, page: str, results: Mapping[tuple[str, int], Any]) -> Verdict:
@@ -206,9 +200,8 @@ def compare(figure: Figure, page: str, results: Mapping[tuple[str, int], Any]) -
     return Verdict(numbers, "".join(parts) + page[end:])
 
 
-def compare_tables(figure: Figure, page: str, folder: Path | None, flags: Flags) -> Verdict:
-    """Comparison of tables, number by number, with those that their module makes anew."""
-    made = import_module(f"bench.{figure.module}").document_tables(folder, flags)
+def compare_tables(figure: Figure, page: str, made: Mapping[str, TextTable]) -> Verdict:
+    """Comparison of tables, number by number, with those that their module has made anew."""
     written = refresh(page, {name: made[name] for name in figure.tables})
     numbers = list[Number]()
     for name in figure.tables:
@@ -246,18 +239,17 @@ def main(argv: Sequence[str]) -> None:
     options = tyro.cli(FiguresOptions, args=argv, description=__doc__)
     figures = {
         name: figure
-        for name, figure in register().items()
+        for name, figure in sorted(register().items(), key=lambda each: each[1].minutes)
         if name in (options.only or [name]) and (figure.kind == "fast" or not options.fast)
     }
     if unknown := set(options.only) - figures.keys():
         raise command.CommandError(f"--only: got {', '.join(sorted(unknown))}, no such figure", 2)
-    rows, bad, digest = list[list[str]](), 0, code()
+    rows, bad = list[list[str]](), 0
     for name, figure in figures.items():
         page = ROOT / figure.page
-        folder = options.out / digest / name
         try:
-            verdict = make(figure, page.read_text(), folder, Flags(options.jobs))
-        except ValueError as error:
+            verdict = make(figure, page, options.out / code(), Flags(options.jobs))
+        except (ValueError, subprocess.CalledProcessError) as error:
             rows.append([name, figure.page, "", "", "", str(error)])
             bad += 1
             continue
@@ -265,7 +257,10 @@ def main(argv: Sequence[str]) -> None:
             files.write(page, verdict.page.encode())
         off = [each for each in verdict.numbers if not each.is_within(figure.tolerance)]
         bad += bool(off)
-        rows += _rows(name, figure, verdict.numbers if figure.text else off)
+        for each in verdict.numbers if figure.text else off:
+            moved = "has moved" if each in off else ""
+            tolerance = f"{figure.tolerance:.0%}"
+            rows.append([name, figure.page, each.written, each.rounded(), tolerance, moved])
         within = f"{len(verdict.numbers) - len(off)} of {len(verdict.numbers)} within"
         print(f"{name}: {within}", flush=True)
     headings = ["figure", "page", "written", "found", "tolerance", "verdict"]
@@ -274,13 +269,13 @@ def main(argv: Sequence[str]) -> None:
         raise command.CommandError(f"{bad} of {len(figures)} figures have left their tolerance", 1)
 
 
-def make(figure: Figure, page: str, folder: Path | None, flags: Flags) -> Verdict:
+def make(figure: Figure, page: Path, folder: Path, flags: Flags) -> Verdict:
     """Make a figure, and compare it with its page.
 
     Args:
         figure: what is made.
-        page: text of its page.
-        folder: where flights are kept; None: nowhere.
+        page: file of its page, which is read after the flights.
+        folder: where flights are kept; figures of the same flights share them.
         flags: workers.
 
     Raises:
@@ -288,27 +283,17 @@ def make(figure: Figure, page: str, folder: Path | None, flags: Flags) -> Verdic
         ValueError: the page does not have the figure.
     """
     if figure.module:
-        kept = folder and folder.parent / figure.module
-        return compare_tables(figure, page, kept, flags)
+        module = import_module(f"bench.{figure.module}")
+        made = module.document_tables(folder / figure.module, flags)
+        return compare_tables(figure, page.read_text(), made)
     tasks = cells(figure)
+    settings = {"tasks": [[*key, *each.seeds, each.command] for key, each in tasks.items()]}
+    kept = folder / hashlib.sha256(msgspec.json.encode(settings)).hexdigest()[:12]
     flights = sum(len(each.seeds) for each in tasks.values())
     with crew(flags, "flying", flights, "flights") as flyers:
-        settings = {"tasks": [[*key, *each.seeds, each.command] for key, each in tasks.items()]}
-        if folder:  # figures of the same flights share them
-            flown = hashlib.sha256(msgspec.json.encode(settings)).hexdigest()[:12]
-            folder = folder.parent / flown
         kind = list[dict[str, Any]]
-        results = flyers.study(
-            fly, tasks, kind, settings, folder, size=lambda each: len(each.seeds)
-        )
-    return compare(figure, page, results)
-
-
-def _rows(name: str, figure: Figure, numbers: Sequence[Number]) -> Iterator[list[str]]:
-    for each in numbers:
-        verdict = "" if each.is_within(figure.tolerance) else "has moved"
-        tolerance = f"{figure.tolerance:.0%}"
-        yield [name, figure.page, each.written, each.rounded(), tolerance, verdict]
+        results = flyers.study(fly, tasks, kind, settings, kept, size=lambda each: len(each.seeds))
+    return compare(figure, page.read_text(), results)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,18 @@ from pathlib import Path
 import pytest
 
 from bench import figures
-from bench.figures import Figure, Number, cells, compare, fly, main, register, statistic
+from bench.figures import (
+    Figure,
+    Number,
+    cells,
+    compare,
+    compare_tables,
+    fly,
+    main,
+    register,
+    statistic,
+)
+from bench.harness import TextTable, refresh
 from skytether.shell.command import CommandError
 
 ROOT = figures.ROOT
@@ -93,6 +104,18 @@ def test_only_the_number_that_has_moved_is_corrected_with_as_many_decimals() -> 
     verdict = compare(FIGURE, PAGE, runs)
     assert [each.is_within(0.02) for each in verdict.numbers] == [False, True]
     assert verdict.page == PAGE.replace("is 1.8 cm", "is 2.3 cm")
+
+
+def test_a_table_is_written_anew_where_a_number_has_moved() -> None:
+    figure, page = Figure("page.md", tables=("t",)), "<!-- table: t -->\n{}<!-- end -->\n"
+    was, little, much = (TextTable(["a"], [["x"], [text]]) for text in ("1.50", "1.51", "1.70"))
+    page = refresh(page.format("\n"), {"t": was})
+    assert compare_tables(figure, page, {"t": little}).page == page
+    moved = compare_tables(figure, page, {"t": much})
+    assert moved.numbers == [Number("1.50", 1.7)]
+    assert moved.page == page.replace("1.50", "1.70")
+    more = compare_tables(figure, page, {"t": TextTable(["a"], [["1.50"], ["2"]])})
+    assert [each.is_within(1.0) for each in more.numbers] == [True, False]
 
 
 def test_a_text_that_the_page_does_not_have_once_is_an_error() -> None:
