@@ -43,7 +43,7 @@ PLACEHOLDER = re.compile(r"\{([a-z]\w*)\.([\w.+]+)(?:([*/])([\d.]+))?\}")
 """
 NUMBER = r"-?\d+(?:\.\d+)?"
 MARKED = r"(?<=<!-- table: {} -->\n).*?(?=<!-- end -->)"
-STATISTICS = {"mean": np.mean, "median": np.median, "least": np.min, "most": np.max}
+STATISTICS: dict[str, Any] = {"mean": np.mean, "median": np.median, "least": np.min, "most": np.max}
 CHUNK = 10
 """Number of flights in a task."""
 
