@@ -1,4 +1,7 @@
-"""Last clamp before the plant: bounds every input, whichever part of the client chose it.
+"""Last clamp: bounds every input, whichever part of the client chose it.
+
+Only the fence acts after it, which may change the input faster than this clamp allows: what leads
+back inside must not wait.
 
 It shares no code with packet decoding or the choice of the input, so that a mistake there stops
 here.

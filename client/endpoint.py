@@ -101,7 +101,7 @@ class Client(Endpoint):
         terms = scenario.terms()
         self.keeps = keeps or before is not None
         self._memory = ClientMemory(terms, boot_id, before)
-        self._is_mission, self._axes = bool(terms.join), terms.axes
+        self._is_mission, self._axes = scenario.is_mission, terms.axes
         self.vehicle, self._server = vehicle, server
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
@@ -150,7 +150,7 @@ class Client(Endpoint):
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
         """Time of day; None if the host does not know it."""
-        self._is_mission, self._time_due_ns = scenario.is_mission, 0
+        self._time_due_ns = 0
         self.horizons = 0
         self.dropped: Counter[Drop] = Counter()
         """Number of dropped datagrams by reason."""

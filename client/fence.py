@@ -51,7 +51,7 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether the latest requested input was limited by the fence."""
+        """Whether a bound limited the latest requested input; being slowed alone does not count."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]

@@ -66,7 +66,7 @@ class Pilot:
         recorder: Recorder | None,
     ) -> None:
         self._terms = scenario.terms()
-        self._dt_ns, self._is_mission = self._terms.dt_ns, bool(self._terms.join)
+        self._dt_ns, self._is_mission = self._terms.dt_ns, scenario.is_mission
         self.steps = scenario.steps
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)

@@ -3,8 +3,8 @@
     observations → x̂(k), x̂(k+d) (`schemes`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`mpc.hierarchical`) → event? (`trigger`) → plans are sent and remembered.
 
-The schemes "predictive" and "none" have d = 0. With "trajectory" there is no MPC:
-`schemes.trajectory`, or on a mission `missions.mission_planner`, takes its place. Every vehicle is
+The schemes "predictive" and "none" have d = 0. With "trajectory" `schemes.trajectory` plans the
+motion to be followed, or on a mission `missions.mission_planner`. Every vehicle is
 planned for at every step, since planning is a small part of the cost of a step.
 """
 

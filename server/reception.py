@@ -1,7 +1,8 @@
 """The server's side of the conversation: receives messages, checks and answers them.
 
 HELLO is answered by a WELCOME or a refusal, OBSERVATION is checked and passed to the controller,
-CLOSE ends a session. Everything else is dropped and counted by reason.
+CLOSE ends a session, and TIME says what a vehicle's time of day is. Everything else is dropped and
+counted by reason.
 """
 
 from collections import Counter, deque

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Batch, Head
+from skytether.server.common.scheme import Batch, Head, make_head
 from skytether.server.controller import BLOCK, Controller, Decisions
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
@@ -196,7 +196,7 @@ class Ticker:
         def head(row: int) -> Head:
             session = sessions.at(row)
             number, silence = session.number_next(now_ns), session.hearing.silence
-            return Head(session.vehicle, session.number, sent_us, number, silence)
+            return make_head((session.vehicle, session.number, sent_us, number, silence))
 
         for row, payload in self._controller.scheme.encode(batch, head):
             self._send(sessions.at(row), payload, is_plan=True)

@@ -7,6 +7,7 @@ one.
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -153,6 +154,10 @@ class Head(NamedTuple):
     """Number of the packet in the session."""
     silence: int
     """Longest silence that is asked of the vehicle [half steps]."""
+
+
+make_head: Callable[[tuple[int, int, int, int, int]], Head] = partial(tuple.__new__, Head)
+"""Head from its five values, in half the time of calling `Head`."""
 
 
 class Batch(NamedTuple):

@@ -53,14 +53,14 @@ class InputScheme(Scheme):
     def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
         # Bytes of one input on all axes, and of what goes with a horizon.
-        width = 4 * self.terms.axes
+        width, planned = 4 * self.terms.axes, self.terms.planned
         feedback, told = NOTHING, 0
         if self.terms.feedback:
             feedback, told = batch.found.feedback.data.cast("B"), width * FEEDBACK
         heads, inputs = self._packing.pack(batch, self.observed_step)
         begin = 0
         for i, row, k, o, d in heads:
-            end = begin + width * (d + self.terms.planned)
+            end = begin + width * (d + planned)
             vehicle, session, sent_us, number, silence = head(row)
             extra = feedback[i * told : (i + 1) * told]
             some, begin = inputs[begin:end], end

@@ -30,8 +30,8 @@ trigger = TRIGGERS
 Amount = Annotated[float, Meta(ge=0)]
 """Threshold of any unit."""
 Figures = NDArray[np.void]
-"""Figures of plans, a record for each vehicle, see `server.mpc.appraisal.FIGURES`; shape
-(n,)."""
+"""Figures of plans, a record for each vehicle, see `server.common.scheme.FIGURES`;
+shape (n,)."""
 
 
 class KnownArrays(NamedTuple):
@@ -134,7 +134,7 @@ class Situation(NamedTuple):
 class Compared(IntEnum):
     """Figure that a trigger compares with its threshold, by the column of the record that has it.
 
-    `server.mpc.appraisal.PlanFigures` says what each is.
+    `server.common.scheme.PlanFigures` says what each is.
     """
 
     NOTHING = 0

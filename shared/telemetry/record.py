@@ -133,7 +133,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
 def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
-    It has those figures for triggers that the scheme computes; `server.mpc.appraisal.PlanFigures`
+    It has those figures for triggers that the scheme computes; `server.common.scheme.PlanFigures`
     describes them.
 
     Args:

@@ -183,7 +183,7 @@ class Work:
         scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
         self.regular = {
             period: replace(
-                scenario, control=replace(scenario.control, trigger="periodic", period=period)
+                scenario, control=replace(scenario.control, trigger=f"periodic({period})")
             )
             for period in PERIODS
         }

@@ -4,7 +4,6 @@ import json
 import shutil
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -13,7 +12,6 @@ from helpers import refusal, refused_before_writing
 from skytether.__main__ import main
 from skytether.lab import calibration
 from skytether.lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Rmse, SearchLimits, Table1
-from skytether.lab.commands.pool import Crew
 from skytether.lab.intervals import interval
 from skytether.lab.search import Free, Objective, Optimiser, SearchPoint, Values, check_free, put
 from skytether.lab.sweep import summaries
@@ -320,28 +318,6 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
     said = capsys.readouterr().err
     assert f"out: files.{table}: got " in said
     assert said.endswith(", to go on there; or another --out\n")
-
-
-def test_a_trajectory_edited_while_a_search_runs_ends_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No generation is kept of which some points were flown along it."""
-    table = tmp_path / "path.csv"
-    table.write_text("t,x,y\n0,0,0\n5,1,1\n")
-    scenario = tmp_path / "mine.toml"
-    scenario.write_text('extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n')
-    fly_all = Crew.share
-
-    def edited(*arguments: Any) -> Any:
-        """Fly, after somebody has saved another trajectory."""
-        table.write_text("t,x,y\n0,0,0\n5,1,2\n")
-        return fly_all(*arguments)
-
-    monkeypatch.setattr(Crew, "share", edited)
-    argv = ["calibrate", str(scenario), *SHORT, "--out", str(tmp_path / "out")]
-    assert main([*argv, "--free", "model.tau_s.0=0.2:2", "--generations", "1"]) == 2
-    assert f"calibrate: {table}: got the content " in capsys.readouterr().err
-    assert (tmp_path / "out" / "journal.jsonl").read_bytes() == b""
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,9 @@ from skytether.lab.contenders import (
 )
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import whole
 from skytether.shared.scenario.reading import COMPARED
+from skytether.shared.scenario.registry import TRIGGERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim import flight
@@ -111,7 +113,9 @@ def test_every_contender_in_every_case_comes_along() -> None:
         there = contenders.differences(start, case.plant)
         here = contenders.differences(scenario, case.plant)
         changed = {key for key, value in here.items() if value != there.get(key)}
-        assert changed <= {key.key.removesuffix(".0").removesuffix(".1") for key in free}, name
+        assert changed <= {whole(key.key.removesuffix(".0").removesuffix(".1")) for key in free}, (
+            name
+        )
         assert scenario.control.state_weight[0] == PAPER.control.state_weight[0]
         assert scenario.title == f"{contender.title}, at its best: {case.title}"
     assert "compare" not in " ".join(reading.names())
@@ -530,7 +534,9 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     assert float(row["rmse_xy_median"]) == pytest.approx(np.median([run.rmse_xy for run in runs]))
     weights = {row["contender"]: row for row in rows(out / "weights.csv")}
     assert list(weights) == [*LOOKED_AT]
-    assert weights["trajectory-expected"]["control.trigger"] == found.control.trigger
+    here = float(weights["trajectory-expected"]["control.trigger.expected_gap"])
+    expected = TRIGGERS.argument(found.control.trigger, "expected_gap")
+    assert here == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:

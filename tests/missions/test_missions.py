@@ -1090,7 +1090,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
         ("goal(3, 0, 1)", "mission.goals: got goal(3, 0, 1), expected vehicles 1, 2"),
         ("goal(1, 0)", "mission.goals: got 'goal(1, 0)', expected goal(vehicle, x, y)"),
         ("place(1, 0, 0)", "mission.goals: got 'place(1, 0, 0)', expected goal(vehicle, x, y)"),
-        ("goal(1, nan, 0)", "mission.goals: got 'goal(1, nan, 0)', expected a place within"),
+        ("goal(1, nan, 0)", "mission.goals: got 'goal(1, nan, 0)', expected goal(vehicle, x, y)"),
         ("goal(1, 7, 7) & goal(2, 7, 7.5)", "got goal(2, 7, 7.5), expected a place 0.93 m from"),
         ("goal(1, 3.2, 0)", "expected a place 0.93 m from the goal of vehicle 2"),
         ("goal(1, 1.1, 0)", "expected a place 0.23 m from box(-1, 1, -1, 1)"),

@@ -747,7 +747,7 @@ def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path:
     page = out.read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "://" not in page.replace("data:", "")
-    for shown in ("RMSE x, y, xy [m]", "session open, flying", "[network.uplink]", "seed 1"):
+    for shown in ("RMSE x, y, xy [m]", "session open, flying", "[network]", "seed 1"):
         assert shown in page
     lost = flown().figures["netem"]["uplink"]["lost"]
     assert f"uplink lost {lost}" in page[page.index("dropped by netem") :]
