@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # pytest compiles kernels before its first test, and rewrites the tests' asserts: not by each of its workers.
 KERNELS = $(BIN)/pytest --collect-only -qq >/dev/null
 
-.PHONY: help setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench fuzz clean
+.PHONY: help setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench figures fuzz clean
 
 help:  ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -94,6 +94,9 @@ autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= nam
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
 	$(BIN)/python -m bench
+
+figures: setup  ## the measured numbers of README and docs/, beside those made anew; goes on after Ctrl-C (an hour)
+	$(BIN)/python -m bench.figures
 
 $(BENCH_STAMP): $(STAMP) locks/bench.lock
 	$(INSTALL) --require-hashes -r locks/bench.lock

@@ -4,7 +4,7 @@
 scripted autopilot, in calm air and in wind, in virtual time. The contenders are Skytether with
 `vehicle.kind = "mavlink"`, and set-points sent directly by each of the laws of `station.laws`. All
 fly with the same seeds of network and wind, counted from each flight's start. Each flight is
-repeated with the network cut for a while. With --write, the tables go into docs/compare.md.
+repeated with the network cut for a while.
 """
 
 import io
@@ -19,12 +19,11 @@ import msgspec
 import numpy as np
 import tyro
 
-from bench.harness import TextTable, refresh
+from bench.harness import TextTable
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
 from skytether.lab.commands.pool import Flags, study
-from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying
 from skytether.shared.scenario import reading
@@ -37,7 +36,6 @@ from skytether.sim import flight, straight
 from skytether.station import laws
 from skytether.station.joined import state_at, summary_of, within
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "compare.md"
 Air = Literal["calm", "wind"]
 INPUTS: dict[str, Any] = {
     "scheme": "committed",
@@ -307,8 +305,6 @@ class AutopilotBenchmarkOptions:
     """Number of flights at once."""
     out: Path | None = None
     """Folder that keeps the flights: after Ctrl-C the same command goes on."""
-    write: bool = False
-    """Put the tables into docs/compare.md."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -322,11 +318,15 @@ def main(argv: Sequence[str]) -> None:
         for seed in range(1, options.seeds + 1)
     ]
     flights = study(fly_cell, cells, FlownCell, {}, options.out, Flags(options.jobs))
-    made = tables(flights)
-    for title, table in made.items():
+    for title, table in tables(flights).items():
         table.show(title)
-    if options.write:
-        files.write(DOCUMENT, refresh(DOCUMENT.read_text(), made).encode())
+
+
+def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
+    """Tables of docs/compare.md by name, with the flights in a folder."""
+    kinds = product(get_args(FlavourName), get_args(Air), range(1, 6))
+    cells = [Cell(name, *kind) for kind in kinds for name in contenders(kind[0])]
+    return tables(study(fly_cell, cells, FlownCell, {}, folder, flags))
 
 
 if __name__ == "__main__":

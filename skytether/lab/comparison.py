@@ -247,7 +247,7 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
     """Table of the choice of each contender within each budget."""
     rows, lines = [], []
     for each in results:
-        best = {budget: _ranked(each, budget)[:1] for budget in BUDGETS}
+        best = {budget: _best(each, budget) for budget in BUDGETS}
         for contender in each.contenders:
             cells = []
             for budget in BUDGETS:
@@ -256,14 +256,19 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
                     cells.append("–")
                     continue
                 named = {"case": each.case.name, "contender": contender.name, "budget": budget}
-                rows.append(named | _row(runs))
-                text = f"{as_text(runs.mean(RMSE), '.4f')} @ {as_text(runs.mean(PACKETS), '.1f')}"
+                rows.append(named | _row(runs) | {"best": runs in best[budget]})
+                mean, half, median = (
+                    as_text(value, ".4f") for value in (*runs.estimate(RMSE), runs.median())
+                )
+                text = f"{mean} ± {half} ({median}) @ {as_text(runs.mean(PACKETS), '.1f')}"
                 cells.append(f"{text} *" if runs in best[budget] else text)
             lines.append((each.case.title, contender.title, *cells))
     says = (
-        "Mean RMSE xy [m] @ packets a second. Within a budget each contender flies at the "
-        "threshold and with the way of reporting that had the smallest error on other seeds; * is "
-        "the best of a case. The CSV has medians, intervals, bytes and all other figures."
+        "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
+        "each contender flies at the threshold and with the way of reporting that had the smallest "
+        "error on other seeds; * marks the smallest mean, and those that cannot be told from it: "
+        "the interval of their ratio on the same seeds contains 1. The CSV has bytes and all other "
+        "figures."
     )
     flown = {id(runs): runs for each in results for runs in each.bought.values()}.values()
     failed = sum(run.rmse_xy is None for each in flown for run in each.runs)
@@ -279,6 +284,17 @@ def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
     """Runs within a budget by mean RMSE xy; failed ones come last."""
     flown = [runs for (_, within), runs in compared.bought.items() if within == budget]
     return sorted(flown, key=lambda each: (math.isnan(each.mean(RMSE)), each.mean(RMSE)))
+
+
+def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
+    """Runs within a budget with the least mean RMSE xy, and those that cannot be told from it."""
+    ranked = _ranked(compared, budget)
+    return [
+        each
+        for each in ranked
+        if not math.isnan(each.mean(RMSE))
+        and (each is ranked[0] or ((of := ratio(each, ranked[0])) and of[1] <= 1.0))
+    ]
 
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:

@@ -409,14 +409,29 @@ def test_the_best_within_a_budget_is_marked_and_ours_is_measured_against_it() ->
     lines = {row[1]: row[2:] for row in budgets_table([compared]).rows}
     dash = "–"
     assert lines["committed with feedback, cost gap"] == (
-        *(dash, dash, "0.2050 @ 4.0 *", "0.2050 @ 4.0 *"),
+        *(dash, dash, "0.2050 ± 0.0635 (0.2050) @ 4.0 *", "0.2050 ± 0.0635 (0.2050) @ 4.0 *"),
         *(dash, dash),
     )
-    assert lines["trajectory, expected gap"] == (dash, dash, "0.3050 @ 3.0", dash, dash, dash)
+    assert lines["trajectory, expected gap"] == (
+        *(dash, dash, "0.3050 ± 0.0635 (0.3050) @ 3.0"),
+        *(dash, dash, dash),
+    )
     ((_, budget, error, other, their_error, value, _),) = leaders_table([compared]).rows
     assert (budget, error, their_error) == ("≤ 5/s", "0.3050", "0.2050")
     assert other == "committed with feedback, cost gap"
     assert float(value) == pytest.approx(0.305 / 0.205, abs=1e-3)
+
+
+def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> None:
+    """Seed by seed the second is now better and now worse; the third is always worse."""
+    best = flew("feedback-gap", [0.2, 0.3, 0.2])
+    equal = flew("trajectory-expected", [0.21, 0.29, 0.21])
+    worse = flew("paper-event", [0.3, 0.4, 0.3])
+    table = budgets_table([within(TARGET, (5.0, best), (5.0, equal), (5.0, worse))])
+    marked = {row[1]: row[4].endswith("*") for row in table.rows}
+    assert [*marked.values()] == [False, True, True]
+    found = [row["best"] for row in csv.DictReader(table.csv.splitlines())]
+    assert found == ["false", "true", "true"]
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
