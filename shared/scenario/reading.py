@@ -86,18 +86,26 @@ def load_base(name: str) -> Scenario:
     return convert(_read(name), name)
 
 
-def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
+def check(
+    raw: Mapping[str, Any],
+    source: str = "",
+    *,
+    known: Scenario | None = None,
+    any_network: bool = False,
+) -> Scenario:
     """The scenario in a table of plain values, every one of them checked.
 
     Args:
         source: the file or command line they come from, for the message.
         known: a scenario that was checked before: where its trajectory is the same, no file of it
             is read again.
+        any_network: whether its network may be too slow, or lose too much, to fly over.
 
     Raises:
         ConfigError: the first thing that is wrong.
     """
-    return _without_contradictions(convert(raw, source), source, known=known)
+    scenario = convert(raw, source)
+    return _without_contradictions(scenario, source, known=known, any_network=any_network)
 
 
 def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
@@ -116,11 +124,11 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
 
 
 def _without_contradictions(
-    scenario: Scenario, source: str, *, known: Scenario | None = None
+    scenario: Scenario, source: str, *, known: Scenario | None = None, any_network: bool = False
 ) -> Scenario:
     """Scenario with its files, refused unless its values are possible together; see `check`."""
     scenario = _with_files(scenario, source, known)
-    _refuse_first(contradictions(scenario, known), source)
+    _refuse_first(contradictions(scenario, known, any_network=any_network), source)
     return scenario
 
 
