@@ -197,6 +197,8 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
 
     parameters: tuple[AutopilotParameter, ...]
     """Parameters that are unsafe, or could not be set."""
+    sets: bool = False
+    """Whether they were to be set."""
 
     def __str__(self) -> str:
         lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
@@ -204,9 +206,19 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
 
     @property
     def brief(self) -> str:
-        """Names of the parameters in one line."""
-        names = ", ".join(parameter.name for parameter in self.parameters)
-        return f"vehicle {self.vehicle} is not armed: {names}; --set-parameters sets them"
+        """Names of the parameters in one line, and what to do."""
+        unknown = ", ".join(each.name for each in self.parameters if each.value is None)
+        unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
+        told = []
+        if unsafe:
+            told.append(
+                f"{unsafe}; --set-parameters {'could not set' if self.sets else 'sets'} them"
+            )
+        if unknown:
+            told.append(
+                f"its autopilot does not tell {unknown}, expected an answer to each question"
+            )
+        return f"vehicle {self.vehicle} is not armed: {'; '.join(told)}"
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):

@@ -240,6 +240,11 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
             goal, zone = near[0]
             at = ", ".join(f"{each:.3g}" for each in places[goal])
             expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
+            if zones.zones[zone].is_fence:
+                expected = (
+                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}, for "
+                    "vehicles stay within every fence"
+                )
             yield "mission.zones", zones.zones[zone].name, expected
             return
     found = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)

@@ -15,6 +15,7 @@ from skytether.server.endpoint import GOALS, POINT, TRIGGER, ZONES
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
 from skytether.shared.scenario.schema import Scenario, Section, Strength
+from skytether.shell.options import meanings
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -59,9 +60,9 @@ def test_help_has_the_sentences_of_the_page(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
-        emulate(["--help"])
+        emulate(["--help-keys"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for name in ("control", "vehicle", "sensor", "link"):
-        sentences = keys_document.sentences(typing.get_type_hints(Scenario)[name])
+        sentences = meanings(typing.get_type_hints(Scenario)[name])
         for key, sentence in sentences.items():
             assert sentence in shown, f"{name}.{key}"
