@@ -209,15 +209,10 @@ class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
         """Names of the parameters in one line, and what to do."""
         unknown = ", ".join(each.name for each in self.parameters if each.value is None)
         unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
-        told = []
-        if unsafe:
-            told.append(
-                f"{unsafe}; --set-parameters {'could not set' if self.sets else 'sets'} them"
-            )
+        does = "could not set" if self.sets else "sets"
+        told = [f"{unsafe}; --set-parameters {does} them"] if unsafe else []
         if unknown:
-            told.append(
-                f"its autopilot does not tell {unknown}, expected an answer to each question"
-            )
+            told.append(f"its autopilot has not answered about {unknown}, or does not have it")
         return f"vehicle {self.vehicle} is not armed: {'; '.join(told)}"
 
 
