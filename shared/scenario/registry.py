@@ -45,6 +45,7 @@ FURTHER = {
 UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
     {
         "bytes_per_s": {"kbit": (1e3, 8.0), "mbit": (1e6, 8.0), "gbit": (1e9, 8.0)},
+        "per_s": {},
         "_s": {"us": (1.0, 1e6), "ms": (1.0, 1e3), "s": (1.0, 1.0)},
         "": {"%": (1.0, 100.0)},
     }

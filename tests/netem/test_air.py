@@ -18,7 +18,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.grammar import Call, GrammarError
-from skytether.shared.scenario.registry import IMPAIRMENTS
+from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 
 SEEDS = range(10)
 SAMPLES = 3000
@@ -76,6 +76,8 @@ def test_a_number_may_have_the_unit_of_its_parameter(text: str, plain: str) -> N
 def test_a_unit_of_something_else_is_refused(text: str) -> None:
     with pytest.raises(GrammarError):
         IMPAIRMENTS.calls(text)
+    with pytest.raises(GrammarError):
+        TRIGGERS.parse("budget(5ms)")
 
 
 @pytest.mark.parametrize("seed", SEEDS)
