@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS
 from skytether.shared.scenario.schema import Scenario, Section
-from skytether.shell.options import meanings
 
 HEAD = """# Keys of a scenario
 

@@ -6,9 +6,7 @@ each start of a process. So simple flags, as commands use to start processes, ar
 and tyro is given a scenario's keys for `--help-keys` alone.
 """
 
-import ast
 import dataclasses
-import inspect
 import json
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -16,13 +14,13 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from inspect import cleandoc
-from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 
@@ -73,21 +71,6 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
     with ExitStack() as undo:
         _tell_tyro(kind, undo, keys=keys)
         return tyro.cli(kind, args=argv, default=default, prog=prog, description=about)
-
-
-def meanings(options: type) -> dict[str, str]:
-    """Docstring of each field of a class, in one line."""
-    found: dict[str, str] = {}
-    for each in reversed(options.__mro__):
-        with suppress(TypeError, OSError):  # not a class of Python's own, or without its source
-            (definition,) = ast.parse(inspect.getsource(each)).body
-            assert isinstance(definition, ast.ClassDef)
-            found |= {
-                ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
-                for key, text in pairwise(definition.body)
-                if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
-            }
-    return found
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:

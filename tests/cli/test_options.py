@@ -10,6 +10,7 @@ import skytether.client.__main__ as client
 import skytether.netem.__main__ as netem
 from skytether.cli import fly, keygen
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shell import command, options
 
@@ -62,7 +63,7 @@ def test_the_help_has_options_and_another_one_has_keys(
             command.parse(client.ClientOptions(), [flag], "x", None)
         shown.append(capsys.readouterr().out)
     for said in shown[1:]:
-        for name, text in options.meanings(client.ClientOptions).items():
+        for name, text in meanings(client.ClientOptions).items():
             assert name == "config" or text in said
     for name in LinkConfig.__struct_fields__:
         flag = f"--link.{name.replace('_', '-')} "

@@ -12,10 +12,10 @@ from skytether.lab import keys_document
 from skytether.netem.__main__ import emulate
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import GOALS, POINT, TRIGGER, ZONES
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
 from skytether.shared.scenario.schema import Scenario, Section, Strength
-from skytether.shell.options import meanings
 
 DOCS = Path(__file__).parents[2] / "docs"
 
