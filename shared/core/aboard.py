@@ -200,11 +200,19 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
     that are unsafe or could not be set.
     """
 
+    sets: bool = False
+    """Whether they were to be set."""
+
     @property
     def brief(self) -> str:
-        """Names of the parameters in one line."""
-        names = ", ".join(parameter.name for parameter in self.parameters)
-        return f"vehicle {self.vehicle} is not armed: {names}; --set-parameters sets them"
+        """Names of the parameters in one line, and what to do."""
+        unknown = ", ".join(each.name for each in self.parameters if each.value is None)
+        unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
+        does = "could not set" if self.sets else "sets"
+        told = [f"{unsafe}; --set-parameters {does} them"] if unsafe else []
+        if unknown:
+            told.append(f"its autopilot has not answered about {unknown}, or does not have it")
+        return f"vehicle {self.vehicle} is not armed: {'; '.join(told)}"
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):

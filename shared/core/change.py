@@ -180,12 +180,13 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         values: plain values by key.
 
     Raises:
-        ConfigError: a key is unknown, or the scenario cannot be flown so.
+        ConfigError: a key is unknown, or the scenario cannot be flown so. A network may become too
+            bad to fly over.
     """
     table = reading.to_table(scenario)
     set_keys(values, table)
     try:
-        return reading.check(table, known=scenario)
+        return reading.check(table, known=scenario, any_network=True)
     except RecursionError:
         raise ConfigError("got values that are nested too deeply") from None
 

@@ -195,6 +195,33 @@ class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         )
 
 
+class TooLong(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """netem has dropped a packet because of its length, the first of that kind."""
+
+    size: int
+    """UDP payload [B]."""
+    most: int
+    """Longest UDP payload that passes [B]."""
+
+    def __str__(self) -> str:
+        return (
+            f"a packet of {self.size} B is dropped, and so are all longer than network.mtu, which "
+            f"is {self.most} B"
+        )
+
+
+class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A packet of netem to the server could not be sent, or was refused on its way."""
+
+    host: str
+    port: int
+    reason: str
+
+    def __str__(self) -> str:
+        at = address_text(self.host, self.port)
+        return f"packets to {at} are lost until it answers: {self.reason}"
+
+
 class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """An autopilot has sent a status text."""
 
@@ -617,6 +644,8 @@ Event = (
     | Fault
     | FlowOpened
     | Returned
+    | TooLong
+    | Unreachable
     | AutopilotSaid
     | AboardEvent
     | Unauthenticated

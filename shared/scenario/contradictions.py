@@ -34,13 +34,16 @@ LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
 
-def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterator[Contradiction]:
+def contradictions(
+    scenario: Scenario, known: Scenario | None = None, *, any_network: bool = False
+) -> Iterator[Contradiction]:
     """Contradictions of a scenario whose values are each valid.
 
     Args:
         scenario: the scenario.
         known: a scenario that was checked before; if the desired trajectory is the same, it is not
             checked again.
+        any_network: whether its network may be too slow, or lose too much, to fly over.
     """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
@@ -90,7 +93,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     if wrong:
         return
     yield from _no_mission(scenario)
-    yield from list(_no_impairments(scenario)) or _too_late(scenario)
+    yield from list(_no_impairments(scenario)) or (() if any_network else _too_late(scenario))
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     yield from _no_way(scenario, known)
@@ -242,6 +245,11 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
             goal, zone = near[0]
             at = ", ".join(f"{each:.3g}" for each in places[goal])
             expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
+            if zones.zones[zone].is_fence:
+                expected = (
+                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}, for "
+                    "vehicles stay within every fence"
+                )
             yield "mission.zones", zones.zones[zone].name, expected
             return
     too_near = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)

@@ -32,7 +32,7 @@ _ARGUMENT = re.compile(
     rf"\s*(?:([a-z_]\w*)\s*=)?\s*((?:{_QUOTED}|[^,\"])*?)\s*,", re.IGNORECASE | re.ASCII
 )
 """An argument and the comma after it."""
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 
 
 class GrammarError(Exception):
@@ -165,6 +165,6 @@ def _call(name: str, arguments: str | None, text: str, begin: int, end: int) -> 
 
 
 def _value(word: str) -> Value:
-    if _NUMBER.fullmatch(word):
+    if NUMBER.fullmatch(word):
         return float(word) if re.search(r"[.e]", word, re.IGNORECASE) else int(word)
     return word[1:-1] if word[:1] == word[-1:] == '"' else word

@@ -85,7 +85,13 @@ def load_base(name: str) -> Scenario:
     return convert(_read(name), name)
 
 
-def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
+def check(
+    raw: Mapping[str, Any],
+    source: str = "",
+    *,
+    known: Scenario | None = None,
+    any_network: bool = False,
+) -> Scenario:
     """Make a scenario from a table of plain values, and check it for contradictions.
 
     Args:
@@ -93,11 +99,13 @@ def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = 
         source: file or command line of the values, for messages.
         known: a scenario that was checked before; if the desired trajectory is the same, its files
             are not read again.
+        any_network: whether its network may be too slow, or lose too much, to fly over.
 
     Raises:
         ConfigError: the first error.
     """
-    return _without_contradictions(convert(raw, source), source, known=known)
+    scenario = convert(raw, source)
+    return _without_contradictions(scenario, source, known=known, any_network=any_network)
 
 
 def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
@@ -116,11 +124,11 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
 
 
 def _without_contradictions(
-    scenario: Scenario, source: str, *, known: Scenario | None = None
+    scenario: Scenario, source: str, *, known: Scenario | None = None, any_network: bool = False
 ) -> Scenario:
     """Scenario with its files, refused if it has contradictions; see `check`."""
     scenario = _with_files(scenario, source, known)
-    _refuse_first(contradictions(scenario, known), source)
+    _refuse_first(contradictions(scenario, known, any_network=any_network), source)
     return scenario
 
 

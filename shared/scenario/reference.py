@@ -6,12 +6,14 @@ A reference is a function from time since the epoch [s; any shape] to the desire
 
 import io
 from collections.abc import Callable
+from contextlib import suppress
+from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, Indices
 
 FAR_M = 1e6
 """Largest coordinate of a trajectory [m]."""
@@ -252,42 +254,62 @@ def from_csv(content: bytes, axes: int) -> Reference:
     Raises:
         ValueError: the table is invalid; says what and in which line.
     """
-    data = read_table(content, ["t", "x", "y", "z"][: axes + 1])
+    data, lines = read_table(content, ["t", "x", "y", "z"][: axes + 1])
     if len(data) < 2:
         raise ValueError("expected at least two lines of finite numbers")
-    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
-        raise ValueError("column t must start at 0 and rise from line to line")
+    check_times(data[:, 0], lines)
     return timed_path(data[:, 0], data[:, 1:])
 
 
-def read_table(content: bytes, names: list[str]) -> Array:
-    """Named columns of a CSV table; shape (rows, columns).
+def check_times(times_s: Array, lines: Indices) -> None:
+    """Refuse times in a table that do not start at 0, or do not rise.
+
+    Raises:
+        ValueError: with the first such line.
+    """
+    if times_s[0] != 0.0:
+        raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
+    for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:
+        after, got = times_s[i : i + 2]
+        raise ValueError(f"line {lines[i + 1]}: expected t above {after:g}, got {got:g}")
+
+
+def read_table(content: bytes, names: list[str]) -> tuple[Array, Indices]:
+    """Named columns of a CSV table, shape (rows, columns), and the number of each row's line.
 
     Raises:
         ValueError: the table is invalid; says what and in which line.
     """
     import csv  # only needed for files
 
-    text = io.StringIO(content.decode("utf-8-sig"), newline="")
+    try:
+        text = io.StringIO(content.decode("utf-8-sig"), newline="")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"line {line}: expected text in UTF-8") from None
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
+    lines: list[int] = []
     try:
-        if len(table.fieldnames or ()) > COLUMNS_MAX:
+        table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
+        if len(header) > COLUMNS_MAX:
             raise ValueError(f"line 1: expected at most {COLUMNS_MAX} columns")
-        if any(name not in (table.fieldnames or ()) for name in names):
-            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
-        rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
+        if any(name not in header for name in names):
+            got = ", ".join(map(repr, header))[:80] or "nothing"
+            raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
+        for row in table:
+            rows.append(_numbers([row[name] for name in names], table.line_num))
+            lines.append(table.line_num)
     except csv.Error as error:
         raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    columns = np.array(rows).reshape(-1, len(names))
-    if not np.isfinite(columns).all():
-        raise ValueError("expected at least two lines of finite numbers")
-    return columns
+    return np.array(rows).reshape(-1, len(names)), np.array(lines, np.int64)
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:
-    """Numbers of one line of a table."""
-    try:
-        return [float(word) for word in words]  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise ValueError(f"line {line}: expected {len(words)} numbers") from None
+    """Finite numbers of one line of a table."""
+    with suppress(TypeError, ValueError):
+        numbers = [float(word) for word in words]  # type: ignore[arg-type]
+        if all(map(isfinite, numbers)):
+            return numbers
+    got = ", ".join(word or "nothing" for word in words)[:80]
+    raise ValueError(f"line {line}: expected {len(words)} finite numbers, got {got}")

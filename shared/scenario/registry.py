@@ -16,9 +16,10 @@ import keyword
 import math
 import re
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 
 import msgspec
@@ -41,7 +42,18 @@ FURTHER = {
 }
 """Other bounds, by their names in msgspec.Meta, and their words in messages."""
 
+UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {
+        "bytes_per_s": {"kbit": (1e3, 8.0), "mbit": (1e6, 8.0), "gbit": (1e9, 8.0)},
+        "per_s": {},
+        "_s": {"us": (1.0, 1e6), "ms": (1.0, 1e3), "s": (1.0, 1.0)},
+        "": {"%": (1.0, 100.0)},
+    }
+)
+"""Units that may stand behind a number, by the end of the parameter's name: multiplier, divisor."""
+
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
+_WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
 
 
 class File(NamedTuple):
@@ -86,6 +98,15 @@ class Parameter:
         except msgspec.ValidationError:
             return False
         return isinstance(value, str) or math.isfinite(value)
+
+    def without_unit(self, value: Value | None) -> Value | None:
+        """A number in the parameter's own unit, of one such as 50ms, 10% or 1mbit."""
+        found = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
+        units = next(units for end, units in UNITS.items() if self.name.endswith(end))
+        if found is None or found[2].lower() not in units:
+            return value
+        multiplier, divisor = units[found[2].lower()]
+        return float(found[1]) * multiplier / divisor
 
     @property
     def file(self) -> bool:
@@ -156,6 +177,7 @@ class Entry:
             *((each, named.get(each.name, each.default)) for each in self.parameters[: len(names)]),
             *((self.parameters[-1], value) for value in rest),
         ]
+        values = [(parameter, parameter.without_unit(value)) for parameter, value in values]
         if not all(value is not None and parameter.takes(value) for parameter, value in values):
             return None
         return tuple(msgspec.convert(value, parameter.type) for parameter, value in values)

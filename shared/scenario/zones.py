@@ -334,26 +334,24 @@ def _features(file: str, collection: Any) -> Iterator[Zone]:
     `radius_m` for a Point.
 
     Raises:
-        ValueError: the collection is invalid; says which feature and why.
+        ValueError: the collection is invalid, or too large.
+        GrammarError: a feature is invalid; says which and what was expected.
     """
     whole = isinstance(collection, dict) and collection.get("type") == "FeatureCollection"
     if not (whole and isinstance(collection.get("features"), list)):
         raise ValueError("a GeoJSON file with a FeatureCollection")
     placed, corners = _frame(collection), 0
     for i, feature in enumerate(collection["features"]):
-        name = f"{file}: feature {i + 1}"
         try:
             for zone in _feature(file, i, feature, placed):
                 yield zone
                 corners += len(zone.corners)
                 if corners > CORNERS_MAX:
                     return  # `geojson` raises
-        except (KeyError, TypeError, AttributeError, IndexError) as error:
-            raise ValueError(
-                f"{name} as RFC 7946 has it, {type(error).__name__}: {error}"
-            ) from None
-        except ValueError as error:
-            raise ValueError(f"{name} with {error}") from None
+        except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+            said = isinstance(error, ValueError)
+            expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
+            raise GrammarError(f"{file}: feature {i + 1}", expected) from None
 
 
 def _frame(collection: dict[str, Any]) -> Frame:
@@ -393,16 +391,22 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     properties, geometry = feature.get("properties") or {}, feature["geometry"]
     kind = None if geometry is None else geometry["type"]
     if kind not in ("Polygon", "MultiPolygon", "Point"):
-        raise ValueError(f"a Polygon, a MultiPolygon or a Point, got {kind}")
+        raise ValueError(f"a Polygon, a MultiPolygon or a Point with radius_m, not a {kind}")
     low = _number(properties.get("low_m", -math.inf), "low_m")
     high = _number(properties.get("high_m", math.inf), "high_m")
     if not low < high:
         raise ValueError(f"low_m below high_m, got {low:g} and {high:g}")
-    is_fence = {"keep_out": False, "fence": True}[properties.get("kind", "keep_out")]
+    role = properties.get("kind", "keep_out")
+    if role not in ("keep_out", "fence"):
+        raise ValueError(f"the property kind to be keep_out or fence, got {str(role)[:80]!r}")
+    is_fence = role == "fence"
     zone = Zone(f"{file}: {properties.get('name', f'feature {i + 1}')}", _NOWHERE, low, high)
     coordinates = geometry["coordinates"]
     if kind == "Point":
         ((x, y),) = placed([coordinates]).tolist()
+        if "radius_m" not in properties:
+            known = ", ".join(map(str, properties))[:80] or "no properties"
+            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
         radius = _number(properties["radius_m"], "radius_m")
         if not 0.0 < radius <= METRES_MAX:
             raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")
@@ -416,9 +420,12 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     for rings in parts:
         # A hole in a fence is a zone to keep out of. Other holes are ignored: they cannot be
         # entered.
+        if len(rings) > 1 and not is_fence:
+            zone = zone._replace(name=f"{zone.name}, with its holes")
         for number, points in enumerate(rings if is_fence else rings[:1]):
             corners = _ring(placed(points))
-            yield zone._replace(corners=corners, is_fence=is_fence and number == 0)
+            name = f"{zone.name}, hole {number}" if number else zone.name
+            yield zone._replace(name=name, corners=corners, is_fence=is_fence and number == 0)
 
 
 def _ring(places: Array) -> Array:

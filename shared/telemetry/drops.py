@@ -14,6 +14,7 @@ import msgspec
 class DirectionCounts(msgspec.Struct, frozen=True):
     """Packets that netem did not forward in one direction, see `netem.link.Counts`."""
 
+    undelivered: int = 0
     lost: int = 0
     oversized: int = 0
     overflowed: int = 0

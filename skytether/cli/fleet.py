@@ -143,9 +143,8 @@ def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over a network of its own.
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
-    process. The cost of the server's work is shown per vehicle and step. Every key of the scenario
-    is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows what was
-    flown.
+    process. The cost of the server's work is shown per vehicle and step. Ctrl-C ends the flight and
+    still shows what was flown.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)

@@ -88,8 +88,7 @@ class FlyOptions(ScenarioOptions):
 def fly(argv: Sequence[str]) -> None:
     """Fly a scenario: server, netem and client as processes on loopback, or in virtual time.
 
-    Every key of the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight
-    and still shows what was flown.
+    Ctrl-C ends the flight and still shows what was flown.
     """
     options = command.parse(FlyOptions(), argv, "skytether fly", fly.__doc__)
     scenario = options.config

@@ -4,15 +4,14 @@ The text of each key is its docstring in the source, as in `--help`; the unit is
 docstring's brackets.
 """
 
-import ast
 import inspect
 import re
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS
 from skytether.shared.scenario.schema import Scenario, Section
 
@@ -40,7 +39,7 @@ def document() -> str:
 
 def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
     """Tables of a section's keys, and of its nested sections."""
-    descriptions = sentences(section)
+    descriptions = meanings(section)
     rows: list[str] = []
     within: list[str] = []
     for field in msgspec.structs.fields(section):
@@ -113,17 +112,6 @@ def _number(value: float | None) -> str:
 def _toml(value: object) -> str:
     """Value in the form that TOML and JSON share."""
     return msgspec.json.encode(value).decode()
-
-
-def sentences(section: type[Section]) -> dict[str, str]:
-    """Docstring of each documented key of a section, in one line."""
-    (definition,) = ast.parse(inspect.getsource(section)).body
-    assert isinstance(definition, ast.ClassDef)
-    return {
-        ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
-        for key, text in pairwise(definition.body)
-        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
 
 
 if __name__ == "__main__":

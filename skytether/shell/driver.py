@@ -33,9 +33,11 @@ from skytether.shell.udp import (
     Names,
     admit_only,
     from_kernel,
+    heed_refusals,
     is_loopback,
     kernel_drops,
     open_socket,
+    refusals,
     within_reach_of,
 )
 
@@ -228,19 +230,23 @@ class Shell:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
-        stopwatch = self._stopwatch
+        stopwatch, is_refused = self._stopwatch, False
         try:
-            for count in range(BURST_MAX):  # noqa: B007 - used below
+            for count in range(BURST_MAX):
                 stopwatch.start()
                 try:
                     size, sender = receive(room)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
+                    is_refused |= count == 0  # for what else are we here
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
+                    is_refused = True
                     continue
                 stopwatch.lap("receive")
                 hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+            for reason in refusals(self._sockets[number]) if is_refused else ():
+                self.endpoint.undelivered(number, reason)
             if self._patience_ns:
                 self._count(number, count)
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
@@ -430,10 +436,12 @@ class Shell:
             sock = self._sockets.get(number)
             if sock is None:
                 sock = self._sockets[number] = open_socket(self._elsewhere)
+                heed_refusals(sock)
                 self._listen(number)
             sock.sendto(payload, self._names.kernel(peer))
-        except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
+        except OSError as error:  # buffer full, port closed, network down
             self.send_errors += 1
+            self.endpoint.undelivered(number, error.strerror or str(error))
 
     async def _keep_resolving(self) -> None:
         for (host, _), reason in self._names.missing.items():

@@ -122,6 +122,8 @@ refused netem_refused_packets_total
     UDP payload of the packets that entered.
 {direction}/forwarded netem_forwarded_packets_total
     Packets that left.
+{direction}/undelivered netem_undelivered_packets_total
+    Packets that could not be sent on, or were refused on their way.
 {direction}/lost netem_lost_packets_total
     Packets that the scenario's loss model dropped.
 {direction}/reordered netem_reordered_packets_total

@@ -164,7 +164,7 @@ def test_help_shows_the_scenario_that_was_named(
     name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as exit_:
-        main([name, "paper", "--help"])
+        main([name, "paper", "--help-keys"])
     assert exit_.value.code == 0
     said = " ".join(re.sub(r"[│\n]", " ", capfd.readouterr().out).split())
     assert f"usage: skytether {name}" in said

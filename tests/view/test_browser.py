@@ -195,7 +195,7 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
     browser: "sync_api.Browser", tmp_path: Path
 ) -> None:
     """Netem alone, with two sockets in place of a client and a server."""
-    netem = [sys.executable, "-P", "-m", "skytether", "netem", "--downlink", "constant(0.02)"]
+    netem = [sys.executable, "-P", "-m", "skytether", "netem", "--to-server", "constant(0.02)"]
     folder, client = tmp_path / "air", socket.socket(type=socket.SOCK_DGRAM)
     folder.mkdir()
     with client, socket.socket(type=socket.SOCK_DGRAM) as server:

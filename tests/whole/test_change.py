@@ -144,7 +144,7 @@ def test_the_trajectory_s_file_is_not_read_again(
     file.unlink()
     probe(scenario)[1].change(FORGOTTEN, now_ns=5)
     check = reading.check
-    monkeypatch.setattr(reading, "check", lambda raw, known: check(raw))  # noqa: ARG005
+    monkeypatch.setattr(reading, "check", lambda raw, **_: check(raw))
     with pytest.raises(ConfigError, match="a file that can be read"):
         probe(scenario)[1].change(FORGOTTEN, now_ns=5)
 
