@@ -91,8 +91,8 @@ ACTUAL: dict[tuple[str, Air], float] = {
     ("led, gain 0.3", WIND): 0.069,
 }
 """RMSE xy of ArduCopter 4.5.6 in its own simulator, over the same netem [m]."""
-BLOWS = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
-"""Keys of the vehicle in wind: 6 m/s, turbulent."""
+WINDY = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
+"""Keys of the vehicle for flights in a wind of 6 m/s with turbulence."""
 CUT_S, HEALED_S, WATCHED_S = 15.0, 20.0, 32.0
 """Times of flight at which the network is cut, at which it is restored, and until which the largest
 error is evaluated [s]."""
@@ -144,7 +144,7 @@ def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
     table = reading.to_table(reading.load("autopilot"))
     table["seed"] = cell.seed
     table["model"] |= MODELS[cell.flavour] if model is None else model
-    table["vehicle"] |= {"address": "udpout:autopilot:0", **(BLOWS if cell.air == WIND else {})}
+    table["vehicle"] |= {"address": "udpout:autopilot:0", **(WINDY if cell.air == WIND else {})}
     for name, keys in OURS.get(cell.contender, {}).items():
         table[name] |= keys
     return reading.check(table, "autopilot")

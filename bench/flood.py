@@ -88,7 +88,7 @@ class Flood:
     lost: int
     """Number of the sent observations that the server never handled."""
     share: float
-    """Share handled of the observations sent during the flood."""
+    """Share of the observations sent during the flood that the server handled."""
     missed: int
     """Number of ticks that the server missed during the flood."""
     rmse_m: float

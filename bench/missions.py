@@ -612,7 +612,7 @@ def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) 
 
 
 def published_table(options: PublishedOptions) -> TextTable:
-    """Fly all."""
+    """Fly every published task over every network; a table of the results."""
     kinds = list(product(TASKS, PUBLISHED_NETWORKS))
     cells = list(product(range(1, options.flights + 1), kinds))
     done = options.fly(partial(fly_published, options), cells)

@@ -343,7 +343,7 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
 
 
 def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
-    """Verdicts in the figures of `measure`."""
+    """Verdicts as objects, from the result of `measure`."""
     return [RestartVerdict(**each) for each in result["verdicts"]]
 
 

@@ -61,9 +61,11 @@ class Constants(NamedTuple):
     model: Model
     """Model of the terms, eq. (4)."""
     held: Array
-    """Columns of a horizon's table that are the same for all horizons; shape (axes, n)."""
+    """Parameters of flight along a horizon that do not depend on it, in the columns of
+    `shared.law.rule`; shape (axes, n)."""
     guide: Array
-    """Columns of a spline's table that are the same for all splines; shape (axes, n)."""
+    """Parameters of flight along a spline that do not depend on it, in the columns of
+    `shared.law.spline`; shape (axes, n)."""
 
     @classmethod
     def of(cls, terms: Terms, regulator: Array) -> Self:

@@ -181,7 +181,7 @@ def changed_columns(rng: Random, found: list[Any]) -> None:
 
 
 def changed_channel(rng: Random, found: list[Any]) -> None:
-    """Messages on another topic, or in another encoding."""
+    """Change the topic or the encoding of a channel, in place."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Channel)])
     if rng.random() < 0.5:
         topics = [e.topic for e in found if isinstance(e, Channel)]

@@ -138,7 +138,7 @@ class SharedBudget:
             self._bytes[row] = size
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the budget."""
+        """Rate [B/s], queueing delay, and how often vehicles had to wait, for the statistics."""
         return {
             "bytes_per_s": self.bytes_per_s,
             "queueing_ms": self._control.queueing_s * 1e3,

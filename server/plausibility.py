@@ -31,7 +31,7 @@ SLACK_NS = 50 * MILLISECOND_NS
 
 
 class Statement:
-    """Record: an observation without its state."""
+    """Numpy record: an observation without its state."""
 
     step: int
     """Step of the observation, or -1 if there is none."""
@@ -71,7 +71,8 @@ class HeardNumbers(NamedTuple):
     """Newest observations of the vehicles."""
 
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
-    """Observations at their three places; shape (3, capacity)."""
+    """Last accepted, last rejected and new observation of each vehicle, at the indices LAST,
+    DOUBTED and NEW; shape (3, capacity)."""
     states: F4
     """Positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
 

@@ -55,7 +55,7 @@ _HOMES = {
 """Names of the library, by the module that each comes from."""
 
 
-if not TYPE_CHECKING:  # or a type checker would take any name for one of ours
+if not TYPE_CHECKING:  # with it, type checkers would accept any name
 
     def __getattr__(name: str) -> Any:
         for module, names in _HOMES.items():

@@ -69,7 +69,7 @@ _STATION_ACTIONS = {
     3: "without our heartbeats it returns home the way it came, and lands",
     4: "without our heartbeats it returns home the way it came, or lands",
     5: "without our heartbeats it lands where it is",
-    6: "without our heartbeats it returns home or to a landing of its mission",
+    6: "without our heartbeats it returns home, or flies to a landing sequence of its mission",
     7: "without our heartbeats it brakes and hovers for ever",
 }
 _SILENCE_ACTIONS = {

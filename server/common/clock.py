@@ -74,7 +74,7 @@ NOTHING, CLOCK, ASYMMETRY, TIME_OF_DAY = map(int, Contradiction)
 
 
 class VehicleClock:
-    """Record: the clock of one vehicle."""
+    """Numpy record: the clock of one vehicle."""
 
     newest: int
     """Interval of its newest sample, counted from our clock's zero."""

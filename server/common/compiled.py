@@ -16,7 +16,7 @@ Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
 
 
 class AxisLaw(Axis):
-    """Record: model, bound and feedback of one axis. The fields of `Axis` come first."""
+    """Numpy record: model, bound and feedback of one axis. The fields of `Axis` come first."""
 
     bound: float
     """Bound u_max of the input [m/s]."""

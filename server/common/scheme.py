@@ -81,7 +81,7 @@ class Foresight(NamedTuple):
 
 
 class PlanFigures:
-    """Record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
+    """Numpy record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
 
     row: int
     """Row of the vehicle."""

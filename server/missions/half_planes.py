@@ -1,7 +1,7 @@
-"""Half-planes that keep a motion away from those of other vehicles.
+"""Half-planes that keep a vehicle's new motion away from the motions of other vehicles.
 
-Each is normal to the line from the nearest possible position of another vehicle at a time to the
-position of the motion in force at that time.
+At each sampled time the boundary is normal to the line from the nearest possible position of the
+other vehicle to the position on the motion that the vehicle flies now.
 """
 
 from typing import NamedTuple
@@ -33,9 +33,9 @@ class HalfPlanes(NamedTuple):
     time: I1
     """Index of the time; shape (n,)."""
     normal: F2
-    """Shape (n, axes)."""
+    """Unit vector away from the other vehicle; shape (n, axes)."""
     bound: F1
-    """Shape (n,) [m]."""
+    """Right-hand side of normal · p ≥ bound [m]; shape (n,)."""
     other: I1
     """Index of the motion to keep away from; shape (n,)."""
 

@@ -118,7 +118,8 @@ def comes_too_near(
     distance: float,
     scratch: F2,
 ) -> bool:
-    """Whether a planned motion comes too near to one possible motion; see `too_near`.
+    """Whether a planned motion comes too near to a possible motion of another vehicle; see
+    `too_near`.
 
     Args:
         planned, in_force, begin: see `too_near`.

@@ -1,4 +1,4 @@
-"""Appraisal of plans: where a plan starts, and its costs once it is solved."""
+"""Start of each plan before it is solved, and its costs afterwards."""
 
 from typing import NamedTuple
 

@@ -256,7 +256,7 @@ def set_inputs(inputs: Inputs, simd: SimdBatch, lane: int) -> None:
 
 @lanes
 def column(numbers: F2, lane: int, to: Inputs) -> None:
-    """Copy one vehicle's numbers, one per stage."""
+    """Copy the column of one vehicle, one value per stage."""
     for stage in range(len(to)):
         to[stage] = numbers[stage, lane]
 

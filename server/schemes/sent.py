@@ -35,7 +35,7 @@ FIRST_LOSS, LOSS_WEIGHT = 0.1, 0.05
 
 
 class Delivery:
-    """Record: delivery of the plans sent to a vehicle, as its observations report it."""
+    """Numpy record: delivery of the plans sent to a vehicle, as its observations report it."""
 
     in_force: int
     """Step that the plan in force at its newest observation was made for, or NO_HORIZON."""
@@ -54,7 +54,7 @@ class Delivery:
 
 
 class SentPlan:
-    """Record: a plan that was sent."""
+    """Numpy record: a plan that was sent."""
 
     step: int
     """Step that it was made for."""

@@ -17,7 +17,7 @@ from skytether.shared.wire.protocol import DISTURBANCE, REFERENCE_P, REFERENCE_V
 
 
 class Observations:
-    """Record: the two newest observations of a vehicle."""
+    """Numpy record: the two newest observations of a vehicle."""
 
     base_step: int
     """Step of the previous observation, or -1."""
@@ -30,7 +30,7 @@ class Observations:
 
 
 class ObservedAxis:
-    """Record: the two newest observations of a vehicle on one axis."""
+    """Numpy record: the two newest observations of a vehicle on one axis."""
 
     p: float
     """Position in the newest observation [m]."""
@@ -49,7 +49,7 @@ class ObservedAxis:
 
 
 class SentHorizon:
-    """Record: a horizon that was sent, without its inputs."""
+    """Numpy record: a horizon that was sent, without its inputs."""
 
     length: int
     """Number of inputs that are flown before they are too old."""
@@ -58,7 +58,7 @@ class SentHorizon:
 
 
 class ReferenceState:
-    """Record: reference state x̄ of a horizon on one axis.
+    """Numpy record: reference state x̄ of a horizon on one axis.
 
     It is advanced to the newest observation, as replays never start before that.
     """

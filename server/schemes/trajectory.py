@@ -91,7 +91,7 @@ follow = shared(spline.follow)
 
 
 class SentTrajectory:
-    """Record: a trajectory that was sent, without its knots."""
+    """Numpy record: a trajectory that was sent, without its knots."""
 
     ends: int
     """First step at which it is too old to be flown."""

@@ -355,7 +355,8 @@ class Growing:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size:
             self.file.close()
-            raise OSError(EINVAL, "it is no plain file, or has just been written", str(path))
+            what = "expected a regular file; or another process wrote to it while it was opened"
+            raise OSError(EINVAL, what, str(path))
 
     def end(self, *, empty: bool, whole: bool) -> None:
         """Close the file; if there is an older one, replace it, or stay beside it, or be removed.

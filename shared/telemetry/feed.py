@@ -38,7 +38,7 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
-    """Parts of the record that follow, by name: columns, as JSON of numpy's description."""
+    """Parts of the record in this feed, by name: their columns, as numpy's description in JSON."""
     wall_ns: int
     """Time of day corresponding to `time_ns` [ns since 1970]."""
     time_ns: int

@@ -259,9 +259,7 @@ class Recorder:
         self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
-        """Append `count` rows; a value holds for all of them, or is an array with the rows
-        first.
-        """
+        """Append `count` rows. Each value is one for all rows, or an array of them."""
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value

@@ -143,7 +143,7 @@ class Mode(IntEnum):
     COAST = 4
     """Flies on along a horizon without a newer one."""
     BRAKE = 5
-    """Brakes from its last input."""
+    """Brakes to a stop, beginning at its last input."""
     HOVER = 6
     """Stands still."""
     LAND = 7
@@ -181,7 +181,7 @@ class Observation(NamedTuple):
     mode: int
     """Mode of the vehicle, one of `Mode`."""
     takes: int
-    """1 if a horizon that arrives now would be flown, else 0."""
+    """1 if the vehicle would use a plan that arrives now, else 0."""
     state: Array
     """Position [m] and velocity [m/s]; shape (axes, 2). Sent as float32."""
     input: Array

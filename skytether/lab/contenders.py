@@ -321,7 +321,7 @@ QUICK = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected
 
 
 def quick(scale: ComparisonSize) -> ComparisonSize:
-    """Size of a first look, at most as large as requested."""
+    """Reduced size for a quick trial run, at most as large as requested."""
     few = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
     return ComparisonSize(
         runs=min(scale.runs, 3),

@@ -169,8 +169,8 @@ class Baselines:
     """Baselines beside the contenders of a case."""
 
     floor: Sequence[Floor] = ()
-    """Points of the floor: for all contenders if only the server sees the target; in wind, for
-    those without feedback aboard."""
+    """Lower bound of the RMSE at several packet rates: for all contenders if only the server sees
+    the target; in wind, for those without feedback aboard."""
     aboard: Sequence[Summary] = ()
     """Flights with the reference aboard, and no packets; none if only the server knows the
     reference."""

@@ -308,7 +308,7 @@ class TableEntry(msgspec.Struct, frozen=True):
     paper: float | None
     """Paper's figure; None if it has none."""
     here: float | None
-    """Mean of the flights; None if none succeeded."""
+    """Reproduced figure: mean of the flights; None if no flight succeeded."""
     ci95: float | None
     """Half-width of the 95 % interval of `here`."""
     deviation: float | None

@@ -365,7 +365,7 @@ class Torture:
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:
-        """Start a new life on a host."""
+        """Restart the process of a host."""
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         if name == SERVER[0]:
             self.world.restart(name, self._new_server())

@@ -42,7 +42,7 @@ PROBES_MAX = 1_000_000
 TRAIN = 16
 """Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
-"""Number of probes that a train replaces."""
+"""Number of regular probe slots that a train takes: twice its number of packets."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 """Shortest time [ns], and smallest number of probes, from one train to the next."""
 HELLO_BYTES = 64

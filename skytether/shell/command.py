@@ -42,7 +42,7 @@ from skytether.shell.udp import (
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
 """Exit codes: 2 the request is impossible, 1 something failed on the way, 130 ended by Ctrl-C."""
 OUTPUTS = ("json", "figure", "record")
-"""Options of all commands that name a file to write."""
+"""Options that name an output file, in any command."""
 
 ScenarioName = Annotated[str, Argument(metavar="SCENARIO", positional=True)]
 ScenarioFlags = Annotated[Scenario, Argument(name="")]

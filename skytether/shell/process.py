@@ -344,8 +344,8 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
 
 @contextmanager
 def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Feed | None]:
-    """Open a feed for as long as the block takes; None where no reader and no recording is asked
-    for. A recording (.mcap) is written from the feed by another process.
+    """Open a feed for the duration of the block; None if neither a feed nor a recording is
+    requested. A recording (.mcap) is written from the feed by another process.
 
     Raises:
         CommandError: the socket cannot be made, or the recording is incomplete at the end.

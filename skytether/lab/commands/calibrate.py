@@ -48,7 +48,8 @@ class CalibrateOptions:
     changes weights and plant, and rmse the weights (except the position's, as only ratios matter)
     and the keys of scheme and trigger."""
     runs: int = 10
-    """Number of flights of each point (for table1 in each column), with seeds from --seed on."""
+    """Number of flights of each point, or with the objective table1 of each column of each point;
+    seeds count up from --seed."""
     generations: int = 40
     """Number of generations; a search in OUT continues up to this number."""
     population: int = 10

@@ -72,7 +72,8 @@ class IdentifyOptions:
     """Time after each step [s]; unless given, four time constants of the scenario's model, but 3 to
     6 s."""
     repeats: int = 3
-    """Number of repetitions on each axis, of four steps: out, back, out to the other side, back."""
+    """Number of repetitions on each axis. Each is four steps: out, back, out to the other side,
+    back."""
     set_parameters: bool = False
     """Set the autopilot's parameters for the case that set-points stop, where their values are
     unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
