@@ -10,6 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from skytether.figures.colours import GREY, PALETTE, RED, Rgb
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
@@ -101,7 +102,7 @@ def _desired(scenario: Scenario) -> Array:
         return np.array([middle - corner, middle + corner])
     try:
         reference = scenario.unallocated_reference()
-    except (OSError, ValueError):  # the trajectory's table is on another machine
+    except (ConfigError, ValueError):  # the trajectory's table is on another machine
         return np.zeros((2, axes))
     if isinstance(reference, Mission):
         return reference.places

@@ -415,6 +415,8 @@ class State:
             scenario = msgspec.convert(toml.loads(opened.scenario), Scenario)
         except ValueError as error:
             raise FeedError(f"got no scenario: {error}") from None
+        with suppress(ConfigError):  # a file that it names is on another machine
+            scenario = reading.check(reading.to_table(scenario))
         if known and process == "client":
             self._begin()  # another flight
         if process == "client" or not self.name:

@@ -137,6 +137,19 @@ def test_a_flight_longer_than_the_servers_scenario_is_as_long_as_the_clients() -
     assert state.duration_s == 60.0
 
 
+@pytest.mark.parametrize("is_here", [True, False])
+def test_a_mission_whose_table_is_on_another_machine_is_shown(is_here: bool) -> None:
+    """Where the table is here, the map shows all of its places."""
+    mission = reading.load("warehouse")
+    if not is_here:
+        away = msgspec.structs.replace(mission.reference, file="/nowhere/warehouse.csv")
+        mission = msgspec.structs.replace(mission, reference=away)
+    state = State()
+    state.take("client", opened("client", {}, mission))
+    assert state.name
+    assert (scene.extent([state.scenario])[1] > 1.0) == is_here
+
+
 def test_the_error_is_that_of_the_record() -> None:
     shown = demo()
     away = (
