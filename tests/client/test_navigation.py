@@ -122,6 +122,12 @@ def test_a_sensor_without_imperfection_needs_no_filter() -> None:
     assert summarise(scenario(), "demo", flight.client).estimate_error_m is None
 
 
+def test_a_delay_counts_whole_steps_rounded_up() -> None:
+    step_s = DT_NS / SECOND_NS
+    delays = [sensing(scenario(sensor={"delay_s": n * step_s})).delay for n in (0.0, 0.1, 1.0, 1.1)]
+    assert delays == [0, 1, 1, 2]
+
+
 def test_noise_and_bias_are_those_that_were_asked_for() -> None:
     bias = {"position_bias_m": [0.3, -0.1], "velocity_bias_mps": [0.0, 0.2]}
     sensor = Sensor(scenario(sensor=NOISE | bias), np.random.default_rng(1))
