@@ -264,6 +264,32 @@ def test_braking_ends_after_its_longest_time(short_ns: int, mode: Mode) -> None:
     assert guard.mode is mode
 
 
+@pytest.mark.parametrize(("over_ns", "mode"), [(0, Mode.BRAKE), (1, Mode.TRACK)])
+def test_malformed_messages_count_within_window_ns(over_ns: int, mode: Mode) -> None:
+    guard = tracking_alone(SECOND_NS)
+    for at_ns in (0, 1, 2, 3, failsafe.WINDOW_NS + over_ns):
+        guard.malformed(now_ns=SECOND_NS + at_ns)
+    assert guard.mode is mode
+
+
+def test_a_vehicle_that_waits_in_another_mode_has_waited_since_the_first() -> None:
+    guard = aboard(timeout=1.0, land_after=1.0)
+    guard.heard(now_ns=SECOND_NS)
+    for cause in (Reason.OPENED, Reason.GOOD):
+        guard.meet(cause, now_ns=SECOND_NS)
+    for now_ns in (SECOND_NS, 2 * SECOND_NS + 500 * MILLISECOND_NS):
+        guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
+    assert guard.mode is Mode.LAND
+
+
+def test_a_leap_stops_no_vehicle_that_holds() -> None:
+    times_ns = {"timeout_ns": SECOND_NS, "brake_ns": SECOND_NS, "land_after_ns": SECOND_NS}
+    guard = Failsafe(HOLD, armed=True, changed=lambda *_: None, **times_ns)
+    guard.meet(Reason.OPENED, now_ns=0)
+    guard.leapt(now_ns=0)
+    assert guard.takes
+
+
 class Challenged(PlainLink):
     """A link whose handshake answers each datagram with another."""
 

@@ -631,6 +631,12 @@ def hello(vehicle: int, boot_id: int) -> Hello:
     return Hello(vehicle, boot_id, scenario().terms())
 
 
+def test_numbers_of_sessions_take_as_many_bytes_whatever_the_entropy() -> None:
+    ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
+    sessions = Sessions(1, bytes, SILENCE_NS, ear)
+    assert sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS).number == 2**31
+
+
 def test_a_session_ends_once_its_vehicle_has_been_silent_for_longer_than_session_ns() -> None:
     sessions, session = with_session()
     assert sessions.expire(DAY_NS + SESSION_NS) == []
