@@ -290,6 +290,12 @@ def test_a_leap_stops_no_vehicle_that_holds() -> None:
     assert guard.takes
 
 
+def test_rounding_of_a_speed_is_not_clamped() -> None:
+    wanted = [1.0 + 5e-10]
+    flown = clamped(wanted, [1.0], [2.0], np.inf, without_feedback=wanted, speed_max=1.0)
+    assert flown == wanted
+
+
 class Challenged(PlainLink):
     """A link whose handshake answers each datagram with another."""
 

@@ -29,6 +29,7 @@ from skytether.shared.core.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    StateDoubted,
     Unauthenticated,
 )
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
@@ -614,6 +615,14 @@ def test_a_time_of_day_that_was_under_way_for_2_s_narrows_a_clock_by_2_ms_less()
         bounds_ms.append(vehicles.server.figures()["by_vehicle"]["1"]["clock_bound_ms"])
     assert bounds_ms[0] < 2.0
     assert bounds_ms[1] - bounds_ms[0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_each_series_of_impossible_states_is_reported_once() -> None:
+    vehicles, welcome = live()
+    for step, x in enumerate((1.0, 90.0, 90.0, 1.0, 90.0), start=1):
+        vehicles.observe(welcome, step, ((x, 0.0), (0.0, 0.0)))
+    events = vehicles.server.events()
+    assert sum(isinstance(event, StateDoubted) for event in events) == 2
 
 
 def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
