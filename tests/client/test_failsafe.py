@@ -20,7 +20,7 @@ from skytether.client import failsafe
 from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
-from skytether.client.link import PlainLink
+from skytether.client.link import AGAIN_NS, PlainLink
 from skytether.client.session import SLEPT_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.chance import stream
@@ -229,6 +229,91 @@ def test_a_link_is_good_with_gaps_up_to_two_thirds_of_the_time_out(gap_ns: int, 
         guard.heard(now_ns=now_ns)
     guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
     assert guard.mode is mode
+
+
+def tracking_alone(now_ns: int) -> Failsafe:
+    """A failsafe by itself that has just heard its server and accepted a horizon."""
+    guard = aboard(timeout=1.0, brake=0.5)
+    guard.heard(now_ns=now_ns)
+    for cause in (Reason.OPENED, Reason.GOOD):
+        guard.meet(cause, now_ns=now_ns)
+    guard.horizon_taken(now_ns=now_ns)
+    return guard
+
+
+@pytest.mark.parametrize(("over_ns", "mode"), [(0, Mode.TRACK), (1, Mode.BRAKE)])
+def test_a_step_that_is_late_by_more_than_stall_ns_brakes(over_ns: int, mode: Mode) -> None:
+    guard = tracking_alone(SECOND_NS)
+    guard.step(late_ns=failsafe.STALL_NS + over_ns, hindrance=None, now_ns=SECOND_NS)
+    assert guard.mode is mode
+
+
+@pytest.mark.parametrize(("over_ns", "mode"), [(0, Mode.TRACK), (1, Mode.COAST)])
+def test_a_horizon_is_old_after_more_than_the_time_out(over_ns: int, mode: Mode) -> None:
+    guard, now_ns = tracking_alone(SECOND_NS), 2 * SECOND_NS + over_ns
+    guard.heard(now_ns=now_ns)
+    guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
+    assert guard.mode is mode
+
+
+@pytest.mark.parametrize(("short_ns", "mode"), [(1, Mode.BRAKE), (0, Mode.HOVER)])
+def test_braking_ends_after_its_longest_time(short_ns: int, mode: Mode) -> None:
+    guard, now_ns = tracking_alone(SECOND_NS), SECOND_NS + 500 * MILLISECOND_NS - short_ns
+    guard.meet(Reason.ENDED, now_ns=SECOND_NS)
+    guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
+    assert guard.mode is mode
+
+
+@pytest.mark.parametrize(("over_ns", "mode"), [(0, Mode.BRAKE), (1, Mode.TRACK)])
+def test_malformed_messages_count_within_window_ns(over_ns: int, mode: Mode) -> None:
+    guard = tracking_alone(SECOND_NS)
+    for at_ns in (0, 1, 2, 3, failsafe.WINDOW_NS + over_ns):
+        guard.malformed(now_ns=SECOND_NS + at_ns)
+    assert guard.mode is mode
+
+
+def test_a_vehicle_that_waits_in_another_mode_has_waited_since_the_first() -> None:
+    guard = aboard(timeout=1.0, land_after=1.0)
+    guard.heard(now_ns=SECOND_NS)
+    for cause in (Reason.OPENED, Reason.GOOD):
+        guard.meet(cause, now_ns=SECOND_NS)
+    for now_ns in (SECOND_NS, 2 * SECOND_NS + 500 * MILLISECOND_NS):
+        guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
+    assert guard.mode is Mode.LAND
+
+
+def test_a_leap_stops_no_vehicle_that_holds() -> None:
+    times_ns = {"timeout_ns": SECOND_NS, "brake_ns": SECOND_NS, "land_after_ns": SECOND_NS}
+    guard = Failsafe(HOLD, armed=True, changed=lambda *_: None, **times_ns)
+    guard.meet(Reason.OPENED, now_ns=0)
+    guard.leapt(now_ns=0)
+    assert guard.takes
+
+
+def test_rounding_of_a_speed_is_not_clamped() -> None:
+    wanted = [1.0 + 5e-10]
+    flown = clamped(wanted, [1.0], [2.0], np.inf, without_feedback=wanted, speed_max=1.0)
+    assert flown == wanted
+
+
+class Challenged(PlainLink):
+    """A link whose handshake answers each datagram with another."""
+
+    def open(self, datagram: bytes, *, now_ns: int) -> None:  # type: ignore[override]
+        """Nothing for the session."""
+
+    def outbox(self) -> list[bytes]:
+        """The answer, which carries the HELLO."""
+        return [b"answer"]
+
+
+def test_no_hello_is_due_for_a_while_after_the_answer_to_a_challenge() -> None:
+    hand = ByHand(scenario(), link=Challenged())
+    hand.wake()
+    hand.now_ns += 900 * MILLISECOND_NS
+    hand.client.receive(Datagram(b"challenge", SERVER), now_ns=hand.now_ns)
+    assert [each.payload for each in hand.client.outbox()] == [b"answer"]
+    assert hand.client.next_wake_ns() == hand.now_ns + AGAIN_NS
 
 
 def test_a_link_that_stutters_is_not_good() -> None:

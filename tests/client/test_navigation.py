@@ -14,7 +14,7 @@ from by_hand import ByHand
 from helpers import packaged
 from skytether.client import filter as aboard
 from skytether.client.filter import Kalman
-from skytether.client.navigation import CARRIED_NS, Navigation, sensing
+from skytether.client.navigation import CARRIED_NS, Leaps, Navigation, sensing
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import simulated
@@ -120,6 +120,20 @@ def test_a_sensor_without_imperfection_needs_no_filter() -> None:
     for column in ("measured", "estimate"):
         np.testing.assert_array_equal(flight.client[column], flight.client["state"])
     assert summarise(scenario(), "demo", flight.client).estimate_error_m is None
+
+
+def test_a_position_without_a_velocity_leaps_too() -> None:
+    leaps = Leaps(scenario())
+    first = Measurement(0, [0.0, 0.0], [0.0, 0.0])
+    assert not leaps.leaps(first, first.numbers())
+    later = Measurement(DT_NS, [0.0, 9.0], None)
+    assert leaps.leaps(later, later.numbers())
+
+
+def test_a_delay_counts_whole_steps_rounded_up() -> None:
+    step_s = DT_NS / SECOND_NS
+    delays = [sensing(scenario(sensor={"delay_s": n * step_s})).delay for n in (0.0, 0.1, 1.0, 1.1)]
+    assert delays == [0, 1, 1, 2]
 
 
 def test_noise_and_bias_are_those_that_were_asked_for() -> None:

@@ -29,6 +29,7 @@ from skytether.shared.core.events import (
     SessionEnded,
     SessionOpened,
     SessionRefused,
+    StateDoubted,
     Unauthenticated,
 )
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
@@ -616,6 +617,14 @@ def test_a_time_of_day_that_was_under_way_for_2_s_narrows_a_clock_by_2_ms_less()
     assert bounds_ms[1] - bounds_ms[0] == pytest.approx(2.0, abs=0.1)
 
 
+def test_each_series_of_impossible_states_is_reported_once() -> None:
+    vehicles, welcome = live()
+    for step, x in enumerate((1.0, 90.0, 90.0, 1.0, 90.0), start=1):
+        vehicles.observe(welcome, step, ((x, 0.0), (0.0, 0.0)))
+    events = vehicles.server.events()
+    assert sum(isinstance(event, StateDoubted) for event in events) == 2
+
+
 def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
     """Sessions, of which that of vehicle 1 was opened by run 5 of its client at DAY_NS."""
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
@@ -629,6 +638,12 @@ def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
 
 def hello(vehicle: int, boot_id: int) -> Hello:
     return Hello(vehicle, boot_id, scenario().terms())
+
+
+def test_numbers_of_sessions_take_as_many_bytes_whatever_the_entropy() -> None:
+    ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
+    sessions = Sessions(1, bytes, SILENCE_NS, ear)
+    assert sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS).number == 2**31
 
 
 def test_a_session_ends_once_its_vehicle_has_been_silent_for_longer_than_session_ns() -> None:
