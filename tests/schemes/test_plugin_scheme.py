@@ -119,7 +119,7 @@ def test_the_documented_scheme_flies_with_the_documented_command(
         assert main(["schemes", "--plugin", "chase.py"]) == 0
     said = capsys.readouterr().out
     assert "RMSE x, y, xy" in said
-    assert "chase or chase(gain) with gain\n    Sends inputs that follow" in said
+    assert "chase(gain=0.8)\n    Sends inputs that follow" in said
 
 
 def test_the_documented_scheme_follows_the_reference(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_a_scheme_calls_no_kernels_of_ours_but_those_that_send(tmp_path: Path) -
     ("written", "expected"),
     [
         ("chose", "'committed' or 'predictive' or 'trajectory' or 'none' or 'chase'"),
-        ("chase(1, 2)", "chase or chase(gain) with gain"),
+        ("chase(1, 2)", "chase(gain=0.8)"),
         ("chase()", "a scheme such as 'trajectory', or 'name(1.5)'"),
     ],
 )
