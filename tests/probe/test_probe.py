@@ -39,8 +39,8 @@ from skytether.probe.wire import (
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
@@ -239,11 +239,10 @@ def measure(
     uplink: str, downlink: str, *, seconds: float, clock: Clock = CLOCK
 ) -> tuple[MeasuredPath, Rows]:
     """Measure a netem network in virtual time, 20 packets a second; with netem's rows."""
-    network = NetworkConfig(uplink=uplink, downlink=downlink)
     sink, world = BytesIO(), World()
     listener = world.add("listener", Listener(PlainGate(), b"secret" * 5), clock=clock)
     recorder = Recorder(PACKET_COLUMNS, sink)
-    scenario = Scenario(network=network)
+    scenario = reading.check({"network": {"uplink": uplink, "downlink": downlink}})
     netem = world.add("netem", Proxy(scenario, server=listener, recorder=recorder))
     prober = Prober(
         PlainLink(),
