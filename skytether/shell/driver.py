@@ -245,8 +245,12 @@ class Shell:
                     continue
                 stopwatch.lap("receive")
                 hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
-            for reason in refusals(self._sockets[number]) if is_refused else ():
-                self.endpoint.undelivered(number, reason)
+            if is_refused:
+                for reason in refusals(self._sockets[number]):
+                    self.endpoint.undelivered(number, reason)
+                if number not in self._crowded:  # libuv stops to watch a socket that has an error
+                    self._loop.remove_reader(self._sockets[number])
+                    self._listen(number)
             if self._patience_ns:
                 self._count(number, count)
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on

@@ -290,7 +290,7 @@ def test_without_pandas_it_says_what_to_install(
     flown: skytether.Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'$"):
+    with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'"):
         flown.to_pandas()
     with pytest.raises(ImportError, match=r"'skytether\[pandas\]'$"):
         skytether.table([flown])

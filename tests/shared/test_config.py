@@ -588,11 +588,11 @@ def test_a_trajectory_is_looked_for_beside_the_scenario_that_names_it(tmp_path: 
         ),
         (
             "t,x,y\n1,1,2\n2,3,4\n",
-            "a table of the trajectory (column t",
+            "a table of the trajectory (line ",
         ),
         (
             "t,x,y\n0,1,2\n0,3,4\n",
-            "a table of the trajectory (column t",
+            "a table of the trajectory (line ",
         ),
     ],
 )

@@ -165,8 +165,15 @@ async def test_packets_to_a_closed_port_are_not_forwarded_and_told_once(
         async with asyncio.timeout(10):
             while counts.undelivered < 20:
                 await asyncio.sleep(0.01)
+            with socket.socket(family, socket.SOCK_DGRAM) as back:
+                back.setblocking(False)
+                back.bind((host, port))
+                await loop.sock_sendto(client, b"again", driver.address)
+                payload, flow = await loop.sock_recvfrom(back, 100)
+                await loop.sock_sendto(back, payload, flow)
+                assert await loop.sock_recv(client, 100) == b"again"
     task.cancel()
-    assert (counts.packets, counts.forwarded, counts.undelivered) == (20, 0, 20)
+    assert (counts.packets, counts.forwarded, counts.undelivered) == (21, 1, 20)
     told = [event for event in events if isinstance(event, Unreachable)]
     assert told == [Unreachable(host=host, port=port, reason="Connection refused")]
 
