@@ -21,16 +21,15 @@ INSTALL = install() { \
 # Tests start hundreds of processes; none shall compile anew what another has.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Kernels are compiled once, the server's beside the laboratory's, and so are the tests, whose asserts
-# pytest rewrites: not by each of its workers.
-LOAD = from skytether.shared.base import kernel; kernel.load()
-KERNELS = $(BIN)/python -c "import skytether.sim.flight, skytether.quadrotor.loops; $(LOAD)" & \
-	$(BIN)/pytest --collect-only -qq >/dev/null & \
-	$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"; wait
+# pytest compiles kernels before its first test, and rewrites the tests' asserts: not by each of its workers.
+KERNELS = $(BIN)/pytest --collect-only -qq >/dev/null
 
-.PHONY: setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench figures fuzz clean
+.PHONY: help setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench figures fuzz clean
 
-setup: $(STAMP)  ## the environment alone
+help:  ## what can be made
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+
+setup: $(STAMP)  ## make the environment alone
 
 $(UV): locks/setup.lock
 	$(PYTHON) -m venv .venv
@@ -47,7 +46,8 @@ $(STAMP): $(FLY) locks/dev.lock
 	touch $@
 
 demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play with
-	$(BIN)/skytether fly demo --duration 180 --beside demo-no-compensation --figure demo.png
+	$(BIN)/skytether fly demo --duration 180 --figure demo.png \
+		--beside demo-paper --beside demo-no-compensation
 	@echo "The flight is drawn in demo.png."
 
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
@@ -67,7 +67,7 @@ check: setup  ## style, types, and who imports whom
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: setup  ## as `check` wants it
+format: setup  ## format the code as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
@@ -86,7 +86,6 @@ docker-test: setup  ## the three containers, and what they survive; needs a Dock
 	$(BIN)/pytest -q -rs -m docker
 
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
-	@$(BIN)/python -c "import skytether.server.__main__; $(LOAD)"
 	$(BIN)/pytest -q -rs -m browser
 
 autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs
@@ -125,5 +124,5 @@ lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, w
 			-o locks/$$need.lock || exit; \
 	done
 
-clean:
+clean:  ## remove the environment and what was built
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

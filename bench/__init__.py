@@ -1,1 +1,1 @@
-"""Benchmarks: costs of Skytether, measured beside those of other programs in the same run."""
+"""Benchmarks of Skytether, measured side by side with other programs in the same run."""

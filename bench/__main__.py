@@ -1,4 +1,4 @@
-"""Every benchmark, one after the other; the figures go into results.json and docs/.
+"""Runs all benchmarks, one after the other; writes the figures to results.json and docs/.
 
 With --only, the figures of the other benchmarks are kept.
 """
@@ -61,7 +61,7 @@ class BenchmarkOptions:
     only: tuple[Section, ...] = tuple(SECTIONS)
     """Benchmarks to run."""
     quick: bool = False
-    """Measure all of them in two minutes, and write nothing."""
+    """Run all benchmarks in two minutes with few repetitions, and write nothing."""
 
 
 def main() -> int:
@@ -107,7 +107,7 @@ def write(
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
-    """Sections that were measured alike, and how late a sleeping process woke meanwhile."""
+    """Table of machine, commit and date of each group of sections, and the lateness of sleeps."""
     alike: dict[tuple[str, ...], list[Section]] = {}
     for name, figures in results.items():
         on = figures["machine"]
@@ -123,7 +123,7 @@ def machines(results: Mapping[Section, Any]) -> TextTable:
 
 
 def packages(results: Mapping[Section, Any]) -> TextTable:
-    """Versions of the solvers' packages; empty where no solvers were measured."""
+    """Table of the versions of the solvers' packages; empty if no solvers were measured."""
     versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
     return TextTable(["package", "version"], [list(pair) for pair in versions.items()])
 

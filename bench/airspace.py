@@ -1,7 +1,7 @@
-"""Vehicles that fly the server's plans without a network, to measure the server's work alone.
+"""Vehicles that fly the server's plans without a network, to measure only the server's work.
 
-Observations arrive some steps late, as over the paper's network, so that the estimator has as much
-work as there. The vehicles are spread along the reference and flown by the model, with noise.
+Observations arrive some steps late, as over the paper's network, so that the estimator has the same
+work. The vehicles are spread along the reference and simulated by the model, with noise.
 """
 
 from collections import deque
@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import foresight
+from skytether.server.common.scheme import empty_foresight
 from skytether.server.controller import BLOCK
 from skytether.server.endpoint import Server
 from skytether.server.mpc.hierarchical import Planner
@@ -68,7 +68,7 @@ class Vehicles:
 
 
 class PlannedFleet:
-    """Planner with vehicles whose states it knows, planned in blocks as in a server.
+    """Planner that knows the states of its vehicles, and plans in blocks as the server does.
 
     Args:
         scenario: scenario that they fly.
@@ -79,7 +79,7 @@ class PlannedFleet:
         terms = scenario.terms()
         desired = Desired(scenario, terms, count, BLOCK)
         self._planner = Planner(scenario.control, terms, desired, count, BLOCK, Stopwatch())
-        self._found = foresight(BLOCK, terms.axes, terms.horizon, committed_max(terms))
+        self._found = empty_foresight(BLOCK, terms.axes, terms.horizon, committed_max(terms))
         self._vehicles = Vehicles(scenario, count)
         self._blocks = [
             np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)
@@ -167,7 +167,7 @@ class Airspace:
         """Fly the previous step, and give the server an observation of every vehicle."""
         sent = len(self.server.outbox())
         if sent:
-            assert sent == len(self._sessions), "a vehicle was sent no horizon"
+            assert sent == len(self._sessions), "no horizon was sent to some vehicle"
             scheme = self.server.controller.scheme
             assert isinstance(scheme, HorizonScheme), "a trajectory is no plan"
             planned = scheme.planner.inputs

@@ -1,9 +1,9 @@
 """Flights of an autopilot over a bad network, by Skytether and by set-points alone.
 
-`python -m bench.autopilots` flies a figure eight over the paper's network with
-both of the scripted autopilot's flavours, in calm air and in wind, in virtual time: Skytether with
-`vehicle.kind = "mavlink"`, and set-points sent straight by each of the laws of `station.laws`. All
-meet the networks and winds of the same seeds, counted from each one's start. Each flight is
+`python -m bench.autopilots` flies a figure eight over the paper's network with both flavours of the
+scripted autopilot, in calm air and in wind, in virtual time. The contenders are Skytether with
+`vehicle.kind = "mavlink"`, and set-points sent directly by each of the laws of `station.laws`. All
+fly with the same seeds of network and wind, counted from each flight's start. Each flight is
 repeated with the network cut for a while.
 """
 
@@ -58,14 +58,14 @@ OURS: dict[str, dict[str, dict[str, Any]]] = {
         "link": {"heartbeat_s": 0.1, "timeout_s": 8.0, "age_max_s": 12.0},
     },
 }
-"""Contenders that are Skytether, with the keys that differ from the scenario, which sends the
-desired trajectory. The others send inputs. The patient one flies its plan to the end, 8 s, however
-long the server is silent; the first two brake after two seconds and after one."""
+"""Contenders with Skytether, and the keys that differ from the scenario. The scenario sends the
+desired trajectory; the other contenders send inputs. "patient" flies its plan to the end, 8 s, even
+if the server is silent; the first two brake after two seconds and after one."""
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
-"""Leads [s] of `targets` and `led`, fitted by hand in calm air: for ArduCopter to a real one, for
-PX4 to the simulated one."""
+"""Leads of the laws `targets` and `led` [s], tuned by hand in calm air: with a real ArduCopter, and
+with the simulated PX4."""
 MODELS: dict[FlavourName, dict[str, Any]] = {
     "ardupilot": {},
     "px4": {
@@ -74,8 +74,8 @@ MODELS: dict[FlavourName, dict[str, Any]] = {
         "dead_time_s": [0.13, 0.13, 0.04],
     },
 }
-"""Keys of the model as measured by steps of 1 m/s, where they differ from the scenario: nothing of
-Skytether is tuned to these flights."""
+"""Keys of the model identified with steps of 1 m/s, if they differ from the scenario. Skytether is
+not tuned to these flights."""
 SAFE: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
     "px4": {"COM_OBL_RC_ACT": 4},
@@ -94,8 +94,8 @@ ACTUAL: dict[tuple[str, Air], float] = {
 BLOWS = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
 """Keys of the vehicle in wind: 6 m/s, turbulent."""
 CUT_S, HEALED_S, WATCHED_S = 15.0, 20.0, 32.0
-"""Times of flight at which the network is cut and restored, and until which the largest error is
-sought [s]."""
+"""Times of flight at which the network is cut, at which it is restored, and until which the largest
+error is evaluated [s]."""
 
 
 class Cell(NamedTuple):
@@ -172,7 +172,7 @@ def fly(
 def autopilot_of(
     scenario: Scenario, flavour: FlavourName, faults: Sequence[ScriptedFault] = ()
 ) -> tuple[Autopilot, io.BytesIO]:
-    """Autopilot that may be flown, and its true states: rows of TRUTH_COLUMNS."""
+    """Autopilot that is ready to fly, and the array for its true states: rows of TRUTH_COLUMNS."""
     truth = io.BytesIO()
     recorder = Recorder(TRUTH_COLUMNS, truth)
     autopilot = Autopilot(
@@ -268,7 +268,7 @@ def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
 
 
 def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
-    """Row of a contender: means over its flights; of a cut the largest error, and who ended."""
+    """Row of a contender: means over its flights; for the cut, the largest error and failures."""
     errors = [each.whole.rmse_xy or np.nan for each in flights]
 
     def a_second(key: str) -> float:

@@ -1,4 +1,4 @@
-"""Processes of a flight as children: started, listened to, killed and stopped; a stack ends all."""
+"""Processes of a flight as child processes, which can be killed, stopped and listened to."""
 
 import contextlib
 import os
@@ -75,7 +75,7 @@ class ChildProcess:
         with self._heard:
             if not self._heard.wait_for(lambda: len(self.all(kind)) >= count, PATIENCE_S):
                 said = [*self.words, *(str(line.event) for line in self.lines)][-3:]
-                raise TimeoutError(f"{self.name} says no {kind.__name__}, but {said}")
+                raise TimeoutError(f"{self.name}: no event {kind.__name__}; its output: {said}")
             return self.all(kind)[count - 1]
 
     def all(self, kind: type[Event]) -> list[LogLine]:
@@ -112,7 +112,7 @@ class ChildProcess:
         return killed_ns
 
     def stop(self) -> int:
-        """Stop the process in order; returns its exit code."""
+        """Stop the process by SIGINT; returns its exit code."""
         with contextlib.suppress(ProcessLookupError):
             self.process.terminate()
         code = self.process.wait(PATIENCE_S)

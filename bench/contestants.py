@@ -125,7 +125,7 @@ TUNINGS = [Tuning(*choice) for choice in product(FORMS, (1.0, 2.0, 3.0, 5.0), (0
 
 
 class Osqp:
-    """OSQP through its own interface, warm-started from its answer of the previous step."""
+    """OSQP by its own interface, warm-started from its solution of the previous step."""
 
     def __init__(self, problem: Problem, form: Form, **settings: Any) -> None:
         self._bound = problem.mpc.bounds[:, None]
@@ -178,14 +178,14 @@ class Daqp:
 
 
 class Quadprog:
-    """Solver quadprog, condensed: the Hessian is factored once; no warm start."""
+    """The solver quadprog, condensed: the Hessian is factorised once; no warm start."""
 
     def __init__(self, problem: Problem) -> None:
         import quadprog
 
         self._solve = quadprog.solve_qp
         H = problem.hessian.shape[1]
-        # quadprog takes the inverse of the upper factor R of the Hessian RᵀR.
+        # quadprog needs the inverse of the upper factor R of the Hessian RᵀR.
         self._factors = [np.linalg.inv(np.linalg.cholesky(h).T) for h in problem.hessian]
         self._rows = np.hstack([np.eye(H), -np.eye(H)])
         self._limits = [np.full(2 * H, -bound) for bound in problem.mpc.bounds]
@@ -322,7 +322,7 @@ class Ipopt:
 
 
 class EmptySolver:
-    """Empty solver: the cost of the measurement itself."""
+    """Solver that does nothing, to measure the cost of the measurement itself."""
 
     def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - like any other
         self._solved = np.array([True])

@@ -1,4 +1,4 @@
-"""Floods beside a flight over real UDP: forged packets, and HELLOs from ever new ports.
+"""Floods of a server during a flight over real UDP: forged packets, and HELLOs from many ports.
 
 Five vehicles of `demo-committed` fly on a sealed link, 100 observations a second; the network is
 not impaired, so every loss is due to the flood. An attacker on the path has recorded packets, and
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from bench.children import HOST, PATIENCE_S, ChildProcess, Lab
-from bench.harness import Lateness, TextTable, progress, sleep_until
+from bench.harness import TextTable, WakeLateness, progress, sleep_until
 from bench.netem import answer, scheduled_ns, start
 from bench.problems import derive
 from skytether.netem.proxy import Proxy
@@ -38,7 +38,7 @@ from skytether.shared.telemetry import record
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire import channel, handshake
 from skytether.shell import driver
-from skytether.shell.batch import BATCH_MAX, Batch, pack_address
+from skytether.shell.batch import BATCH_MAX, DatagramBatch, pack_address
 
 VEHICLES = 5
 NEWCOMER = VEHICLES + 1
@@ -105,7 +105,7 @@ class Flood:
     """Share of a core that the senders used."""
 
 
-# -- what is recorded on the way -------------------------------------------------------------------
+# -- recording packets -----------------------------------------------------------------------------
 
 
 class Tap(Proxy):
@@ -139,7 +139,7 @@ def tap(pipe: Connection, port: int) -> None:
     driver.run([shell], on_second=tell)
 
 
-# -- what is sent ----------------------------------------------------------------------------------
+# -- packets of the flood --------------------------------------------------------------------------
 
 
 def forgeries(good: bytes) -> list[bytes]:
@@ -175,7 +175,7 @@ def flood(
 ) -> tuple[int, int]:
     """Send packets, many per system call; returns their number, and the CPU time [ns]."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    batch, peer = Batch(socket.AF_INET), pack_address((HOST, port))
+    batch, peer = DatagramBatch(socket.AF_INET), pack_address((HOST, port))
     sent, used_ns = 0, 0
     for due in _batches(pipe, rate, seconds):
         used_ns = used_ns or time.process_time_ns()
@@ -213,12 +213,12 @@ def _batches(pipe: Connection, rate: int, seconds: int) -> Iterator[int]:
         sleep_until(start_ns + (passed_ns // MILLISECOND_NS + 1) * MILLISECOND_NS)
 
 
-# -- a flight --------------------------------------------------------------------------------------
+# -- the flight ------------------------------------------------------------------------------------
 
 
 def measure(counts: FloodCounts) -> dict[str, Any]:
     """Figures of a flight without a flood, and with each."""
-    lateness = Lateness()
+    lateness = WakeLateness()
     floods = [_fly(kind, counts, lateness) for kind in progress(KINDS, "floods")]
     return {
         "counts": asdict(counts),
@@ -257,7 +257,7 @@ class _State:
         )
 
 
-def _fly(kind: str, counts: FloodCounts, lateness: Lateness) -> Flood:
+def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
     """One flight, with one kind of flood or none."""
     duration_s = counts.lead_s + counts.seconds + AFTER_S
     # A report at every step: a missing one was lost.
@@ -361,7 +361,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
     rows = {
         "packets of the flood sent [1/s]": [f"{each.sent:.0f}" for each in floods],
         "read and refused [1/s]": [f"{each.read:.0f}" for each in floods],
-        "kept out by the kernel [1/s]": [f"{each.kept_out:.0f}" for each in floods],
+        "rejected by the kernel's filter [1/s]": [f"{each.kept_out:.0f}" for each in floods],
         "no room, never read [1/s]": [f"{each.unread:.0f}" for each in floods],
         "observations sent": [str(each.good) for each in floods],
         "never handled": [str(each.lost) for each in floods],
@@ -370,7 +370,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         ],
         "ticks missed": [str(each.missed) for each in floods],
         "RMSE [m]": [f"{each.rmse_m:.4f}" for each in floods],
-        f"a newcomer's session after [s] (≤ {SESSION_S:g})": [
+        f"session of a new vehicle after [s] (≤ {SESSION_S:g})": [
             f"{each.session_s:.2f}" for each in floods
         ],
         f"growth of the server's memory [MB] (< {GROWTH_BYTES / 1e6:g})": [

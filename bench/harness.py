@@ -1,9 +1,9 @@
-"""Side by side: how every benchmark here measures, and how it writes down what it measured.
+"""Measuring contestants side by side, and tables of the results; used by every benchmark.
 
-Contestants take turns at the same problems, so that whatever else the machine does meanwhile hits
-all of them alike: a ratio of two figures of one run can be trusted where the figures cannot. Time
-is CPU time of this process, which does not run while somebody else has the core. How late the
-process wakes from its pauses is the machine's own error, and is reported beside the figures.
+Contestants take turns at the same problems, so that other load on the machine affects all of them
+alike: ratios of figures from one run are reliable even if the figures are not. Time is the CPU time
+of this process, which excludes the time of other processes. The lateness with which the process
+wakes from its pauses shows how busy the machine was, and is reported with the figures.
 """
 
 import gc
@@ -36,23 +36,23 @@ Step = TypeVar("Step")
 
 
 def sleep_until(due_ns: int) -> None:
-    """Wait for an absolute time; not at all if it has passed."""
+    """Sleep until an absolute time; return at once if it has passed."""
     time.sleep(max(0, due_ns - time.monotonic_ns()) / SECOND_NS)
 
 
 def quantile_ms(values_ns: Any, share: float) -> float:
-    """A quantile of durations [ms]; not a number without any."""
+    """Quantile of durations [ms]; NaN without any."""
     return float(np.quantile(values_ns, share)) / MILLISECOND_NS if len(values_ns) else float("nan")
 
 
 @dataclass(frozen=True)
-class Lateness:
-    """Pauses, and how late this process woke from each."""
+class WakeLateness:
+    """Pauses of this process, and the lateness of each wake."""
 
     late_ns: list[int] = field(default_factory=list)
 
     def sleep(self, pause_s: float) -> None:
-        """Pause, and note how late the end of it came."""
+        """Pause, and record the lateness of the wake."""
         due_ns = time.monotonic_ns() + round(pause_s * SECOND_NS)
         sleep_until(due_ns)
         self.late_ns.append(time.monotonic_ns() - due_ns)
@@ -68,7 +68,7 @@ class Pace:
     """Rule by which contestants take turns."""
 
     turn: int
-    """Number of problems in a row; the first of several only warms up."""
+    """Number of consecutive problems of a turn; the first of several is a warm-up."""
     pause_s: float
     """Sleep before every turn [s]."""
 
@@ -83,22 +83,22 @@ def interleave(
     contestants: Mapping[str, Callable[[int], object]],
     count: int,
     pace: Pace,
-    lateness: Lateness,
+    lateness: WakeLateness,
     title: str,
     *,
     prepare: Mapping[str, Callable[[], object]] = MappingProxyType({}),
 ) -> dict[str, Durations]:
     """CPU time of each contestant for each of the problems 0 … count - 1.
 
-    Who follows whom is drawn anew each time: after a long solve the caches hold nothing of ours.
+    The order of contestants is random in each turn, as it affects what is left in the caches.
 
     Args:
-        contestants: what each does with a problem.
-        count: how many problems.
+        contestants: function that solves a problem by its number, by name.
+        count: number of problems.
         pace: hot or paced.
-        lateness: of the pauses.
-        title: for the progress bar.
-        prepare: what a contestant has to do before each problem, which is not counted.
+        lateness: records the lateness of the pauses.
+        title: title of the progress bar.
+        prepare: preparation of a contestant before each problem, which is not measured.
     """
     order, rng = list(contestants.items()), np.random.default_rng(1)
     spent = {name: np.empty(count, dtype=np.int64) for name in contestants}
@@ -110,7 +110,7 @@ def interleave(
                         prepare[name]()
                     if problem == first:
                         lateness.sleep(pace.pause_s)
-                        time.process_time_ns()  # the first call after a pause takes long
+                        time.process_time_ns()  # the first call after a pause is slow
                     start_ns = time.process_time_ns()
                     solve(problem)
                     spent[name][problem] = time.process_time_ns() - start_ns
@@ -120,7 +120,7 @@ def interleave(
 
 @contextmanager
 def without_gc() -> Iterator[None]:
-    """Context in which no garbage is collected."""
+    """Context without garbage collection."""
     gc.collect()
     gc.disable()
     try:
@@ -130,23 +130,28 @@ def without_gc() -> Iterator[None]:
 
 
 def progress(steps: Sequence[Step], title: str) -> Iterable[Step]:
-    """Progress bar, drawn between the steps and not by a thread during them."""
+    """Progress bar, drawn between the steps and not by a concurrent thread."""
     return track(steps, title, console=CONSOLE, transient=True, auto_refresh=False)
 
 
 def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict[str, float]:
-    """Median and p99 of durations [ns], divided by a number of packets or vehicles [µs]."""
+    """Median and p99 of durations [µs].
+
+    Args:
+        durations: durations [ns].
+        per: number of packets or vehicles by which they are divided.
+    """
     p50, p99 = np.quantile(durations, [0.5, 0.99]) / 1000.0 / per
     return {"p50_us": float(p50), "p99_us": float(p99)}
 
 
 def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, float]:
-    """Ratios of the others' figures of `figures_us` to ours."""
+    """Ratios of another contestant's figures of `figures_us` to ours."""
     return {name: theirs[f"{name}_us"] / ours[f"{name}_us"] for name in ("p50", "p99")}
 
 
 def machine() -> dict[str, Any]:
-    """Description of the machine, the packages and the commit that are measured."""
+    """Machine, packages and commit of the measurement."""
     return {
         "cpu": processor(),
         "cores": len(os.sched_getaffinity(0))
@@ -169,7 +174,7 @@ def _version(package: str) -> str | None:
 
 @dataclass(frozen=True)
 class TextTable:
-    """Text in columns; the first is flush left, the others are numbers."""
+    """Table as text; the first column is left-aligned, the others are numbers."""
 
     headings: list[str]
     rows: list[list[str]]
@@ -186,10 +191,10 @@ class TextTable:
 
 
 def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
-    """The document with each table put where `<!-- table: name -->` … `<!-- end -->` says.
+    """Document with each table replaced between `<!-- table: name -->` and `<!-- end -->`.
 
     Raises:
-        ValueError: it has no such place for one of them.
+        ValueError: the document has not exactly one place for a table.
     """
     for name, table in tables.items():
         place = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end -->)", re.DOTALL)
@@ -201,12 +206,12 @@ def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
 
 
 def us(value: float) -> str:
-    """Microseconds, to three digits."""
+    """Number of microseconds as text, with three digits."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def times(ratio: float, target: float | None = None) -> str:
-    """A ratio, and the target beside it."""
+    """Ratio as text, with its target in brackets."""
     text = f"{ratio:.0f} x" if ratio >= 100 else f"{ratio:.1f} x"
     return text if target is None else f"{text} (≥ {target:g})"
 

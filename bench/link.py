@@ -16,12 +16,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bench.harness import HOT, Lateness, TextTable, figures_us, interleave, median, progress, us
+from bench.harness import HOT, TextTable, WakeLateness, figures_us, interleave, median, progress, us
 from bench.problems import derive
 from bench.wire import NOTHING, messages
 from skytether.client import secure as client
 from skytether.server import secure as server
-from skytether.server.gate import Call
+from skytether.server.gate import GateCall
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
@@ -61,7 +61,8 @@ QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=
 
 
 class Ends:
-    """Both ends of one vehicle's link, after a handshake unless told otherwise.
+    """Both ends of one vehicle's link, after a handshake unless `hello` and `welcome` say
+    otherwise.
 
     Args:
         gate: the server's end.
@@ -95,7 +96,7 @@ class Ends:
         assert self.link.open(answer.payload, now_ns=NOW_NS) is None
         self.second = self.link.hello(self._hello, now_ns=NOW_NS)
 
-    def welcome(self) -> Call:
+    def welcome(self) -> GateCall:
         """Exchange the HELLO with the cookie and the WELCOME; keep the WELCOME. Returns the HELLO's
         call.
         """
@@ -127,7 +128,7 @@ class Ends:
 
 def measure(counts: LinkCounts) -> dict[str, Any]:
     """Figures of packets, handshakes, a fleet and the demonstration."""
-    lateness = Lateness()
+    lateness = WakeLateness()
     return {
         **_packets(counts, lateness),
         "handshake": _handshakes(counts, lateness),
@@ -137,7 +138,7 @@ def measure(counts: LinkCounts) -> dict[str, Any]:
     }
 
 
-def _packets(counts: LinkCounts, lateness: Lateness) -> dict[str, Any]:
+def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
     """Sizes of the messages, and the cost of a packet to either end."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
     known = {type(message).__name__.upper(): encode(message) for message in messages(terms)}
@@ -193,7 +194,7 @@ def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
     return server.SecureGate(keyring, entropy=stream(1, "gate").bytes), keyring
 
 
-def _handshakes(counts: LinkCounts, lateness: Lateness) -> dict[str, Any]:
+def _handshakes(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
     """Cost of a handshake to either end; each is another vehicle's, because their rate is
     limited.
     """
@@ -253,7 +254,7 @@ def _demo(counts: LinkCounts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Tables of the costs of a packet, of its size, and of all together."""
+    """Tables of the cost of a packet, of packet sizes, and of the link as a whole."""
     both = {**result["packet"], **{f"handshake, {k}": v for k, v in result["handshake"].items()}}
     nothing = both.pop(NOTHING)
     rows = [

@@ -1,23 +1,23 @@
-"""Vehicles that keep apart: how near they come to each other and to zones, and when all arrive.
+"""Benchmark of missions: smallest distances between vehicles and from zones, and arrival times.
 
     python -m bench.missions random --flights 1000
     python -m bench.missions swap
     python -m bench.missions published
 
-`random`: each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and triangles in
-their way, and a network with losses up to one half, bursts up to two seconds and delays up to half
-a second. Each vehicle has a way to its goal. With --harsh every link is also cut again and again,
-often for so long that the server takes the vehicle for gone, and in half of the missions the server
-dies, and begins anew without memory. With --space they fly at any height, some zones end below or
-begin above them, and whoever hears nothing for 40 s lands. Every fault is printed with its seed:
-`--first 17 --flights 1` flies that mission again.
+`random`: each mission has 2 to 32 vehicles in a fence, up to six boxes, cylinders and triangles,
+and a network with losses up to 50 %, bursts up to 2 s and delays up to 0.5 s. Each vehicle can
+reach its goal. With --harsh every link is also cut repeatedly, often for so long that the server
+takes the vehicle as lost, and in half of the missions the server restarts without memory. With
+--space they fly with three axes, some zones end below or begin above the vehicles, and a vehicle
+without packets for 40 s lands. Every fault is printed with its seed: `--first 17 --flights 1` flies
+the mission again.
 
-`swap`: vehicles swap places on a circle or a sphere, over several networks; in one of them the
-server dies three times a flight, for 0.5 to 20 s.
+`swap`: vehicles swap places on a circle or a sphere, over several networks; with one of them the
+server is down three times a flight, for 0.5 to 20 s.
 
-`published`: tasks of published planners, as the authors' own code has them: places, distances,
-bounds, noise. Skytether plans motions as far apart as they do, for vehicles of the paper's time
-constant, over a network that is near (20 ms, no loss) and over the paper's with 30 % lost.
+`published`: tasks of published planners, with places, distances, bounds and noise of the authors'
+code. Skytether plans with the same distances, for vehicles with the paper's time constant, over a
+good network (20 ms, no loss) and over the paper's with 30 % loss.
 
 - Luis, Vukosavljev and Schoellig (RA-L, 2020), github.com/carlosluis/online_dmpc: `config.json`
   (four cross), `sim_params.m` and `comp_dmpc_bvc.m` (random places), `run_algorithm.m` (a crash).
@@ -65,13 +65,13 @@ from skytether.sim.world import World
 C = TypeVar("C")
 
 GOAL_AT_S = 2.0
-"""Time from which on the goals of random and published missions hold [s]."""
+"""Time from which the goals of random and published missions hold [s]."""
 ARRIVED_M, PUBLISHED_ARRIVED_M = 0.3, 0.1
 """Distance from its goal at which a vehicle has arrived; of `comp_dmpc_bvc.m` [m]."""
 ROOM_M2 = 12.0
 """Area for each vehicle and zone of a random mission [m²]."""
 UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
-"""Ranges of the mean times between two cuts of a link, and for which it is cut [s]."""
+"""Ranges of the mean time between two cuts of a link, and of the mean length of a cut [s]."""
 HIGH_M = 6.0
 """Greatest height of a goal in space [m]; the least is a sixth of it."""
 MORTAL_SHARE = 0.5
@@ -108,7 +108,7 @@ class Amount:
     workers: int = 2
     """Number of processes."""
     out: Path | None = None
-    """Folder that keeps the flights: after Ctrl-C, or with more, the same command goes on."""
+    """Folder for the flights: after Ctrl-C, or with more flights, the same command continues."""
     markdown: Path | None = None
     """File for the table as Markdown."""
 
@@ -191,12 +191,12 @@ def fly_mission(
     goal_at_s: float = GOAL_AT_S,
     arrived_m: float = ARRIVED_M,
 ) -> MissionFlight:
-    """Fly a scenario to its end, and judge it.
+    """Fly a scenario to its end, and evaluate the flight.
 
     Args:
         scenario: mission to fly.
         vehicles: number of vehicles.
-        deaths: when the server dies and begins anew [s].
+        deaths: times at which the server stops and restarts [s], in order.
         goal_at_s: time from which on the goals hold, on each vehicle's clock [s]; with 0 the
             vehicles' clocks are aligned.
         arrived_m: distance from its goal at which a vehicle has arrived [m].
@@ -240,12 +240,12 @@ def fly_mission(
 
 @contextmanager
 def timed() -> Iterator[list[float]]:
-    """Time that servers plan meanwhile [s], one item a tick."""
+    """Computing time of the planner in each tick within the block [s]."""
     real, spent = MissionPlanner.plan, list[float]()
 
-    def plan(self: MissionPlanner, rows: Indices, step: Indices, found: Foresight) -> None:
+    def plan(self: MissionPlanner, rows: Indices, step: Indices, foresight: Foresight) -> None:
         began = time.perf_counter()
-        real(self, rows, step, found)
+        real(self, rows, step, foresight)
         spent.append(time.perf_counter() - began)
 
     MissionPlanner.plan = plan  # type: ignore[method-assign]
@@ -258,12 +258,12 @@ def timed() -> Iterator[list[float]]:
 def fly_with_deaths(
     scenario: Scenario, vehicles: int, deaths: Sequence[tuple[float, float]]
 ) -> tuple[Record, list[Server]]:
-    """Flight in which the server dies and begins anew without its memory, and all its lives.
+    """Flight in which the server restarts without memory, and all runs of the server.
 
     Args:
-        scenario: what is flown.
+        scenario: mission to fly.
         vehicles: number of vehicles.
-        deaths: when it dies and begins anew [s], in order.
+        deaths: times at which the server stops and restarts [s], in order.
     """
     lives: list[Server] = []
 
@@ -281,7 +281,7 @@ def fly_with_deaths(
 
 
 def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
-    """Times at which a server dies and is started again, drawn from a seed [s]."""
+    """Random times at which a server stops and restarts [s]."""
     rng = stream(seed, "deaths")
     begins = rng.uniform(np.arange(DEATHS), np.arange(DEATHS) + 1.0) * duration / DEATHS
     for_s = rng.uniform(*DOWN_S, DEATHS)
@@ -292,12 +292,12 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 def mission_scenario(
     name: str, seed: int, duration: float, goals: Array, folder: Path
 ) -> dict[str, Any]:
-    """Table of a scenario with goals of its own.
+    """Table of a scenario with other goals.
 
     Args:
-        name: scenario that it is made of.
-        seed: its seed.
-        duration: its length [s].
+        name: name of the scenario that is changed.
+        seed: seed of the scenario.
+        duration: length of the flight [s].
         goals: starts and goals [m]; shape (2, vehicles, axes).
         folder: folder for the file of goals.
     """
@@ -316,7 +316,7 @@ def mission_scenario(
 
 
 def arrivals(flown: Sequence[MissionFlight]) -> str:
-    """Median and largest time of the last arrival, of flights in which all arrived."""
+    """Median and maximum of the last arrival, over flights in which all vehicles arrived."""
     done = [each.arrived_s for each in flown if each.arrived_s is not None]
     return f"{np.median(done):.1f}, {max(done):.1f}" if done else "-"
 
@@ -325,7 +325,7 @@ def arrivals(flown: Sequence[MissionFlight]) -> str:
 
 
 def random_mission(options: RandomOptions, seed: int, folder: Path) -> Scenario:
-    """A random mission; its table of goals is put into a folder."""
+    """Random mission; its table of goals is written to a folder."""
     rng = stream(seed, "mission")
     vehicles = int(rng.integers(2, 33))
     obstacles = int(rng.integers(0, 7))
@@ -368,7 +368,7 @@ def _zones(rng: np.random.Generator, count: int, half_m: float) -> Iterator[str]
 
 
 def _between(heights: np.random.Generator, shape: str) -> str:
-    """A box or cylinder between two heights; any other zone as it is."""
+    """Box or cylinder limited to random heights; any other zone unchanged."""
     low_m, thick_m = heights.uniform(0.0, HIGH_M), heights.uniform(0.5, 3.0)
     is_high = shape.startswith(("box", "cylinder"))
     return f"{shape[:-1]}, {low_m:.2f}, {low_m + thick_m:.2f})" if is_high else shape
@@ -378,7 +378,7 @@ def _places(
     rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
 ) -> Array:
     """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
-    room_m = 0.75 * apart_m  # from zones: past a vehicle at its goal there is a way
+    room_m = 0.75 * apart_m  # from zones, so that others can pass a vehicle at its goal
     routes, found = Routes(kept, room_m), list[Array]()
     while len(found) < 2:
         places = np.zeros((0, 2))
@@ -394,7 +394,7 @@ def _places(
                 found.append(places)
                 break
         else:
-            found.clear()  # too full: begin anew
+            found.clear()  # too crowded: start again
     return np.stack(found)
 
 
@@ -413,7 +413,7 @@ def _network(rng: np.random.Generator) -> str:
 
 
 def fly_random(options: RandomOptions, seed: int) -> MissionFlight:
-    """Fly one; to its end, unless all have arrived by half of the time."""
+    """Fly a random mission; half of its time if all vehicles have arrived by then."""
     if not options.harsh:
         half = _fly_random(replace(options, duration=options.duration / 2.0), seed)
         if not half.late:
@@ -432,7 +432,7 @@ def _fly_random(options: RandomOptions, seed: int) -> MissionFlight:
 
 
 def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]]:
-    """Fly all; the table, and the flights with a fault."""
+    """Fly all missions; returns the table, and the flights with a fault."""
     seeds = range(options.first, options.first + options.flights)
     flown = options.fly(partial(fly_random, options), seeds)
     asked_m = reading.load("swap").mission.separation_m
@@ -491,7 +491,7 @@ def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
 
 
 def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
-    """Fly one."""
+    """Fly one cell: a seed and a network; called in a worker."""
     seed, network = cell
     when = deaths(seed, options.duration) if network == MORTAL else []
     scenario = swap_scenario(network, options, seed)
@@ -500,7 +500,7 @@ def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
 
 def swap_table(options: SwapOptions) -> TextTable:
     """Fly every cell."""
-    # By seeds first, so that more flights only add to the end.
+    # Seeds in the outer loop, so that more flights only add cells at the end.
     cells = list(product(range(1, options.flights + 1), SWAP_NETWORKS))
     done = options.fly(partial(fly_swap, options), cells)
     asked = reading.load(options.shape).mission.separation_m
@@ -571,7 +571,7 @@ def places(task: Task, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _spread(task: Task, rng: np.random.Generator, keep_m: float, scale: Array) -> Array:
-    """Random places of a box that are so far apart; begun anew where no more fit."""
+    """Random places in a box with a minimum distance; starts again if no more places fit."""
     while True:
         found = np.zeros((0, 3))
         for _ in range(20_000):
@@ -585,7 +585,7 @@ def _spread(task: Task, rng: np.random.Generator, keep_m: float, scale: Array) -
 def published_scenario(
     task: Task, network: str, duration: float, seed: int, folder: Path
 ) -> Scenario:
-    """A flight of a task; its table of goals is put into a folder."""
+    """Scenario of a task; its table of goals is written to a folder."""
     goals = np.stack(places(task, stream(seed, "published")))
     table = mission_scenario("sphere", seed, duration, goals, folder)
     table["mission"] |= {
@@ -603,7 +603,7 @@ def published_scenario(
 
 
 def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) -> MissionFlight:
-    """Fly one."""
+    """Fly one cell: a seed, a task and a network; called in a worker."""
     seed, (name, network) = cell
     with tempfile.TemporaryDirectory() as folder:
         task = TASKS[name]
@@ -634,7 +634,7 @@ def published_table(options: PublishedOptions) -> TextTable:
     headings = [
         "task, network",
         "least separation\n[m]",
-        "flights nearer than\na crash",
+        "flights with\na crash",
         f"all arrived in\n{TOLD_S:g} s, {options.duration:g} s",
         "last arrival\np50, max [s]",
         "planning\na motion [ms]",

@@ -1,11 +1,11 @@
-"""Cost of keeping vehicles apart: the planning of a tick beside OSQP.
+"""Cost of planning missions, per tick, compared with OSQP.
 
-Fleets of which a share is near others: pairs that change places again and again, 20 m from the next
-pair, beside vehicles that fly to and fro alone. The planning of each tick (everything, from the
+In each fleet a share of the vehicles flies near another: pairs that swap places repeatedly, 20 m
+from the next pair; the others fly to and fro alone. The planning of each tick (all of it, from the
 motions that may be flown to the one that is sent) is compared with OSQP on one QP for each vehicle
-planned for in that tick, the last of its rounds, with the constraints that were taken in. OSQP is
-set up once for each shape of problem and given what changes, with tolerances of 1e-4, which leave a
-millimetre, and no polishing. Both are CPU time.
+planned for in that tick: the QP of its last iteration, with the constraints added so far. OSQP is
+set up once for each problem size and then updated, with tolerances of 1e-4, equivalent to about a
+millimetre, and without polishing. Both are CPU time.
 """
 
 import itertools
@@ -35,10 +35,10 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 
 ROWS = 64
-"""OSQP's problems are filled up to a multiple of this number of constraints with ones that always
-hold: it stays set up for a few sizes instead of one for every number."""
+"""OSQP's problems are padded to a multiple of this number of constraints with ones that always
+hold, so that OSQP is set up for a few sizes only."""
 FLEETS = (16, 64, 200)
-"""Numbers of vehicles in ticks by share."""
+"""Numbers of vehicles of the fleets."""
 SHARES = (0.0, 0.1, 0.5)
 """Shares of vehicles near others."""
 LEG_M, APART_M = 3.0, 20.0
@@ -76,7 +76,7 @@ class MotionProblem(NamedTuple):
 
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
-    """Keep every QP that is solved."""
+    """Record every QP that is solved within the block."""
     real = TrajectoryQP.solve
 
     def solve(
@@ -95,7 +95,7 @@ def kept(problems: list[MotionProblem]) -> Iterator[None]:
 
 
 def filled_up(problem: MotionProblem) -> tuple[Any, Array]:
-    """Constraints and their bounds, to the next multiple of ROWS."""
+    """Constraints and their bounds, padded to the next multiple of ROWS."""
     variables, count = problem.columns.shape
     rows = -(-count // ROWS) * ROWS
     least, columns = np.full(rows, -1.0), np.zeros((rows, variables))
@@ -114,7 +114,7 @@ class MotionOsqp:
         self._made: dict[int, Any] = {}
 
     def solve(self, problem: MotionProblem) -> Array:
-        """The minimum, at its tolerance."""
+        """Solution within OSQP's tolerance."""
         dense, least = filled_up(problem)
         rows, most = len(least), np.full(len(least), np.inf)
         most[: problem.equal] = least[: problem.equal]
@@ -140,7 +140,7 @@ class MotionOsqp:
 
 
 def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> Scenario:
-    """Fleet of which a share flies in pairs that change places, in each other's way."""
+    """Scenario of a fleet in which a share of the vehicles flies in pairs that swap places."""
     near = 2 * round(share * vehicles / 2)
     lines = ["vehicle,t,x,y"]
     for vehicle in range(1, vehicles + 1):
@@ -159,11 +159,11 @@ def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> 
 
 @contextmanager
 def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) -> Iterator[None]:
-    """Take the time of planning at each tick [µs], or else keep the last QP of each vehicle in it.
+    """Measure the planning time of each tick [µs], or record the last QP of each vehicle instead.
 
     Args:
-        plan_us: filled with the time of each tick, unless problems are kept.
-        problems: filled with those of each tick.
+        plan_us: output: time of each tick, if `problems` is None.
+        problems: output: QPs of each tick; None to measure.
     """
     plan, toward = MissionPlanner.plan, MissionPlanner._motion_toward
     of_tick: list[MotionProblem] = []
@@ -198,7 +198,7 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
 
 
 def measure(counts: MotionsCounts) -> dict[str, Any]:
-    """Planning of whole ticks beside OSQP for each vehicle in turn, by the share near others."""
+    """Planning time of whole ticks and OSQP's time, by the share of vehicles near others."""
     fleets = []
     with tempfile.TemporaryDirectory() as folder:
         kinds = list(itertools.product(counts.fleets, counts.shares))
@@ -210,7 +210,7 @@ def measure(counts: MotionsCounts) -> dict[str, Any]:
                 flight.fly(msgspec.structs.replace(flown, duration=2 * LEG_S), vehicles=vehicles)
             with watched(spent, None):
                 flight.fly(flown, vehicles=vehicles)
-            with watched([], problems):  # the same flight once more, to the last bit
+            with watched([], problems):  # the same flight again, bit for bit
                 flight.fly(flown, vehicles=vehicles)
             planned = [tick for tick, each in enumerate(problems) if each]
             beside = _beside_osqp(spent, problems, planned)
@@ -219,7 +219,7 @@ def measure(counts: MotionsCounts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table of planning beside OSQP."""
+    """Table of planning times and OSQP's."""
     rows = []
     for each in result["fleets"]:
         ours, theirs = (
@@ -248,7 +248,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 def _beside_osqp(
     spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
 ) -> dict[str, Any]:
-    """Planning of the ticks in which vehicles are planned for, and OSQP's time."""
+    """Planning time of the ticks with planned vehicles, and OSQP's time."""
     root = problems[planned[0]][0].solver.root
     rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
     looked_at = planned[:: max(1, len(planned) // RIVALS)]

@@ -41,7 +41,7 @@ HEAD = struct.Struct("<qq")
 BATCH_NS = MILLISECOND_NS // 4
 SO_TIMESTAMPNS = 35
 QUIET_S = 2
-"""Silence after which no packet is under way [s]: the paper's delays are far shorter."""
+"""Silence after which no packet is in flight any more [s]: the paper's delays are far shorter."""
 PATIENCE_S = 90.0
 """Longest wait for an answer [s]; the longest run takes 60 s."""
 

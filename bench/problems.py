@@ -29,7 +29,7 @@ from skytether.sim.flight import fly
 
 
 def derive(name: str, **sections: Any) -> Scenario:
-    """Scenario that comes with Skytether, with some keys changed: `control={"dt": 0.02}`."""
+    """Built-in scenario with some keys changed, as in `control={"dt": 0.02}`."""
     table = reading.to_table(reading.load(name))
     for key, value in sections.items():
         table[key] = {**table[key], **value} if isinstance(value, dict) else value
@@ -101,7 +101,7 @@ class ProblemRecorder:
         self._asked.append((gradient, guess))
         return self._solver.solve(gradient, guess)
 
-    def heard(self, turns: int = 0) -> tuple[Array, Array]:
+    def recorded(self, turns: int = 0) -> tuple[Array, Array]:
         """Recorded gradients and guesses, the last or all; each of shape (2, problems, axes, H).
 
         The generator's come first, then the tracker's.
@@ -120,7 +120,9 @@ class ProblemRecorder:
 
 
 class ByTurns:
-    """Two solvers in turn, for the generator and for the tracker: each keeps its own warm start."""
+    """Two solvers in turn, one for the generator and one for the tracker, each with a warm
+    start.
+    """
 
     def __init__(self, make: Callable[[Problem], Solver], problem: Problem) -> None:
         self._next, self._other = make(problem), make(problem)
@@ -134,7 +136,7 @@ class ByTurns:
 
 @contextmanager
 def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
-    """Within the block, new planners solve by `make(problem)`, whatever their scenario says."""
+    """Within the block, new planners use the solver `make(problem)`, not the scenario's."""
 
     def make_solver(control: ControlConfig, problem: Problem) -> Solver:  # noqa: ARG001
         return make(problem)
@@ -165,4 +167,4 @@ def record(scenario: Scenario, ticks: int) -> RecordedProblems:
         flight = fly(scenario)
     assert len(flight.client), flight.failure
     _, later = listeners
-    return RecordedProblems(later.problem, *later.heard(ticks))
+    return RecordedProblems(later.problem, *later.recorded(ticks))

@@ -1,4 +1,4 @@
-"""Reference solutions of QPs, found by other solvers and then proved optimal.
+"""Reference solutions of QPs, found by other solvers and then proved to be optimal.
 
 quadprog (or, if it is not installed, bounded least squares of scipy) finds the inputs that are at a
 bound. With these fixed, a dense Cholesky factorisation gives the others, and the optimality

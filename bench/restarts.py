@@ -1,24 +1,24 @@
 """Restarts in flight: server, netem and client are killed and stopped during flights over real UDP.
 
-A vehicle flies the demonstration's figure eight, sealed, over a network of 30 to 50 ms each way
-that loses 5 % of the packets. Again and again one of the three processes is killed with SIGKILL and
-restarted, at once or after 3 s in which nothing listens at its port, or stopped with SIGSTOP for 3
-s. The vehicle's reaction is read from its own record.
+A vehicle flies the demonstration's figure eight, encrypted, over a network of 30 to 50 ms each way
+with 5 % loss. Repeatedly one of the three processes is killed with SIGKILL and restarted, at once
+or after 3 s in which nothing listens at its port, or stopped with SIGSTOP for 3 s. The vehicle's
+reaction is read from its own record.
 
 Speed is compared with the braking curve from the step at which the vehicle brakes, or from 1.2 s
-after the process was gone at the latest: 1 s of silence makes the vehicle brake, and 0.2 s are
-allowed for packets still under way and for the step that has begun. With v the speed commanded at
+after the process stopped at the latest: 1 s of silence makes the vehicle brake, and 0.2 s are
+allowed for packets still in flight and for the step that has begun. With v the speed commanded at
 that step and a = `vehicle.brake_mps2`,
 
     commanded   b(t) = max(0, v - a t)
     true        τ ds/dt = b(t) - s,   s(0) = the true speed at that step
 
 The vehicle follows its command with the lag τ, equal on each axis, so that its speed is at most the
-lagged commanded one; in still air, as here, nothing else moves the vehicle. A curve without the lag
-would demand what no braking can achieve. The curve applies until the first horizon that was made
-after the process was back: then the vehicle flies again. A vehicle whose own process was stopped
-brakes when the process wakes, and its times count from there; a vehicle whose process was killed
-starts again at rest, and must stay at rest until it flies.
+lagged commanded one; there is no wind. Without the lag in the curve no vehicle could stay below it.
+The curve applies until the first horizon that was made after the process was back; then the vehicle
+flies again. A vehicle whose own process was stopped brakes when the process wakes, and its times
+are counted from there. A vehicle whose process was killed starts again at rest, and must stay at
+rest until it flies.
 """
 
 import math
@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.children import HOST, ChildProcess, Lab
-from bench.harness import Lateness, TextTable, progress
+from bench.harness import TextTable, WakeLateness, progress
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Flying, ModeChanged
@@ -155,7 +155,7 @@ class RestartVerdict:
 
 
 def scenario() -> Scenario:
-    """`demo-committed` in still air, on a network of our own, with a time-out of 1 s."""
+    """`demo-committed` without wind, on another network, with a time-out of 1 s."""
     way = "paper(0.03, 0.005, 1.0) & loss(0.05)"
     return derive(
         "demo-committed",
@@ -278,7 +278,7 @@ def judge(
 
 
 def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
-    """Run of the vehicle that goes on, or begins, after an outage."""
+    """Run of the vehicle that continues or starts after an outage."""
     for life in lives:
         if life.time_ns[-1] > outage.back_ns:
             return life
@@ -323,7 +323,7 @@ def curves(
 
 def measure(counts: RestartsCounts) -> dict[str, Any]:
     """Reactions to all outages, and the speed around each."""
-    lateness, rng, outages = Lateness(), np.random.default_rng(1), []
+    lateness, rng, outages = WakeLateness(), np.random.default_rng(1), []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-"))
         flight = Processes(stack, Path(folder))

@@ -11,8 +11,8 @@ from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Factory, Tuning, by
 from bench.harness import (
     HOT,
     PACED,
-    Lateness,
     TextTable,
+    WakeLateness,
     figures_us,
     interleave,
     progress,
@@ -55,7 +55,7 @@ def flights() -> dict[str, Scenario]:
 
 def measure(counts: SolversCounts) -> dict[str, Any]:
     """Figures of all contestants on both flights."""
-    lateness = Lateness()
+    lateness = WakeLateness()
     result: dict[str, Any] = {
         name: _measure_flight(name, scenario, counts, lateness)
         for name, scenario in flights().items()
@@ -64,7 +64,7 @@ def measure(counts: SolversCounts) -> dict[str, Any]:
 
 
 def _measure_flight(
-    name: str, scenario: Scenario, counts: SolversCounts, lateness: Lateness
+    name: str, scenario: Scenario, counts: SolversCounts, lateness: WakeLateness
 ) -> dict[str, Any]:
     recorded = record(scenario, max(counts.hot, counts.paced, counts.tuning))
     tuned, forms = tune(recorded, counts.tuning, lateness)
@@ -129,7 +129,7 @@ class SolverEntry:
 
 
 def tune(
-    recorded: RecordedProblems, count: int, lateness: Lateness
+    recorded: RecordedProblems, count: int, lateness: WakeLateness
 ) -> tuple[Tuning, dict[str, dict[str, float]]]:
     """Tuning of OSQP with the smallest median time, and the best of each form [µs]."""
     entries = {str(tuning): SolverEntry(tuning.make, recorded) for tuning in TUNINGS}

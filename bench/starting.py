@@ -1,9 +1,9 @@
-"""Starts of the commands: time until each has done what it was started for, and memory then.
+"""Start-up time and memory of the commands.
 
-A command that ends is measured to its end, with the most memory that it had; a server until it
-says that it listens, and a client until its first packet arrives. *Warm* starts find bytecode and
-the machine code of kernels on disk, *cold* ones find neither, as after an installation. Starts take
-turns, and CPU time stands beside the time that passed: on a busy machine it says more.
+A command that ends is measured until its end, with its peak memory; a server until it reports that
+it listens, and a client until its first packet arrives. *Warm* starts find bytecode and the machine
+code of kernels on disk; *cold* ones find neither, as after an installation. The commands take
+turns. CPU time is reported besides elapsed time, because it depends less on other load.
 """
 
 import os
@@ -29,11 +29,11 @@ from skytether.shell.workers import die_with_parent
 
 MB = 1_000_000
 POLL_S = 0.01
-"""Interval at which the memory of a command is read that will end [s]."""
+"""Interval at which the memory of a command that ends by itself is read [s]."""
 
 
 class Start(NamedTuple):
-    """A command to start, and what it should take."""
+    """Command to start, and its targets."""
 
     command: str
     """Words of the command line."""
@@ -76,14 +76,14 @@ class StartCost(NamedTuple):
     cpu_s: float
     """CPU time of all its threads [s]."""
     memory_bytes: float
-    """Resident memory [B]: at the end of what is measured, or the most of a command that ended."""
+    """Resident memory [B]: at the end of the measurement, or the peak of a command that ended."""
 
 
 def measure(counts: StartingCounts) -> dict[str, Any]:
     """Costs of each start, medians of warm and of cold ones."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     found: dict[tuple[str, str], list[StartCost]] = {}
-    # The first warm start leaves on disk what the others find there, and does not count.
+    # The first warm start fills the caches on disk, and is not measured.
     turns = [("warm", turn) for turn in range(counts.warm + 1)]
     turns += [("cold", turn + 1) for turn in range(counts.cold)]
     for (kind, turn), name in progress([*product(turns, STARTS)], "starting"):
@@ -103,7 +103,7 @@ def started(command: str, environment: Mapping[str, str]) -> StartCost:
     """Cost of one start.
 
     Raises:
-        TimeoutError: the process has not done what it was started for.
+        TimeoutError: the process is not ready in time.
         RuntimeError: the command has failed.
     """
     name, *rest = command.split()
@@ -151,10 +151,10 @@ def started(command: str, environment: Mapping[str, str]) -> StartCost:
 
 
 def _peak_bytes(process: subprocess.Popen[bytes]) -> float:
-    """Most memory that a process has until it closes its output [B].
+    """Peak memory of a process until it closes its output [B].
 
-    What the kernel tells of a process that has ended counts the memory of the one that started it,
-    which the two shared before `exec`.
+    It is read from /proc while the process runs: the kernel's figure for an ended process includes
+    memory shared with the parent before `exec`.
     """
     assert process.stdout is not None
     output, status, most_kb = process.stdout.fileno(), Path(f"/proc/{process.pid}/status"), 0

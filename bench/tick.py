@@ -1,4 +1,4 @@
-"""Cost of a whole tick: of one vehicle, of fleets, and of more and more vehicles."""
+"""Cost of a whole tick: for one vehicle, for fleets, and over the number of vehicles."""
 
 import gc
 import time
@@ -17,9 +17,9 @@ from bench.contestants import Tuning
 from bench.harness import (
     HOT,
     PACED,
-    Lateness,
     Pace,
     TextTable,
+    WakeLateness,
     figures_us,
     interleave,
     progress,
@@ -85,7 +85,7 @@ def mixes() -> dict[str, Scenario]:
 
 def measure(counts: TickCounts) -> dict[str, Any]:
     """All figures of this section."""
-    lateness = Lateness()
+    lateness = WakeLateness()
     tunings = tune(counts, lateness)
     single = {
         name: _single(name, scenario, tunings[name], counts, lateness)
@@ -104,7 +104,7 @@ def measure(counts: TickCounts) -> dict[str, Any]:
     }
 
 
-def tune(counts: TickCounts, lateness: Lateness) -> dict[str, Tuning]:
+def tune(counts: TickCounts, lateness: WakeLateness) -> dict[str, Tuning]:
     """The fastest tuning of OSQP for each flight of `solvers.flights`."""
     return {
         name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
@@ -121,9 +121,11 @@ def fleets(counts: TickCounts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 
 
 def _single(
-    name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: Lateness
+    name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: WakeLateness
 ) -> dict[str, Any]:
-    """Time from a decoded observation to a packed horizon, one vehicle; two servers by turns."""
+    """CPU time from a decoded observation to a packed horizon of one vehicle; two servers in
+    turn.
+    """
     ours = Airspace(scenario, 1)
     with solving(lambda problem: ByTurns(tuned.make, problem)):
         theirs = Airspace(scenario, 1)
@@ -151,7 +153,7 @@ def _single(
 def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> dict[str, Any]:
     """Figures of planning for all in one batch, then for some of them one by one by OSQP.
 
-    A second fleet flies the same, and is listened to: what it asks is given to both solvers alone.
+    The QPs of a second, equal fleet are recorded, and both solvers solve them again.
     """
     fleet = PlannedFleet(scenario, counts.fleet)
     with listening() as listeners:
@@ -161,7 +163,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
         ExactSolver(later.problem),
         range(0, counts.fleet, max(1, counts.fleet // counts.fleet_sample)),
     )
-    # Each of them has its own, and keeps its own warm start.
+    # Each vehicle has its own solvers, with their own warm starts.
     others = [[tuned.make(later.problem) for _ in range(2)] for _ in sample]
     plan_ns, solve_ns, theirs_ns, active = [], [], [], []
     with without_gc():
@@ -173,7 +175,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
             fleet.fly()
             heard.fly()
             if tick >= SETTLE:
-                gradient, guess = later.heard()
+                gradient, guess = later.recorded()
                 start_ns = time.process_time_ns()
                 answers = [exact.solve(*half)[0] for half in zip(gradient, guess, strict=True)]
                 solve_ns.append(time.process_time_ns() - start_ns)
@@ -202,7 +204,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
     }
 
 
-def _crowd(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[str, Any]:
+def _crowd(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> dict[str, Any]:
     """Time of a server's tick of many saturated vehicles, by stage [ms]."""
     space = Airspace(scenario, counts.crowd, Stopwatch(time.process_time_ns))
     spent = space.server.stopwatch.spent_ns
@@ -228,7 +230,7 @@ def _crowd(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[s
         **laps,
         " + ".join(STAGES): target,
         "tick": tick_ns,
-        "tick, by the clock on the wall": wall_ns,
+        "tick, elapsed time": wall_ns,
     }
     shares = {"p50_ms": 0.5, "p99_ms": 0.99}
     return {
@@ -238,11 +240,11 @@ def _crowd(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[s
 
 
 def waker(space: Airspace) -> Callable[[int], None]:
-    """Contestant whose every problem is a tick of these vehicles."""
+    """Contestant for which each problem is a tick of these vehicles."""
     return lambda _: space.wake()
 
 
-def _scaling(scenario: Scenario, counts: TickCounts, lateness: Lateness) -> dict[str, float]:
+def _scaling(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> dict[str, float]:
     """Median CPU time of a tick [ms], by the number of vehicles."""
     spaces = {count: Airspace(scenario, count) for count in counts.scale}
     spent = interleave(

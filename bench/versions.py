@@ -1,12 +1,13 @@
-"""Before and after: this checkout against another one on the same machine, in one run.
+"""Comparison of this checkout with another commit, on the same machine and in one run.
 
     python -m bench.versions HEAD~10
 
-A commit is checked out into a temporary folder, which goes at the end; a folder is taken as it is.
+A commit is checked out into a temporary folder, which is removed at the end; the folder of another
+checkout can be given instead.
 
-Each checkout has a process of its own, its `versions_worker.py`. Only one of them works at
-a time, in short turns whose order is drawn anew, so that a busy machine hits both alike. Time is
-CPU time. Planning is compared with OSQP as well, in this checkout alone.
+Each checkout has a process of its own, its `versions_worker.py`. Only one of them works at a time,
+in short turns of random order, so that other load affects both alike. Time is CPU time. Planning is
+also compared with OSQP, in this checkout only.
 """
 
 import json
@@ -24,7 +25,7 @@ import numpy as np
 import tyro
 
 from bench import tick
-from bench.harness import HOT, PACED, Lateness, TextTable, progress, us
+from bench.harness import HOT, PACED, TextTable, WakeLateness, progress, us
 from skytether.shared.base import files
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +40,7 @@ there = importlib.import_module(harness)
 there.PACED = type(there.PACED)(there.PACED.turn, float(pause_s))
 runpy.run_path(worker, run_name="__main__")
 """
-"""Program that runs a worker with the pauses of this checkout; older ones have pauses of 5 ms."""
+"""Program that runs a worker with the pauses of this checkout; older checkouts have 5 ms."""
 SIDES = ("before", "after")
 VALUES_MIN = 20
 """Number of values below which no p99 is given."""
@@ -47,14 +48,14 @@ VALUES_MIN = 20
 
 @dataclass(frozen=True)
 class Contest:
-    """Work that both checkouts do by turns; a row of the table."""
+    """Work that both checkouts do in turns; a row of the table."""
 
     title: str
     """Description, with the unit of the figures in brackets."""
     turn: tuple[Any, ...]
     """Name and arguments of the worker's turn."""
     turns: int
-    """Number of turns of each checkout that count; one more before them only warms up."""
+    """Number of measured turns of each checkout, after one warm-up turn."""
     per_unit: float = 1.0
     """Number of the worker's units in one unit of the title."""
     target_ratio: str = ""
@@ -98,7 +99,7 @@ class VersionsBenchmarkOptions:
     other: Annotated[str, tyro.conf.Positional]
     """Commit to compare with, or the folder of another checkout."""
     quick: bool = False
-    """Measure with counts too small to decide anything."""
+    """Measure with small counts, only to test the benchmark."""
     json: Path | None = None
     """File for the figures."""
 
@@ -164,7 +165,7 @@ def checkout(other: str) -> Iterator[Path]:
             check=False,
         )
         if added.returncode:
-            raise ValueError(f"{other}: got no folder and no commit: {added.stderr.strip()}")
+            raise ValueError(f"{other}: expected a folder or a commit: {added.stderr.strip()}")
         try:
             yield folder
         finally:
@@ -186,12 +187,12 @@ def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
         }
         machines = {side: _ask(worker, "where") for side, worker in workers.items()}
         figures = {contest.title: _compete(contest, workers, rng) for contest in contests(counts)}
-    tunings = tick.tune(counts.osqp, Lateness())
+    tunings = tick.tune(counts.osqp, WakeLateness())
     return {**machines, "contests": figures, "fleets": tick.fleets(counts.osqp, tunings)}
 
 
 def _start(folder: Path) -> subprocess.Popen[str]:
-    """A worker that imports from this folder; closing its stdin ends it."""
+    """Start a worker that imports from this folder; closing its stdin ends it."""
     worker = next((name for name in WORKERS if (folder / name).exists()), None)
     if worker is None:
         raise ValueError(f"{folder}: got a folder without benchmarks, expected a checkout")
@@ -207,7 +208,7 @@ def _start(folder: Path) -> subprocess.Popen[str]:
 
 
 def _ask(worker: subprocess.Popen[str], *turn: Any) -> Any:
-    """The worker's answer to one turn, waited for."""
+    """Let a worker do one turn, and wait for its answer."""
     assert worker.stdin is not None
     assert worker.stdout is not None
     worker.stdin.write(json.dumps(turn) + "\n")
@@ -223,8 +224,8 @@ def _compete(
 ) -> dict[str, Any]:
     """Median and p99 of each side in the contest's unit, and the ratios after / before.
 
-    The ratio of medians is taken turn by turn, each with its neighbour, and the median of these is
-    given: the machine's own pace changes more from second to second than between neighbours.
+    The ratio of medians is computed for each pair of neighbouring turns, and the median of these
+    ratios is returned, because the machine's speed changes little between neighbouring turns.
     """
     turns: dict[str, list[list[float]]] = {side: [] for side in SIDES}
     for _ in progress(range(contest.turns + 1), contest.title):

@@ -1,8 +1,8 @@
-"""A checkout's half of `versions`: takes turns, one a line, and answers with figures.
+"""Worker of `versions` in one checkout: does one turn per line of stdin, and answers with figures.
 
-Each checkout runs its own, so that names may change from one to the other; the turns may not. A
-line of stdin is a JSON list of a turn's name and its arguments; the answer is a line of JSON on
-stdout. No garbage is collected during a turn.
+Each checkout runs its own worker, so names in the package may change between commits; the names and
+arguments of turns must not. A line of stdin is a JSON list of a turn's name and its arguments; the
+answer is a line of JSON on stdout. There is no garbage collection during a turn.
 """
 
 import gc
@@ -24,16 +24,16 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.sim.flight import fly, fly_batch
 
 PLANNING = {"estimate", "trigger", "plan", "solve"}
-"""Laps of the stopwatch between a decoded observation and a horizon; a checkout may lack some."""
+"""Laps of the stopwatch between a decoded observation and a horizon; old checkouts lack some."""
 
 
 def where() -> dict[str, Any]:
-    """The folder that this process imports from, and what `machine` says of it."""
+    """Folder that this process imports from, and the result of `harness.machine`."""
     return {"folder": str(Path(tick.__file__).parents[1]), **machine()}
 
 
 def ticks(name: str, vehicles: int, count: int, paced: bool) -> list[float]:
-    """CPU time of whole ticks per vehicle [ns]: hot without the first, or each after a pause."""
+    """CPU time of whole ticks per vehicle [ns]: hot, without the first; or each after a pause."""
     space, spent = _space(name, vehicles, timed=False), []
     for number in range(count):
         space.prepare()
@@ -62,9 +62,10 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
     """Vehicle-steps per second of CPU time, of one flight in virtual time, or of a batch of seeds.
 
     Args:
-        name: the scenario, flown for so many seconds.
-        vehicles: how many in each flight; a batch has one in each.
-        seeds: how many flights; a single one is flown with the scenario's own seed.
+        name: name of the scenario.
+        seconds: length of a flight [s].
+        vehicles: number of vehicles in each flight; 1 in a batch.
+        seeds: number of flights; a single one is flown with the scenario's own seed.
     """
     scenario = derive(name, duration=seconds, settle=0.0)
     start_ns = time.process_time_ns()
@@ -78,7 +79,7 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
 
 @cache
 def _space(name: str, vehicles: int, *, timed: bool) -> Airspace:
-    """Vehicles that have flown long enough to have left the reference, where they start."""
+    """Vehicles after enough ticks to have left the reference, where they start."""
     stopwatch = Stopwatch(time.process_time_ns) if timed else None
     space = Airspace(_scenarios()[name], vehicles, stopwatch)
     for _ in range(tick.SETTLE):
@@ -94,13 +95,13 @@ def _scenarios() -> dict[str, Scenario]:
 
 def _pause(pause_s: float) -> None:
     time.sleep(pause_s)
-    time.process_time_ns()  # the first call after a pause takes long
+    time.process_time_ns()  # the first call after a pause is slow
 
 
 TURNS: dict[str, Callable[..., Any]] = {
     turn.__name__: turn for turn in (where, ticks, planning, flight)
 }
-"""Functions that a line may ask for, by name."""
+"""Functions of the turns, by name."""
 
 
 def main() -> None:

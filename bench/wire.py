@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness import HOT, Lateness, TextTable, figures_us, interleave, us
+from bench.harness import HOT, TextTable, WakeLateness, figures_us, interleave, us
 from bench.problems import derive
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import (
@@ -56,7 +56,7 @@ def messages(terms: Terms) -> list[Message]:
 def measure(counts: WireCounts) -> dict[str, Any]:
     """Figures of all types, both ways."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
-    lateness = Lateness()
+    lateness = WakeLateness()
     result: dict[str, dict[str, Any]] = {}
     contestants: dict[str, Any] = {NOTHING: lambda _: None}
     for message in messages(terms):

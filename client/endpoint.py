@@ -13,6 +13,7 @@ import msgspec
 
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
+from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import ClientMemory, FlownMotion, SavedState
 from skytether.client.pilot import Pilot
@@ -20,7 +21,6 @@ from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import AutopilotWaits
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
 from skytether.shared.core.events import (
     Failure,
@@ -29,10 +29,7 @@ from skytether.shared.core.events import (
     Flying,
     ModeChanged,
     NotFlown,
-    ServerHeard,
-    ServerSilent,
     StateLeapt,
-    Welcomed,
     address_text,
     metres,
 )
@@ -50,13 +47,6 @@ VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 ARMED = keys_of(InFlight.ARMED)
 """Key with which an operator allows plans to be flown."""
-WAITED_NS = 2 * SECOND_NS
-"""Delay before the log says what a vehicle waits for that cannot be flown yet [ns]."""
-SILENT_NS = 3 * SECOND_NS
-"""Time beyond the time-out after which the server of a vehicle on the ground counts as silent [ns].
-
-The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
-of the packets each way."""
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which the log repeats that the fence limits the vehicle [ns]."""
 AFTER_LEAP = "vehicle.after_leap"
@@ -139,13 +129,7 @@ class Client(Endpoint):
         self._land_after_s = scenario.vehicle.land_after_s
         self._reported_leap: tuple[float, ...] | None = None
         """Latest leap that was reported."""
-        self._waits_for, self._waits_ns, self._reported_wait = "", 0, ""
-        """What is missing before the vehicle can be flown, since when, and what of that was
-        logged."""
-        self._welcomed: int | None = None
-        """Number of the session that was reported while the vehicle is on the ground."""
-        self._silent_ns: int | None = None
-        """Time of the newest packet before the server was reported as silent; None if it is not."""
+        self._ground = GroundReports(vehicle, server, self._timeout_ns, self._events)
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
@@ -315,35 +299,12 @@ class Client(Endpoint):
 
     def _watch_ground(self, now_ns: int) -> None:
         """Report what a vehicle on the ground waits for, and the state of its link."""
-        session, (host, port) = self._session, self._server
-        waits_for = self._flies.waits_for
-        if session.number is None:
-            if self._flies.is_ready:
-                waits_for = f"an answer of the server at {address_text(host, port)}"
-        elif session.number != self._welcomed:
-            self._welcomed = session.number
-            self._events.append(Welcomed(vehicle=self.vehicle, host=host, port=port))
-        else:
-            self._watch_link(now_ns)
-        if waits_for != self._waits_for:
-            self._waits_for, self._waits_ns = waits_for, now_ns
-        if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._reported_wait:
-            self._reported_wait = waits_for
-            if waits_for:
-                self._events.append(AutopilotWaits(vehicle=self.vehicle, waits_for=waits_for))
-
-    def _watch_link(self, now_ns: int) -> None:
-        """Report when the server falls silent, and when it is heard again."""
-        newest_ns = self._session.echo.received_ns
-        if self._silent_ns is not None:
-            if newest_ns > self._silent_ns:
-                silent_s = (newest_ns - self._silent_ns) / SECOND_NS
-                self._events.append(ServerHeard(vehicle=self.vehicle, silent_s=silent_s))
-                self._silent_ns = None
-        elif now_ns - newest_ns > self._timeout_ns + SILENT_NS:
-            self._silent_ns = newest_ns
-            silent_s = (now_ns - newest_ns) / SECOND_NS
-            self._events.append(ServerSilent(vehicle=self.vehicle, silent_s=silent_s))
+        session, waits_for = self._session, self._flies.waits_for
+        if session.number is not None:
+            self._ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
+        elif self._flies.is_ready:
+            waits_for = f"an answer of the server at {address_text(*self._server)}"
+        self._ground.wait(waits_for, now_ns=now_ns)
 
     def _fly(self, now_ns: int) -> None:
         """Fly the step that is due, and report to the server."""
@@ -493,10 +454,12 @@ class Client(Endpoint):
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:
     """Figures of several clients in one process, see `Endpoint.figures`."""
+    others = clients[VEHICLES_TOLD_MAX:]
     return {
         "vehicles": len(clients),
         "missed": sum(client.missed for client in clients),
         "by_vehicle": {
             str(client.vehicle): client.vehicle_figures() for client in clients[:VEHICLES_TOLD_MAX]
         },
+        "others_dropped": by_name(sum((client.dropped for client in others), Counter())),
     }

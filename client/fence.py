@@ -27,7 +27,7 @@ gains by 20 % and dead times by 0.1 s.
 import math
 from collections.abc import Sequence
 
-from skytether.shared.scenario.fence import SLOW_STEPS, inner
+from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 
 ROUNDING = 1e-9
@@ -47,7 +47,7 @@ class Fence:
         self._T = [tau + SLOW_STEPS * dt for tau in terms.tau_s]
         self._brake = scenario.vehicle.brake_mps2
         self._speed = fence.speed_mps or math.inf
-        low, high, self._radius = inner(scenario)
+        low, high, self._radius = inner_bounds(scenario)
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False

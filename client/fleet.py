@@ -22,7 +22,7 @@ def apart_ns(vehicles: int, dt_ns: int) -> int:
     return min(dt_ns, START_NS // vehicles)
 
 
-class Fleet(Endpoint):
+class ClientFleet(Endpoint):
     """Clients driven as one endpoint; client n uses socket n.
 
     Args:

@@ -16,7 +16,7 @@ from skytether.shared.law.model import Array, Model
 from skytether.shared.law.rule import bounded
 from skytether.shared.law.spline import along
 from skytether.shared.law.terms import Terms
-from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, LED
+from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, REFERENCE
 
 TOLD = [GAIN_P, GAIN_V, DISTURBANCE]
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
@@ -119,7 +119,7 @@ class HorizonFollower:
         """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""
         if feedback is not None:
             self._table[:, TABLED] = feedback[:, TOLD]
-            self.reference[:] = feedback[:, LED]
+            self.reference[:] = feedback[:, REFERENCE]
         self._reference_stage = 0
 
     def input_at(

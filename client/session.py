@@ -260,7 +260,7 @@ class ServerSession:
     def rest(self, *, now_ns: int) -> None:
         """Delay the next HELLO of a session that waits for its vehicle to take off."""
         if self.number is not None:
-            self.hello_ns = max(self.hello_ns, now_ns + AGAIN_NS)
+            self.hello_ns = now_ns + AGAIN_NS
 
     def send(self, message: Observation | Close) -> None:
         """Send a message in the session."""

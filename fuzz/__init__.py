@@ -1,4 +1,4 @@
-"""Fuzzing: arbitrary bytes from outside may only raise the documented error.
+"""Fuzzing: arbitrary bytes from outside must only raise the documented errors.
 
 A target (`fuzz.target`) takes bytes, and raises if a guarantee is broken; `fuzz.targets`
 lists all targets, each with its own mutations of valid inputs. `python -m fuzz` feeds

@@ -1,4 +1,4 @@
-"""Fuzzing as a command: guided by coverage with atheris; random without it, or with --count."""
+"""Command that fuzzes: guided by coverage with atheris; random without it, or with --count."""
 
 import argparse
 import multiprocessing
@@ -22,7 +22,7 @@ except ImportError:
 LOOK_EVERY = 100
 """Number of inputs between two checks of the time."""
 GUIDED_SHARE = 0.5
-"""Share of inputs that a target mutates itself, by its knowledge of the format; atheris makes the
+"""Share of inputs that are mutated by the target, which knows the format; atheris mutates the
 rest."""
 SHM = Path("/dev/shm")
 """Folder in memory for files that are rewritten often."""
@@ -56,11 +56,11 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
             done += 1
         before_mb = before_mb or memory_mb()  # allocations made once are complete by now
     took_s, grown_mb = time.monotonic() - begin_s, memory_mb() - before_mb
-    return f"{told(name, done, took_s)}, seed {seed}, no fault, {grown_mb:.1f} MB grown"
+    return f"{rate(name, done, took_s)}, seed {seed}, no fault, memory grew by {grown_mb:.1f} MB"
 
 
-def told(name: str, done: int, took_s: float) -> str:
-    """Number of inputs that a target had, and their rate, in words."""
+def rate(name: str, done: int, took_s: float) -> str:
+    """Number of inputs of a target and their rate, in words."""
     return f"{name}: {done} inputs in {took_s:.0f} s, {done / took_s:.0f} per s"
 
 
@@ -78,9 +78,9 @@ def guided(name: str, folder: Path, seconds: float) -> str:
     begin_s = time.monotonic()
     child.start()
     child.join()
-    said = told(name, int(done.value), time.monotonic() - begin_s)
+    said = rate(name, int(done.value), time.monotonic() - begin_s)
     if child.exitcode:
-        print(f"{said}, guided, and then a fault", file=sys.stderr)
+        print(f"{said}, guided, until a fault was found", file=sys.stderr)
         raise SystemExit(1)
     return f"{said}, guided, no fault"
 
@@ -114,11 +114,9 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
 def main() -> None:
     """Run targets for a time, or a number of inputs."""
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=main.__doc__)
-    parser.add_argument("--target", choices=TARGETS, help="what is fuzzed; left out: all")
-    parser.add_argument(
-        "--seconds", type=float, help="how long in all, guided where atheris is there"
-    )
-    parser.add_argument("--count", type=int, help="how many random inputs of each target")
+    parser.add_argument("--target", choices=TARGETS, help="what is fuzzed; default: all")
+    parser.add_argument("--seconds", type=float, help="total time; guided if atheris is installed")
+    parser.add_argument("--count", type=int, help="number of random inputs of each target")
     parser.add_argument("--jobs", type=int, default=1, help="processes, for --count")
     parser.add_argument("--seed", type=int, default=1, help="seed of the first process")
     given = parser.parse_args()

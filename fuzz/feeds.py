@@ -61,7 +61,7 @@ class FeedTarget(Text):
         """Decode the feed, at once and in pieces."""
         whole, size = read(payload), len(payload) // PIECES + 1
         pieces = [payload[size * i : size * (i + 1)] for i in range(PIECES)]
-        # As texts, for figures may be NaN, which equals nothing.
+        # Compared as texts, because figures may be NaN, which is not equal to itself.
         assert repr(read(*pieces)) == repr(whole), payload.hex()
         for frame in whole or ():
             assert read(feed.encode(frame)) is not None, payload.hex()

@@ -1,7 +1,7 @@
-"""Target for recordings: carefully altered files, and everything that commands make of them.
+"""Target for recordings: altered files are read, exported, joined and reported.
 
-Each is read as `export`, `join` and `report` read it: it is accepted, or `RecordingError` says why
-not; and reading takes little memory, whatever sizes the file claims.
+A file is accepted, or refused with `RecordingError`; and reading takes little memory, whatever
+sizes the file claims.
 """
 
 import io
@@ -117,7 +117,7 @@ def written(found: list[Any]) -> bytes:
 
 
 def of_topic(found: list[Any], topic: str) -> list[int]:
-    """Positions of the messages on topics that begin so."""
+    """Positions of the messages on topics with this prefix."""
     numbers = {e.id for e in found if isinstance(e, Channel) and e.topic.startswith(topic)}
     return [i for i, e in enumerate(found) if isinstance(e, Message) and e.channel_id in numbers]
 
@@ -327,7 +327,7 @@ def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
 
 
 class RecordingFile(Target):
-    """Target for a recording's file: it is refused, or all that commands make of it can be made."""
+    """Target for a recording's file: it is refused, or can be read, exported and reported."""
 
     code = (container, export, feed, recorded, rows, summaries)
     largest = 256 * 1024

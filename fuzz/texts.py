@@ -1,6 +1,7 @@
 """Targets for texts: scenarios, requests for changes in flight, and output of processes."""
 
 import importlib
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,13 +14,14 @@ from fuzz.datagrams import SCENARIOS, EndpointInFlight
 from fuzz.mutators import text_changed, words_of
 from fuzz.target import Target, flown
 from skytether.netem.proxy import Proxy
+from skytether.probe import recorded as captures
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
 from skytether.shared.scenario import contradictions, grammar, mission, reading, reference, zones
-from skytether.shared.scenario.air import traces
+from skytether.shared.scenario.air import pings, recorded, traces
 from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, File
@@ -47,7 +49,7 @@ class Text(Target):
     """Target that takes text.
 
     Args:
-        known: texts to begin with.
+        known: texts that are mutated.
         words: replacements for tokens, besides the words of these texts.
     """
 
@@ -67,7 +69,9 @@ class Text(Target):
 
 
 class ScenarioFile(Text):
-    """Target for a scenario file: it raises `ConfigError`, or it can be agreed upon and flown."""
+    """Target for a scenario file: it raises `ConfigError`, or gives a scenario that can be
+    flown.
+    """
 
     code = (
         reading,
@@ -105,14 +109,25 @@ class ScenarioFile(Text):
         assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
 
 
+def capture(later_s: int) -> bytes:
+    """Capture of four packets of a flow each way, with times that are so much later."""
+    parts = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101)]
+    for number in range(8):
+        udp = struct.pack(">HHHH", 5 + number % 2, 6 - number % 2, 16, 0) + b"packet %d" % number
+        frame = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0) + bytes(8) + udp
+        time_s = number + later_s * (-1) ** number
+        parts.append(struct.pack("<IIII", time_s + 50, 0, len(frame), len(frame)) + frame)
+    return b"".join(parts)
+
+
 class NamedFiles(Text):
-    """Target for files that a scenario names: tables, zones, traces, and keys.
+    """Target for files that a scenario names: tables, zones, traces, captures, and keys.
 
     The first byte of an input chooses the reader, which raises an error for the user, or gives
     values that can be flown.
     """
 
-    code = (reference, mission, zones, traces, keys)
+    code = (reference, mission, zones, recorded, pings, traces, captures, keys)
     largest = 20_000
 
     def __init__(self, folder: Path) -> None:
@@ -129,20 +144,34 @@ class NamedFiles(Text):
             "vehicle,t,x,y\n1,0,0,0\n1,5,4,4\n2,0,9,0\n",
             f'{{"type":"FeatureCollection","units":"m","features":[{box},{point}]}}',
             "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
+            "timestamp,rtt\n1700000000000,20\n1700000000200,-1\n",
             "\n".join(map(row.format, (1, 2, 4))),
+            (
+                f"PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.\n[17.2] {row.format(65535)}\n"
+                "2 packets transmitted, 1 received, 50% packet loss, time 812ms"
+            ),
+            (
+                "Pinging 192.0.2.1 with 32 bytes of data:\nReply from 192.0.2.1: time<1ms\nlost\n\n"
+                "    Packets: Sent = 4, Received = 2, Lost = 2 (50% loss)"
+            ),
+            (
+                "$ fping -p 200 h\nh : [0], 64 bytes, 20.1 ms\nh : [1], timed out\n"
+                "h : xmt/rcv/%loss = 3/1/66%"
+            ),
             f'{{"round_trips":[{trip % 5},{trip % 9}]}}',
             "0\n3\n3\n17\n",
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
-        kinds = b"\0\1\2\3\3\3\4\5"
+        kinds = b"\0\1\2" + 7 * b"\3" + b"\4\6"
         known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
+        known.append(b"\5" + capture(0) + capture(9))
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
 
     def __call__(self, payload: bytes) -> None:
         """Read the file."""
         self._path.write_bytes(payload[1:])
         with suppress(ConfigError, GrammarError, ValueError):
-            match (payload or b"\0")[0] % 6:
+            match (payload or b"\0")[0] % 7:
                 case 0:
                     assert np.isfinite(reference.from_csv(payload[1:], 2)(SAMPLES_S)).all()
                 case 1:
@@ -151,11 +180,16 @@ class NamedFiles(Text):
                     file = File("it", payload[1:])
                     zones.parse("geojson(it)", 2, (file,)).clearance(np.zeros((2, 2)))
                 case 3:
-                    found = traces.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
-                    assert np.isfinite(found.delay_s[~found.lost]).all()
+                    found = recorded.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
+                    assert np.isfinite(found.delay_s).all()
+                    assert (np.diff(found.time_s) > 0.0).all()
                 case 4:
                     times_s = traces.deliveries_in.__wrapped__(File("it", payload[1:]))
                     assert np.isfinite(times_s).all()
+                case 5:
+                    half = (len(payload) + 1) // 2
+                    measured = captures.of_captures(payload[1:half], payload[half:])
+                    assert len(measured.uplink.sent_ns) > 1
                 case _:
                     keys.parse("it", payload[1:])
 
@@ -192,7 +226,7 @@ class ControlTarget(Text, EndpointInFlight):
             assert bool(said.changed) == (running.scenario != before), payload.hex()
             assert not (said.refused and said.changed), payload.hex()
             reading.check(reading.to_table(running.scenario), known=running.scenario)
-        running._endpoint.events()  # no other sender asks netem
+        running._endpoint.events()  # nobody else empties netem's events
 
 
 class LogLines(Text):

@@ -32,18 +32,19 @@ default of 700 would scan all of them many times a second."""
 class NetemOptions(ProcessOptions):
     """Options of `skytether netem`."""
 
+    scenario: command.ScenarioName = "transparent"
+    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
     brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
     address if it has one."""
     server: str = "127.0.0.1:47001"
     """HOST:PORT of the server; its address family may differ from the clients'."""
-    uplink: str | None = None
-    """Impairments of packets from the server to clients, joined by &, as in "constant(0.05) &
-    loss(0.1)", see `skytether impairments`. They replace the scenario's; if only one of uplink and
-    downlink is given, the other has no impairments."""
-    downlink: str | None = None
-    """Impairments of packets from clients to the server, written as for uplink."""
+    to_client: str | None = None
+    """Impairments of packets from the server to clients, joined by &, as in "constant(50ms) &
+    loss(10%)", see `skytether impairments`; the key network.uplink of a scenario."""
+    to_server: str | None = None
+    """Impairments of packets from clients to the server; the key network.downlink."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once, each of which takes a socket; by default 512, or as many
     as the system allows."""
@@ -54,11 +55,11 @@ def emulate(argv: Sequence[str]) -> None:
 
     It carries any UDP. Clients send to --bind instead of the server:
 
-        skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --uplink "constant(0.05)"
-            --downlink "gamma(0.02, 0.08, 0.03) & loss(0.05) & rate(125000, queue=30000)"
+        skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --to-client "constant(50ms)"
+            --to-server "gamma(20ms, 80ms, 30ms) & loss(5%) & rate(1mbit, queue=30000)"
 
-    SIGUSR1 prints the counters so far; they are also printed at the end. With --control, `skytether
-    set` changes the impairments meanwhile. Without --uplink and --downlink they are the scenario's.
+    Without these, packets pass at once. SIGUSR1 prints the counters so far; they are also printed
+    at the end. With --control, `skytether set` changes the impairments meanwhile.
     """
     gc.set_threshold(COLLECT_AFTER)
     options = _with_directions(
@@ -75,16 +76,16 @@ def emulate(argv: Sequence[str]) -> None:
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options with the network that --uplink and --downlink describe.
+    """Options with the network that --to-client and --to-server describe.
 
     Raises:
-        ConfigError: the scenario cannot be flown with it.
+        ConfigError: there is no such network.
     """
     table = reading.to_table(options.config)
-    if not (options.uplink is None and options.downlink is None):
-        table["network"] |= {"uplink": options.uplink or "", "downlink": options.downlink or ""}
+    given = {"uplink": options.to_client, "downlink": options.to_server}
+    table["network"] |= {key: text for key, text in given.items() if text is not None}
     source = f"{options.scenario} and the command line"
-    return replace(options, config=reading.check(table, source))
+    return replace(options, config=reading.check(table, source, any_network=True))
 
 
 def _check_server(server: Address, bind: Address) -> None:

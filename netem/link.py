@@ -78,6 +78,8 @@ class Counts:
     """UDP payload of these [B]."""
     forwarded: int = 0
     """Packets that have left."""
+    undelivered: int = 0
+    """Packets that could not be sent on, or were refused on their way; they are not forwarded."""
     lost: int = 0
     """Packets lost by impairments."""
     reordered: int = 0
@@ -366,6 +368,7 @@ class Link:
             "packets": counts.packets,
             "bytes": counts.bytes,
             "forwarded": counts.forwarded,
+            "undelivered": counts.undelivered,
             "lost": counts.lost,
             "reordered": counts.reordered,
             "oversized": counts.oversized,

@@ -6,7 +6,8 @@ is server to client, downlink is client to server.
 
 If no place is free for a new client, `places` says which flow it replaces. A server address that
 leads back to netem is detected: until the server has sent its first packet, a packet that has come
-from LAPS_MAX new addresses, one after another, opens no further flow.
+from LAPS_MAX new addresses, one after another, opens no further flow. The first packet that is too
+long, and the first that does not reach the server, are reported.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from skytether.shared.core.endpoint import (
     host_of,
     make_datagram,
 )
-from skytether.shared.core.events import Fault, FlowOpened, Returned
+from skytether.shared.core.events import Fault, FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
@@ -62,7 +63,7 @@ class Proxy(Endpoint):
         self._flows_max = flows
         self._scenario = scenario
         self._server = server
-        mtu = scenario.network.mtu
+        self._mtu = mtu = scenario.network.mtu
         self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink)
         self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink)
         self._places = Places(flows)
@@ -72,6 +73,10 @@ class Proxy(Endpoint):
         """Whether the server has ever sent a packet."""
         self._is_looped = False
         """Whether a loop of packets was reported."""
+        self._is_too_long = False
+        """Whether a packet was too long."""
+        self._is_unreachable = False
+        """Whether packets to the server have failed since it last answered."""
         self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
         """Until the server answers: laps of each of the newest packets, and its latest client, by
         digest of the packet."""
@@ -84,6 +89,9 @@ class Proxy(Endpoint):
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Process a packet that enters the network."""
         payload, peer, socket = datagram
+        if len(payload) > self._mtu and not self._is_too_long:
+            self._is_too_long = True
+            self._events.append(TooLong(size=len(payload), most=self._mtu))
         # Clients send to socket 0.
         if socket == 0:
             flow = self._places.find(peer) or self._open(datagram, now_ns)
@@ -102,7 +110,7 @@ class Proxy(Endpoint):
                 return
             onward = make_datagram((payload, flow.client, 0))
             may_leave = self.uplink.accept(onward, flow.uplink, now_ns=now_ns)
-            self._is_answered = True
+            self._is_answered, self._is_unreachable = True, False
             self._passed.clear()
         if flow.uplink.fates.fault or flow.downlink.fates.fault:
             self._report_faults(flow)
@@ -116,6 +124,16 @@ class Proxy(Endpoint):
             if lane.fates.fault and lane.fates.fault not in self._faults:
                 self._faults.add(lane.fates.fault)
                 self._events.append(Fault(traceback=lane.fates.fault))
+
+    def undelivered(self, socket: int, reason: str) -> None:
+        """See `Endpoint`; of clients, which come and go, it is counted only."""
+        counts = self.downlink.counts if socket else self.uplink.counts
+        counts.forwarded -= 1
+        counts.undelivered += 1
+        if socket and not self._is_unreachable:
+            self._is_unreachable = True
+            host, port = self._server
+            self._events.append(Unreachable(host=host, port=port, reason=reason))
 
     def wake(self, *, now_ns: int) -> None:
         """Send the packets that are due."""

@@ -19,7 +19,14 @@ from skytether.server.budget import SharedBudget
 from skytether.server.common import splines
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import DOUBTS, Batch, Figures, Fleet, Scheme, foresight
+from skytether.server.common.scheme import (
+    LOSS_CASES,
+    Batch,
+    Figures,
+    Fleet,
+    Scheme,
+    empty_foresight,
+)
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.schemes import table
@@ -29,7 +36,7 @@ from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.scenario.triggers import KnownArrays, Situation, Verdict, make_trigger
+from skytether.shared.scenario.triggers import Situation, SituationArrays, Verdict, make_trigger
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
@@ -168,8 +175,8 @@ class Controller:
         """Use another trigger from the next step on; it has no memory of what was sent."""
         terms = self._terms
         self._trigger = make_trigger(control, self._capacity, self.faults.append)
-        doubts = DOUBTS if self._trigger.doubts else 0
-        self._foresight = arrays = foresight(
+        doubts = LOSS_CASES if self._trigger.doubts else 0
+        self._foresight = arrays = empty_foresight(
             self._block,
             terms.axes,
             terms.planned,
@@ -177,7 +184,7 @@ class Controller:
             doubts,
             splines=terms.splines,
         )
-        self._trigger_inputs = KnownArrays(
+        self._trigger_inputs = SituationArrays(
             model=terms.model,
             dt_s=terms.dt_s,
             planned=terms.planned,

@@ -24,7 +24,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.mission import Guided, given
+from skytether.shared.scenario.mission import Guided, parse_goals
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.pace import first_too_fast
 from skytether.shared.scenario.reference import Reference
@@ -93,7 +93,7 @@ class Server(Endpoint):
         self._guided: Guided | None = None
         """Goals of a mission; None without one."""
         if scenario.is_mission and references:
-            goals = given(scenario.mission.goals, scenario.model.axes)
+            goals = parse_goals(scenario.mission.goals, scenario.model.axes)
             self._guided = Guided(references, goals)
             references = lru_cache(capacity)(self._guided.of)
         self.stopwatch = stopwatch or Stopwatch()
@@ -178,7 +178,7 @@ class Server(Endpoint):
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
         if keys & GOALS and self._guided:
-            self._guided.goals = given(scenario.mission.goals, scenario.model.axes)
+            self._guided.goals = parse_goals(scenario.mission.goals, scenario.model.axes)
         if keys & ZONES:
             self.controller.scheme.change_zones(scenario.zones)
         if keys & POINT:

@@ -15,7 +15,7 @@ class ReplyPath(Protocol):
         """Datagram that carries a message to the peer."""
 
 
-class Call(NamedTuple):
+class GateCall(NamedTuple):
     """A message and its sender."""
 
     payload: bytes
@@ -35,14 +35,14 @@ class Gate(Protocol):
     secure: bool
     """Whether messages returned by `open` are authenticated."""
 
-    def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
+    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
         """Message in a datagram; None if it was part of a handshake.
 
         Raises:
             ProtocolError: it is not from a vehicle.
         """
 
-    def admit(self, call: Call, *, now_ns: int) -> None:
+    def admit(self, call: GateCall, *, now_ns: int) -> None:
         """Accept the vehicle whose HELLO is in this call: its further packets are opened."""
 
     def outbox(self) -> list[Datagram]:
@@ -54,11 +54,11 @@ class PlainGate:
 
     secure = False
 
-    def open(self, datagram: Datagram, *, now_ns: int) -> Call:  # noqa: ARG002 - as of any `Gate`
+    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - as of any `Gate`
         """See `Gate`."""
-        return Call(datagram.payload, None, _PLAIN_REPLY, moves=True)
+        return GateCall(datagram.payload, None, _PLAIN_REPLY, moves=True)
 
-    def admit(self, call: Call, *, now_ns: int) -> None:
+    def admit(self, call: GateCall, *, now_ns: int) -> None:
         """See `Gate`."""
 
     def outbox(self) -> list[Datagram]:

@@ -9,7 +9,7 @@ from collections import Counter, deque
 
 from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.server.controller import Controller
-from skytether.server.gate import Call, Gate
+from skytether.server.gate import Gate, GateCall
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
@@ -121,8 +121,12 @@ class Reception:
         self._report_ns = 0
         """Time from which these may be reported again."""
 
-    def hear(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it."""
+    def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
+        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it.
+
+        Returns:
+            Why it was dropped; None if it was not.
+        """
         self._stopwatch.start()
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
@@ -131,19 +135,22 @@ class Reception:
             self._unauthenticated += 1
             if now_ns >= self._report_ns:
                 self._report_unauthenticated(datagram.peer, error.reason, now_ns)
-            return
+            return error.reason
         finally:
             self._stopwatch.lap("open")
         if call is None:
             self._out += self._gate.outbox()
-            return
+            return None
+        dropped = None
         try:
             self._take(call, datagram.peer, now_ns)
         except ProtocolError as error:
-            self.dropped[error.reason] += 1
+            dropped = error.reason
+            self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
+        return dropped
 
-    def _take(self, call: Call, address: Address, now_ns: int) -> None:
+    def _take(self, call: GateCall, address: Address, now_ns: int) -> None:
         """Process one message.
 
         Raises:
@@ -172,7 +179,7 @@ class Reception:
         self._events.append(event)
         self._report_ns = now_ns + REPORT_NS
 
-    def _hello(self, hello: Hello, call: Call, address: Address, now_ns: int) -> None:
+    def _hello(self, hello: Hello, call: GateCall, address: Address, now_ns: int) -> None:
         row = self._sessions.row_of_other_life(hello)
         if row is not None and self._controller.scheme.restart(row):
             self._events.append(BegunAnew(vehicle=hello.vehicle))
@@ -209,7 +216,9 @@ class Reception:
             self._events.append(event)
         return refusal
 
-    def _observe(self, observation: Observation, call: Call, address: Address, now_ns: int) -> None:
+    def _observe(
+        self, observation: Observation, call: GateCall, address: Address, now_ns: int
+    ) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
         row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
         # A round trip of half an hour or more is impossible: it becomes negative and is rejected.
@@ -285,7 +294,7 @@ class Reception:
         self._controller.forget(row)
         self._sessions.idle[row] = Idle.PLANS
 
-    def _begin(self, observation: Observation, call: Call, now_ns: int) -> Session:
+    def _begin(self, observation: Observation, call: GateCall, now_ns: int) -> Session:
         """Open the session of a first observation."""
         session = self._sessions.begin(observation, now_ns)
         session.line = call.line

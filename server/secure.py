@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from skytether.server.gate import Call
+from skytether.server.gate import GateCall
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Form
 from skytether.shared.wire import channel, handshake
@@ -191,7 +191,7 @@ class SecureGate:
         """Vehicles with a key that have returned a valid cookie."""
         self._out: deque[Datagram] = deque(maxlen=OUT_MAX)
 
-    def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
+    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
         """Message in a datagram; None for an INITIATION whose answer is in the outbox.
 
         Raises:
@@ -204,7 +204,7 @@ class SecureGate:
                 return self._initiation(datagram, now_ns)
         raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def admit(self, call: Call, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
+    def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
         """Keep the channel created by the answer to this HELLO as pending."""
         answer = call.line
         assert isinstance(answer, _Answer)
@@ -226,7 +226,7 @@ class SecureGate:
             if keyed.find(number) is None:
                 return int(number)
 
-    def _data(self, packet: bytes, now_ns: int) -> Call:
+    def _data(self, packet: bytes, now_ns: int) -> GateCall:
         vehicle, number = channel.address(packet)
         keyed = self._vehicles.get(vehicle)
         used = None if keyed is None else keyed.find(number)
@@ -236,9 +236,9 @@ class SecureGate:
         check_place(payload, in_handshake=False)
         if number in keyed.pending:
             keyed.promote(number, now_ns)
-        return Call(payload, vehicle, used, moves=newest and used is keyed.live)
+        return GateCall(payload, vehicle, used, moves=newest and used is keyed.live)
 
-    def _initiation(self, datagram: Datagram, now_ns: int) -> Call | None:
+    def _initiation(self, datagram: Datagram, now_ns: int) -> GateCall | None:
         """HELLO of an INITIATION with a valid cookie; otherwise answers with a CHALLENGE.
 
         Repeats of an attempt get new answers while the rate limit grants them, and then the
@@ -278,7 +278,7 @@ class SecureGate:
             raise ProtocolError(Drop.FORGED) from None
         hello = unpad(noise.payload)
         check_place(hello, in_handshake=True)
-        return Call(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)
+        return GateCall(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)
 
     def _is_valid(self, cookie: bytes, peer: Address, now_ns: int) -> bool:
         """Whether a cookie is valid for the sender now."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Batch, Head, make_head
+from skytether.server.common.scheme import Batch, Header, make_header
 from skytether.server.controller import BLOCK, Controller, Decisions
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
@@ -193,12 +193,12 @@ class Ticker:
         # stamp.
         sessions, sent_us = self._sessions, stamp_us(now_ns)
 
-        def head(row: int) -> Head:
+        def header(row: int) -> Header:
             session = sessions.at(row)
             number, silence = session.number_next(now_ns), session.hearing.silence
-            return make_head((session.vehicle, session.number, sent_us, number, silence))
+            return make_header((session.vehicle, session.number, sent_us, number, silence))
 
-        for row, payload in self._controller.scheme.encode(batch, head):
+        for row, payload in self._controller.scheme.encode(batch, header):
             self._send(sessions.at(row), payload, is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
@@ -231,7 +231,7 @@ class Ticker:
             self._record_plans(self._plans, batch)
         if self._recorder is None:
             return
-        rows, predicted = batch.rows, batch.found
+        rows, predicted = batch.rows, batch.foresight
         n = len(rows)
         self._recorder.append(
             n,
@@ -262,7 +262,7 @@ class Ticker:
         solved = figures["solved"]
         if not solved.all():
             columns = {name: np.where(solved, figure, missing) for name, figure in columns.items()}
-        if EXPECTED_GAP in columns and not decisions.batch.found.doubt.size:
+        if EXPECTED_GAP in columns and not decisions.batch.foresight.loss_probability.size:
             columns[EXPECTED_GAP] = missing
         columns[OWN] = verdict.figure if verdict.compared is Compared.OWN else missing
         return columns
@@ -273,5 +273,5 @@ class Ticker:
             len(batch.sent),
             vehicle=self._sessions.vehicle[batch.rows[batch.sent]],
             **sent_plans._asdict(),
-            disturbance=batch.found.disturbance[batch.sent],
+            disturbance=batch.foresight.disturbance[batch.sent],
         )

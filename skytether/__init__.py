@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skytether.library.flight import Column, Flight
+    from skytether.library.flight import Column, Flight, table
     from skytether.library.flying import check, fly, fly_batch, load
     from skytether.library.sweeping import Swept, sweep
     from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
@@ -39,10 +39,11 @@ __all__ = [
     "fly_batch",
     "load",
     "sweep",
+    "table",
 ]
 
 _HOMES = {
-    "skytether.library.flight": ("Column", "Flight"),
+    "skytether.library.flight": ("Column", "Flight", "table"),
     "skytether.library.flying": ("check", "fly", "fly_batch", "load"),
     "skytether.library.sweeping": ("Swept", "sweep"),
     "skytether.shared.base.errors": ("ConfigError", "FlightError", "RecordingError"),

@@ -23,7 +23,7 @@ reorders and loses their packets.
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
-  duel ONE OTHER        two scenarios on the same network, side by side on one page
+  duel SCENARIO...      two or more scenarios on the same network, side by side on one page
   replay FILE           a recording on the page that showed the flight
   page FOLDER...        the page of flights in a browser; `fly` serves one by itself
   report FILE           a recording as a page with figures, for the browser

@@ -3,7 +3,7 @@
 They bring the server's packages, which no other plug-in needs. docs/schemes.md has such a plug-in.
 """
 
-from skytether.server.common.scheme import Batch, Fleet, Foresight, Head, Scheme, SentPlans
+from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.server.common.splines import SplineScheme
 from skytether.server.schemes.horizons import InputScheme
 from skytether.shared.law.model import Flags, Indices
@@ -15,7 +15,7 @@ __all__ = [
     "Flags",
     "Fleet",
     "Foresight",
-    "Head",
+    "Header",
     "Indices",
     "InputScheme",
     "Observation",

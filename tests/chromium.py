@@ -8,8 +8,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from skytether.view.words import FLOWN_S
 
@@ -25,6 +26,8 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
 )
 """Flags that make Chromium render in software."""
+SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
+"""What a browser may prefer."""
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
 PATIENCE_S = 90.0
@@ -68,9 +71,14 @@ def served(*arguments: str) -> Iterator[str]:
 
 
 @contextmanager
-def opened(browser: "Browser", address: str, size: str = "wide") -> "Iterator[Page]":
+def opened(
+    browser: "Browser",
+    address: str,
+    size: str = "wide",
+    prefers: Literal["dark", "light"] = "dark",
+) -> "Iterator[Page]":
     width, height = SIZES[size]
-    page = browser.new_page(viewport={"width": width, "height": height})
+    page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=prefers)
     page.goto(address)
     yield page
     page.close()
@@ -129,15 +137,11 @@ def picture(page: "Page", file: Path) -> None:
 
 
 def pictures(browser: "Browser", address: str, folder: Path) -> None:
-    for size in SIZES:
-        with opened(browser, address, size) as page:
+    for size, prefers in product(SIZES, SCHEMES):
+        with opened(browser, address, size, prefers) as page:
             until(lambda page=page: "TRACK" in status(page), "it flies a plan")
             until(lambda page=page: flown_s(page) > SHOWN_S, "it has flown for a while")
-            picture(page, folder / f"flight-dark-{size}.png")
-            page.get_by_label("Light page").click()
-            page.wait_for_timeout(1000)
-            picture(page, folder / f"flight-light-{size}.png")
-            if size == "wide":
-                page.get_by_role("tab", name="Network").click()
-                page.wait_for_timeout(2000)
-                picture(page, folder / f"network-light-{size}.png")
+            picture(page, folder / f"flight-{prefers}-{size}.png")
+            page.get_by_role("tab", name="Network").click()
+            page.wait_for_timeout(2000)
+            picture(page, folder / f"network-{prefers}-{size}.png")

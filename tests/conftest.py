@@ -6,6 +6,8 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
@@ -40,6 +42,8 @@ kernel.check_types()
 os.environ.setdefault("SKYTETHER_PAGE", "none")
 # Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests start hundreds of processes; none shall compile anew what another has.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # What a client keeps for its next life is not found by that of another test.
 _STATES = tempfile.mkdtemp(prefix="skytether-states-")
 atexit.register(shutil.rmtree, _STATES, ignore_errors=True)
@@ -53,6 +57,20 @@ FIRST = (
     *("test_trajectory.py", "test_kernel.py", "test_slow.py", "test_loopback.py"),
 )
 """Files that take longest: they begin first, so that no other worker waits for them at the end."""
+
+
+COMPILE = """
+import skytether.quadrotor.loops, skytether.server.__main__, skytether.sim.flight
+from skytether.shared.base import kernel
+from skytether.shell import terminal
+terminal.prepare(kernel.missing())
+"""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what flies before the first test: flights over UDP wait for no compiler."""
+    if not hasattr(session.config, "workerinput"):
+        subprocess.run([sys.executable, "-P", "-c", COMPILE], check=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -18,7 +18,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.core.events import Fault
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.driver import Shell
@@ -50,7 +50,7 @@ def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
 def demo_with(**keys: Any) -> Scenario:
     """The scenario `demo-committed` with some keys changed: `control__dt=0.1` is `control.dt`."""
     table = reading.to_table(reading.load("demo-committed"))
-    lay({key.replace("__", "."): value for key, value in keys.items()}, table)
+    set_keys({key.replace("__", "."): value for key, value in keys.items()}, table)
     return reading.check(table, "test")
 
 

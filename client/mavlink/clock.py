@@ -112,6 +112,12 @@ class BootClock:
             return None
         return boot_passed_ns / passed_ns
 
+    @property
+    def rate_fault(self) -> str:
+        """Rate of a clock that cannot be followed, in words; empty if it can be."""
+        rate = self.wrong_rate
+        return "" if rate is None else f"{rate:.3g}, expected 1 within {DRIFT_MAX:.0%}"
+
     def ask(self, *, now_ns: int) -> int:
         """Time stamp for a question sent now."""
         self._questions.append(now_ns)

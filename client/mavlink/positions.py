@@ -14,6 +14,7 @@ from skytether.mavlink.codec import Message
 from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.scenario.reference import FAR_M
+from skytether.shared.scenario.schema import Scenario
 
 WAITING_MAX = 64
 """Number of measurements waiting to be read; the oldest are dropped."""
@@ -44,6 +45,26 @@ FAULTS = {
 """Reasons for dropping a position, in words."""
 
 Vector = tuple[float, float, float]
+
+
+def take_off_place(scenario: Scenario, vehicle: int) -> Vector:
+    """Position of take-off, in our axes [m]; on a mission, below its start position."""
+    if not scenario.is_mission:
+        return 0.0, 0.0, 0.0
+    x, y = scenario.start_m(vehicle)[:2].tolist()
+    return x, y, 0.0
+
+
+def given_origin(scenario: Scenario) -> Vector | None:
+    """Origin given by a scenario, in our axes [m]; None if it is the place of take-off."""
+    match scenario.mavlink.origin:
+        case "takeoff":
+            return None
+        case "autopilot":
+            return 0.0, 0.0, 0.0
+        case (x, y, *up):
+            return float(x), float(y), float(up[0]) if up else 0.0
+    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused anything else
 
 
 class Positions:

@@ -8,10 +8,13 @@ A required parameter that the autopilot does not have makes it unsafe; any other
 missing.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from skytether.shared.core.aboard import AutopilotParameter
+from skytether.shared.law.model import ALTITUDE
+from skytether.shared.scenario.schema import Scenario
 
 SILENCE_MAX_S = 1.0
 """Longest time for which a vehicle may fly on without set-points [s]."""
@@ -19,6 +22,16 @@ SILENCE_MIN_S = 0.2
 """Shortest usable time-out if set-points arrive at 10 Hz [s]."""
 TOLERANCE = 1e-6
 """Rounding error of a decimal number stored as float32."""
+
+
+def returns_below_m(scenario: Scenario) -> float | None:
+    """Altitude below which a vehicle without a link returns home [m], infinite without a fence;
+    None for a vehicle that lands where it is.
+    """
+    if scenario.vehicle.on_loss != "return":
+        return None
+    high = scenario.fence.high_m[ALTITUDE:]
+    return high[0] if high else math.inf
 
 
 class Rule(NamedTuple):

@@ -196,7 +196,9 @@ class Setup:
             self._begin_setting(unsafe)
         if not self.is_done and not self._tries:
             wrong = tuple(unsafe.values())
-            self.failure = ParametersUnsafe(vehicle=self._vehicle, parameters=wrong)
+            self.failure = ParametersUnsafe(
+                vehicle=self._vehicle, parameters=wrong, sets=self._sets
+            )
             self._events.append(self.failure)
 
     def _begin_setting(self, unsafe: Mapping[Rule, AutopilotParameter]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from skytether.client.mavlink.flavours import ARDUPILOT, Flavour
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import SECOND_NS
@@ -14,6 +15,31 @@ WINDOW_NS = 2 * SECOND_NS
 LEAST = 3.0
 BACK_OFF_MAX = 8
 """Longest window, as a multiple of the shortest: some streams are silent for long."""
+RATES = {
+    int(dialect.MAVLINK_MSG_ID_HEARTBEAT): 5.0,  # so that a pilot's mode switch is seen at once
+    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
+    int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,
+    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 2.0,
+    int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): 1.0,
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.5,
+}
+"""Requested rates [Hz], beside those of positions and of the estimator status."""
+
+
+def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
+    """Requested rate of each message [Hz], by its number.
+
+    Args:
+        flavour: which autopilot.
+        positions_hz: rate of positions [Hz].
+    """
+    estimate = (
+        dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+        if flavour is ARDUPILOT
+        else dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+    )
+    position = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    return RATES | {position: positions_hz, int(estimate): 5.0}
 
 
 class _Stream:

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.client.mavlink.port import Port, given_origin
+from skytether.client.mavlink.port import Port
+from skytether.client.mavlink.positions import given_origin
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import AboardFailure
@@ -40,15 +41,16 @@ class MavlinkVehicle(Vehicle):
         line = parse_line("vehicle.address", scenario.vehicle.address)
         self._may_arm = scenario.armed
         self._port = self.port = Port(scenario, number, line, altitude(scenario, number))
+        self._autopilot = self._port.autopilot
 
     @property
     def failure(self) -> AboardFailure | None:  # type: ignore[override] # it comes of itself
         """See `Vehicle`."""
-        return self._port.failure
+        return self._autopilot.failure
 
     def set_parameters(self) -> bool:
         """See `Vehicle`."""
-        self._port.sets_parameters = True
+        self._autopilot.sets_parameters = True
         return True
 
     def fly(self, velocity: Array) -> None:
@@ -58,17 +60,17 @@ class MavlinkVehicle(Vehicle):
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
         """See `Vehicle`."""
-        return self._port.positions.take(now_ns=now_ns)
+        return self._autopilot.positions.take(now_ns=now_ns)
 
     @property
     def is_ready(self) -> bool:
         """See `Vehicle`."""
-        return self._port.is_ready
+        return self._autopilot.is_ready
 
     @property
     def waits_for(self) -> str:
         """See `Vehicle`."""
-        return self._port.waits_for
+        return self._autopilot.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
         """See `Vehicle`; a vehicle on the ground is armed only if its scenario is."""
@@ -81,20 +83,20 @@ class MavlinkVehicle(Vehicle):
     @property
     def took_off(self) -> bool:
         """See `Vehicle`."""
-        return self._port.took_off
+        return self._autopilot.took_off
 
     @property
     def frame(self) -> VehicleMemory:
         """See `Vehicle`."""
-        return self._port.frame
+        return self._autopilot.frame
 
     def recall(self, frame: VehicleMemory) -> None:
         """See `Vehicle`."""
-        self._port.recall(frame)
+        self._autopilot.recall(frame)
 
     def arm(self) -> None:
         """See `Vehicle`."""
-        self._port.arm()
+        self._autopilot.arm()
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
         """See `Vehicle`."""
@@ -103,11 +105,11 @@ class MavlinkVehicle(Vehicle):
     @property
     def leap_m(self) -> tuple[float, ...] | None:  # type: ignore[override] # it comes of itself
         """See `Vehicle`."""
-        return self._port.positions.leap_m
+        return self._autopilot.positions.leap_m
 
     def decide(self, *, keeps_frame: bool) -> None:
         """See `Vehicle`."""
-        self._port.positions.decide(keeps_frame=keeps_frame)
+        self._autopilot.positions.decide(keeps_frame=keeps_frame)
 
     def land(self) -> bool:
         """See `Vehicle`; by the autopilot's landing mode."""
@@ -126,14 +128,14 @@ class MavlinkVehicle(Vehicle):
     def change(self, scenario: Scenario) -> None:
         """See `Vehicle`; arming the scenario lets the vehicle take off."""
         self._may_arm = scenario.armed
-        origin, positions = given_origin(scenario), self._port.positions
+        origin, positions = given_origin(scenario), self._autopilot.positions
         if origin is not None and not positions.has_origin:
             positions.place(origin)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """See `Vehicle`; a known origin stays, since changing it would move the fence in flight."""
-        if keys & ORIGIN and self._port.positions.has_origin:
-            x, y, z = self._port.positions.origin
+        if keys & ORIGIN and self._autopilot.positions.has_origin:
+            x, y, z = self._autopilot.positions.origin
             known = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
             return f"mavlink.origin: got {scenario.mavlink.origin}, but {known}"
         return ""
@@ -150,7 +152,7 @@ def altitude(scenario: Scenario, number: int = 1) -> float:
         return float(takeoff_m)
     if scenario.model.axes == 2:
         return PLANE_ALTITUDE_M
-    start = float(scenario.given_reference(number)(np.zeros(()))[2, 0])
+    start = float(scenario.unallocated_reference(number)(np.zeros(()))[2, 0])
     if start < ALTITUDE_MIN_M:
         expected = f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground"
         raise ConfigError(f"mavlink.takeoff_m: got 'auto' at altitude {start:g} m, {expected}")

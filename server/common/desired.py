@@ -228,7 +228,7 @@ class Desired:
 def _live(scenario: Scenario) -> LivePoint:
     """Live point of a scenario at its initial position."""
     velocity = scenario.reference.velocity_mps
-    start = scenario.given_reference()(np.zeros(()))[:, 0]
+    start = scenario.unallocated_reference()(np.zeros(()))[:, 0]
     return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 

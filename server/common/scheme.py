@@ -1,7 +1,7 @@
-"""Interface of the schemes of delay compensation, and the predictions that they share.
+"""Interface of a scheme of delay compensation, and the arrays that schemes fill in.
 
-`shared.scenario.schemes` has the table of all; on a mission `server.missions.mission_planner` is
-one.
+`shared.scenario.schemes` lists the schemes. On a mission `server.missions.mission_planner` is the
+scheme.
 """
 
 from abc import ABC, abstractmethod
@@ -27,24 +27,23 @@ from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
 
 class Splines(NamedTuple):
-    """Trajectories that are sent in place of horizons; no vehicles with the other schemes."""
+    """Trajectories sent by the scheme "trajectory"; with other schemes `block` is 0."""
 
     knots: S3
-    """Position [m] and velocity [m/s] of one knot after the other; shape
+    """Position [m] and velocity [m/s] of each knot, alternating; shape
     (block, axes, 2 KNOTS_MAX)."""
     number: I1
     """Number of knots; shape (block,)."""
     spacing: I1
     """Steps from one knot to the next; shape (block,)."""
-    back: I1
-    """Number of steps since the one it was made for: 0, unless it is sent once more; shape
-    (block,)."""
+    age: I1
+    """Age of the trajectory [steps]: 0 unless an old one is sent again; shape (block,)."""
 
 
 class Foresight(NamedTuple):
-    """Predictions for vehicles at their steps k before planning, and the horizons sent after it.
+    """Predictions for a block of vehicles, each at its step k, and the horizons planned from them.
 
-    It is written anew for every block of vehicles; those of a block come first in each array.
+    The arrays are reused for every block. A block with fewer vehicles fills the first rows only.
     """
 
     estimate: F3
@@ -54,34 +53,35 @@ class Foresight(NamedTuple):
     start: F3
     """Estimate x̂(k+d), where planning starts [m, m/s]; shape (block, axes, 2)."""
     committed: F3
-    """Inputs of k … k+d-1, the first d of the last axis [m/s]; shape (block, axes, most), with
-    the largest d there may be."""
+    """Committed inputs of steps k … k+d-1, in the first d columns [m/s]; shape
+    (block, axes, largest d)."""
     held: F3
-    """Inputs from k+d on, if nothing more were sent [m/s]; shape (block, axes, H)."""
-    doubt: F2
-    """Probability that the newest 1, 2, … of the horizons in flight are lost, and no older one;
-    shape (block, doubts), with no doubts where no trigger asks for them."""
-    doubted_start: F4
-    """State at k+d in each of these cases [m, m/s]; shape (block, doubts, axes, 2)."""
-    doubted: F4
-    """Inputs from k+d on in each of these cases, if nothing more were sent [m/s]; shape
-    (block, doubts, axes, H)."""
-    flown: I1
-    """Number of the inputs planned from k+d on that a vehicle flies, before they are too old;
+    """Inputs that the vehicle flies from k+d on if no further packet is sent [m/s]; shape
+    (block, axes, H)."""
+    loss_probability: F2
+    """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape
+    (block, loss_cases), with 0 cases if no trigger uses them."""
+    start_if_lost: F4
+    """State at k+d in each of these cases [m, m/s]; shape (block, loss_cases, axes, 2)."""
+    inputs_if_lost: F4
+    """Inputs from k+d on in each of these cases, if no further packet is sent [m/s]; shape
+    (block, loss_cases, axes, H)."""
+    usable: I1
+    """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`;
     shape (block,)."""
     disturbance: F2
-    """Disturbance ŵ, an input that nobody gave [m/s]; shape (block, axes)."""
+    """Estimated disturbance ŵ, as an equivalent input [m/s]; shape (block, axes)."""
     horizons: S3
-    """Inputs that may be sent, from k on: d committed inputs, then H planned ones [m/s]; shape
-    (block, axes, most + H)."""
+    """Horizons to send, from step k on: d committed inputs, then H planned ones [m/s]; shape
+    (block, axes, largest d + H)."""
     feedback: S3
     """Feedback columns of a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
-    told: Splines
-    """Trajectories that are sent, with the scheme "trajectory"."""
+    splines: Splines
+    """Trajectories to send, with the scheme "trajectory"."""
 
 
 class PlanFigures:
-    """Record: what is known of a vehicle once its plan is made; a cost is that of eq. (9)."""
+    """Record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
 
     row: int
     """Row of the vehicle."""
@@ -90,19 +90,20 @@ class PlanFigures:
     start: int
     """Step k + d, where planning starts."""
     gap: int
-    """Steps since planning started before."""
+    """Steps from the start of the previous plan to the start of this one."""
     state_gap: float
-    """V(k) of eq. (16): square of how far x̂ is from x_p, weighted by P [cost]."""
+    """V(k) of eq. (16): (x̂ - x_p)' P (x̂ - x_p) [cost]."""
     cost_gap: float
-    """Cost of flying on with what was sent above that of the plan [cost]."""
+    """Cost of flying on with the inputs already sent, minus the cost of the new plan [cost]."""
     expected_gap: float
-    """Mean of that cost where packets in flight may be lost [cost]."""
+    """Expected value of `cost_gap` over which packets in flight are lost [cost]."""
     deviation_m: float
-    """Largest distance between what was sent and the generator's plan before [m]; 0 where fresh."""
+    """Largest distance between the flight with the inputs already sent and the generator's
+    previous plan [m]; 0 if `fresh`."""
     fresh: bool
-    """Whether it is at its first step, or behind a gap that no plan reached over."""
+    """Whether no usable previous plan exists: first step, or a gap longer than H."""
     solved: bool
-    """Whether the plan is new and right, so that it may be sent."""
+    """Whether a plan was foresight, so that it may be sent."""
 
 
 FIGURES = record(PlanFigures)
@@ -110,84 +111,84 @@ Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
 """Shape (n,)."""
 
 
-DOUBTS = 4
-"""Number of horizons in flight whose loss is reckoned with."""
+LOSS_CASES = 4
+"""Number of loss cases computed: the newest 1, 2, 3, or 4 horizons in flight are lost."""
 
 
-def foresight(
-    block: int, axes: int, H: int, most: int, doubts: int = 0, *, splines: bool = False
+def empty_foresight(
+    block: int, axes: int, H: int, ahead_max: int, loss_cases: int = 0, *, splines: bool = False
 ) -> Foresight:
-    """Room for a block of vehicles, whose delay bounds are at most `most`."""
-    states, told = (block, axes, 2), block if splines else 0
+    """Allocate the arrays for a block of vehicles, whose delay bounds are at most `ahead_max`."""
+    states, trajectories = (block, axes, 2), block if splines else 0
     return Foresight(
         estimate=np.zeros(states),
         ahead=np.zeros(block, dtype=np.int64),
         start=np.zeros(states),
-        committed=np.zeros((block, axes, most)),
+        committed=np.zeros((block, axes, ahead_max)),
         held=np.zeros((block, axes, H)),
-        doubt=np.zeros((block, doubts)),
-        doubted_start=np.zeros((block, doubts, axes, 2)),
-        doubted=np.zeros((block, doubts, axes, H)),
-        flown=np.full(block, H),
+        loss_probability=np.zeros((block, loss_cases)),
+        start_if_lost=np.zeros((block, loss_cases, axes, 2)),
+        inputs_if_lost=np.zeros((block, loss_cases, axes, H)),
+        usable=np.full(block, H),
         disturbance=np.zeros((block, axes)),
-        horizons=np.zeros((block, axes, most + H), dtype=np.float32),
+        horizons=np.zeros((block, axes, ahead_max + H), dtype=np.float32),
         feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),
-        told=Splines(
-            knots=np.zeros((told, axes, 2 * KNOTS_MAX), dtype=np.float32),
-            number=np.ones(told, dtype=np.int64),
-            spacing=np.ones(told, dtype=np.int64),
-            back=np.zeros(told, dtype=np.int64),
+        splines=Splines(
+            knots=np.zeros((trajectories, axes, 2 * KNOTS_MAX), dtype=np.float32),
+            number=np.ones(trajectories, dtype=np.int64),
+            spacing=np.ones(trajectories, dtype=np.int64),
+            age=np.zeros(trajectories, dtype=np.int64),
         ),
     )
 
 
-class Head(NamedTuple):
-    """What the head of a packet to a vehicle says, whatever is in it."""
+class Header(NamedTuple):
+    """Header of a packet to a vehicle, the same for horizons and trajectories."""
 
     vehicle: int
     """Number of the vehicle."""
     session: int
     """Number of its session."""
     sent_us: int
-    """Time of sending on the server's clock [µs]."""
+    """Server's clock when the packet is sent [µs]."""
     number: int
     """Number of the packet in the session."""
     silence: int
-    """Longest silence that is asked of the vehicle [half steps]."""
+    """Longest time without a packet from the vehicle that the server asks for [half steps]."""
 
 
-make_head: Callable[[tuple[int, int, int, int, int]], Head] = partial(tuple.__new__, Head)
-"""Head from its five values, in half the time of calling `Head`."""
+make_header: Callable[[tuple[int, int, int, int, int]], Header] = partial(tuple.__new__, Header)
+"""Header from its five values, in half the time of calling `Header`."""
 
 
 class Batch(NamedTuple):
-    """Vehicles that are decided on together, and which of them are sent a plan."""
+    """Vehicles planned for together, and which of them are sent their plan."""
 
     rows: Indices
-    """The vehicles; shape (n,)."""
+    """Rows of the vehicles; shape (n,)."""
     step: Indices
     """Step k of each; shape (n,)."""
-    found: Foresight
-    """What is foreseen of them, and planned; these n come first."""
+    foresight: Foresight
+    """Their predictions and plans, in the first n rows of its arrays."""
     sent: Indices
-    """Indices, of these n, of those that are sent their plan."""
+    """Indices, from 0 to n - 1, of the vehicles whose plan is sent; shape (m,)."""
 
 
 class SentPlans(NamedTuple):
-    """Plans that are sent, for the record; shapes (m, …)."""
+    """Plans that are sent, for the record."""
 
     step: Indices
-    """Step that each is made for."""
+    """Step k that each plan is made for; shape (m,)."""
     begins: Indices
-    """Step of its first planned input."""
+    """Step of its first planned input; shape (m,)."""
     state: Array
-    """State there [m, m/s]; shape (m, axes, 2)."""
+    """Predicted state at that step [m, m/s]; shape (m, axes, 2)."""
     inputs: NDArray[np.floating]
     """Planned inputs [m/s]; shape (m, axes, H)."""
 
 
 class Fleet(NamedTuple):
-    """Flight and vehicles for which a scheme is made."""
+    """Arguments of a scheme's constructor: the flight and its vehicles."""
 
     scenario: Scenario
     terms: Terms
@@ -195,7 +196,7 @@ class Fleet(NamedTuple):
     capacity: int
     """Largest number of vehicles."""
     block: int
-    """Largest number of vehicles that are planned for together."""
+    """Largest number of vehicles planned for together."""
     clock: ClockMap
     desired: Desired
     """Desired trajectories."""
@@ -203,113 +204,116 @@ class Fleet(NamedTuple):
     """Reference of each vehicle of a mission, by its number; None without a mission."""
     stopwatch: Stopwatch
     tell: Callable[[str], None]
-    """Called with the traceback of a plug-in's first error in flight."""
+    """Called with the traceback of a plug-in's first error in flight, for the log."""
 
 
 class Scheme(ABC):
-    """A scheme of delay compensation: what the server believes of its vehicles, plans and sends.
+    """A scheme of delay compensation: predicts vehicles, plans for them and encodes the plans.
 
-    At each step and for each block of vehicles it is asked, in this order, to `foresee`, `plan`,
-    `remember`, and `encode`.
+    At each step and for each block of vehicles the server calls `foresee`, `plan`, `remember` and
+    `encode`, in this order.
     """
 
     properties: ClassVar[SchemeProperties]
-    """Properties of a plug-in's scheme; those of ours are in `shared.scenario.schemes`."""
+    """Properties of a plug-in's scheme; built-in ones are in `shared.scenario.schemes`."""
     solve_ns = -1
-    """Time that planning for the last block took [ns], or -1 where nobody measures it."""
+    """Time that planning for the last block took [ns], or -1 if it is not measured."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.terms = fleet.terms
         self.observed_step: Indices = np.full(fleet.capacity, -1, dtype=np.int64)
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.counts: Counter[str] = Counter()
-        """Events that the scheme counted, by name."""
+        """Counters of the scheme, by name, for the summary."""
         self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
-        """Costs of the newest plans; those of a block come first."""
+        """Figures of the newest plans; a block with fewer vehicles fills the first rows only."""
         self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
-        """States that the newest plans begin with by the plans before [m, m/s]; shape (block,
-        axes, 2)."""
+        """States at which the newest plans start, as predicted by the previous plans [m, m/s];
+        shape (block, axes, 2)."""
 
     @abstractmethod
     def forget(self, row: int) -> None:
-        """Begin anew with a vehicle in this row."""
+        """Forget the vehicle in this row."""
 
     @abstractmethod
     def observe(self, row: int, observation: Observation) -> bool:
-        """Keep an observation, unless a newer one is known (E11); whether it was kept."""
+        """Store an observation unless a newer one is stored (E11); True if stored."""
 
     @abstractmethod
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in all but the plans, for vehicles that were observed recently enough.
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Fill in the predictions of vehicles whose newest observation is young enough.
 
         Args:
-            rows: the vehicles; shape (n,).
-            step: k of each; shape (n,).
-            found: what is filled in.
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: output: all fields but the plans.
         """
 
     @abstractmethod
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in the plans, `figures` and `planned`.
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Plan, and fill in `figures` and `planned`.
 
         Args:
-            rows: the vehicles; shape (n,).
-            step: k of each; shape (n,).
-            found: what is foreseen of them; its horizons are filled in.
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: their predictions; output: `horizons`.
         """
 
-    def remember(  # noqa: B027 - many need not know what is sent
-        self, rows: Indices, step: Indices, found: Foresight, event: Flags
+    def remember(  # noqa: B027 - many schemes ignore what is sent
+        self, rows: Indices, step: Indices, foresight: Foresight, event: Flags
     ) -> None:
-        """Take note of what was computed for the steps from k on, and which of it is sent.
+        """Store the plans, before those that the trigger chose are encoded and sent.
 
         Args:
-            rows: the vehicles; shape (n,).
-            step: k of each; shape (n,).
-            found: what was foreseen and planned.
-            event: which vehicles are sent their plan; shape (n,).
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: their predictions and plans.
+            event: True for vehicles whose plan is sent; shape (n,).
         """
 
     @abstractmethod
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
-        """Row and message of each vehicle that is sent its plan.
+    def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
+        """Row and encoded message of each vehicle whose plan is sent.
 
         Args:
-            batch: the vehicles.
-            head: returns the head of the next packet to the vehicle in a row; called once for each.
+            batch: vehicles and plans.
+            header: returns the header of the next packet to the vehicle in a row; call it once for
+                each packet.
         """
 
     @abstractmethod
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """Plans of the vehicles that are sent theirs, for the record."""
+        """Plans that are sent, for the record."""
 
-    # -- what is asked of a mission ----------------------------------------------------------------
+    # -- missions only -----------------------------------------------------------------------------
 
     @property
     def left_tube(self) -> list[tuple[int, float]]:
-        """Vehicles that have left their tube, and by how much [m]; to be emptied."""
+        """Vehicles that have left their tube, and by how much [m]; the caller empties the list."""
         return []
 
     @property
     def inside(self) -> list[tuple[int, str]]:
-        """Vehicles that were found at rest within a zone, and its name; to be emptied."""
+        """Vehicles that rest inside a zone, and its name; the caller empties the list."""
         return []
 
-    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most know of none
-        """Keep vehicles out of other zones from now on."""
+    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes know no zones
+        """Replace the zones that vehicles keep out of."""
 
     def objection(self, zones: Zones) -> str:  # noqa: ARG002
-        """Why there cannot be these zones now, in words; empty: there can."""
+        """Reason why the zones cannot be changed to these now; empty if they can."""
         return ""
 
     def waits(self, row: int) -> str:  # noqa: ARG002
-        """Reason in words why a vehicle waits; empty if it does not."""
+        """Reason why a vehicle waits; empty if it does not."""
         return ""
 
     def clock_m(self, row: int) -> float | None:  # noqa: ARG002
-        """Distance by which a vehicle may be elsewhere for want of its clock [m]."""
+        """Position error that the uncertainty of the vehicle's clock may cause [m]; None without a
+        mission.
+        """
         return None
 
     def restart(self, row: int) -> bool:  # noqa: ARG002
-        """Take note that the client of a vehicle has begun anew; whether that is news."""
+        """Note that a vehicle's client has restarted; False if this was known already."""
         return False

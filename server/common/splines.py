@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from skytether.server.common.compiled import Axes, axes_of, axis_at, bounded
-from skytether.server.common.scheme import Batch, Head, Scheme, SentPlans
+from skytether.server.common.scheme import Batch, Header, Scheme, SentPlans
 from skytether.shared.base.kernel import F1, F3, I1, kernel, shared
 from skytether.shared.law import spline
 from skytether.shared.scenario.schemes import SchemeProperties
@@ -15,31 +15,31 @@ along = shared(spline.along)
 
 
 class SplineScheme(Scheme):
-    """A scheme that sends the splines of `Foresight.told`."""
+    """A scheme that sends the splines of `Foresight.splines`."""
 
     properties = SchemeProperties(flown_as="trajectory", feedback=True)
 
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+    def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
-        sent, told = batch.sent, batch.found.told
-        rows, back = batch.rows[sent], told.back[sent]
-        step = batch.step[sent] - back
+        sent, told = batch.sent, batch.foresight.splines
+        rows, old = batch.rows[sent], told.age[sent]
+        step = batch.step[sent] - old
         age = step - self.observed_step[rows]
         # A motion that is sent again is older than the newest observation, from which it was not
         # planned; its age is 0. Others have a negative age if the server's clock was set and the
         # clock map lags, as a horizon has: it must name an existing observation.
-        age = np.where(back > 0, np.maximum(age, 0), age)
+        age = np.where(old > 0, np.maximum(age, 0), age)
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
             knots = told.knots[i, :, : 2 * n].reshape(-1, n, 2)
-            vehicle, session, sent_us, number, silence = head(row)
+            vehicle, session, sent_us, number, silence = header(row)
             said = (vehicle, session, k, sent_us, o, spacing, knots, number, silence)
             yield row, encode(Trajectory(*said))
 
     def sent_plans(self, batch: Batch) -> SentPlans:
         """See `Scheme`."""
-        terms, sent, told = self.terms, batch.sent, batch.found.told
-        step = batch.step[sent] - told.back[sent]
+        terms, sent, told = self.terms, batch.sent, batch.foresight.splines
+        step = batch.step[sent] - told.age[sent]
         knots = told.knots[sent].astype(np.float64)
         inputs = np.empty((len(sent), terms.axes, terms.horizon))
         inputs_along(
@@ -51,7 +51,7 @@ class SplineScheme(Scheme):
             told.spacing[sent],
             inputs,
         )
-        return SentPlans(step, step + batch.found.ahead[sent], knots[:, :, :2], inputs)
+        return SentPlans(step, step + batch.foresight.ahead[sent], knots[:, :, :2], inputs)
 
 
 @kernel

@@ -137,12 +137,12 @@ class MissionPlanner(SplineScheme):
         """See `Scheme`."""
         return self._state.observe(row, observation)
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
         """See `Scheme`; the observed state is used as it is."""
         n = len(rows)
-        found.estimate[:n] = found.start[:n] = self._state.state[rows]
+        foresight.estimate[:n] = foresight.start[:n] = self._state.state[rows]
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
         """Plan for each vehicle every SPACING steps, not for all at the same step."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
@@ -171,7 +171,7 @@ class MissionPlanner(SplineScheme):
                 self._state.decided.add(int(rows[i]))
         self.planned[:n] = self._state.state[rows]
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         """See `Scheme`; fills in the knots of the motions sent."""
         for i in event.nonzero()[0].tolist():
             vehicle, k = self._state.vehicles[int(rows[i])], int(step[i])
@@ -185,9 +185,9 @@ class MissionPlanner(SplineScheme):
             count = min(max((motion.last - k) // SPACING, 0) + 1, KNOTS_MAX)
             p, v = motion.at(k + SPACING * np.arange(count, dtype=np.float64), self._dt_s)
             knots = np.stack([p, v], axis=-1).transpose(1, 0, 2).reshape(p.shape[1], -1)
-            found.told.knots[i, :, : 2 * count] = knots
-            found.told.number[i], found.told.spacing[i] = count, SPACING
-            found.told.back[i] = int(step[i]) - k
+            foresight.splines.knots[i, :, : 2 * count] = knots
+            foresight.splines.number[i], foresight.splines.spacing[i] = count, SPACING
+            foresight.splines.age[i] = int(step[i]) - k
             if not vehicle.repeat:
                 self._state.note_sent(int(rows[i]), k, motion)
 

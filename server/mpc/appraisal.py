@@ -75,7 +75,7 @@ def planned_state(
 def _deviate(
     mpc: MPC,
     memory: PlanMemory,
-    found: Foresight,
+    foresight: Foresight,
     plan: PlanFigures,
     i: int,
     axis: int,
@@ -87,16 +87,16 @@ def _deviate(
     Args:
         mpc: the problem.
         memory: previous plans.
-        found: predictions for the vehicles.
+        foresight: predictions for the vehicles.
         plan: record of the vehicle's plan.
         i: index of the vehicle in the block.
         axis: the axis.
         distance: sum to which each stage adds, as far as both are flown [m²]; shape (H + 1,).
     """
-    held, flown = found.held[i, axis], found.flown[i]
-    model, w, H = axis_at(mpc.model, axis), found.disturbance[i, axis], len(held)
+    held, flown = foresight.held[i, axis], foresight.usable[i]
+    model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)
     planned = memory.inputs[GENERATOR, plan.row, axis]
-    p, v = found.start[i, axis, 0], found.start[i, axis, 1]
+    p, v = foresight.start[i, axis, 0], foresight.start[i, axis, 1]
     planned_p, planned_v = planned_state(mpc, memory, plan, axis)
     for stage in range(min(H - plan.gap, flown) + 1):
         away = p - planned_p
@@ -154,7 +154,7 @@ def conclude(
     compares: bool,
     memory: PlanMemory,
     draft: Draft,
-    found: Foresight,
+    foresight: Foresight,
     plan: PlanFigures,
     i: int,
 ) -> None:
@@ -163,9 +163,9 @@ def conclude(
     Source: eq. (16).
     """
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
-    row, d, state_gap, cost = plan.row, found.ahead[i], 0.0, 0.0
+    row, d, state_gap, cost = plan.row, foresight.ahead[i], 0.0, 0.0
     # Later inputs are never flown, so the old plan must not seem to end too early because of them.
-    change = draft.guess[i, 0, : found.flown[i]]
+    change = draft.guess[i, 0, : foresight.usable[i]]
     distance, furthest = draft.distance, 0.0
     sure, doubted = 1.0, 0.0
     if compares:
@@ -173,32 +173,32 @@ def conclude(
             distance[stage] = 0.0
     for axis in range(axes):
         u = draft.inputs[TRACKER, i, axis]
-        off_p = found.start[i, axis, 0] - draft.planned[i, axis, 0]
-        off_v = found.start[i, axis, 1] - draft.planned[i, axis, 1]
+        off_p = foresight.start[i, axis, 0] - draft.planned[i, axis, 0]
+        off_v = foresight.start[i, axis, 1] - draft.planned[i, axis, 1]
         state_gap += off_p * off_p * P[0] + off_v * off_v * P[1]
         if compares:
             steep = draft.gradient[i, axis]
             x = (0.0, 0.0)
-            cost = _add_gap(mpc, axis, x, found.held[i, axis], u, steep, change, cost)
-            for j in range(found.doubt.shape[1]):
-                share = found.doubt[i, j]
+            cost = _add_gap(mpc, axis, x, foresight.held[i, axis], u, steep, change, cost)
+            for j in range(foresight.loss_probability.shape[1]):
+                share = foresight.loss_probability[i, j]
                 if share > 0.0:
                     x = (
-                        found.doubted_start[i, j, axis, 0] - found.start[i, axis, 0],
-                        found.doubted_start[i, j, axis, 1] - found.start[i, axis, 1],
+                        foresight.start_if_lost[i, j, axis, 0] - foresight.start[i, axis, 0],
+                        foresight.start_if_lost[i, j, axis, 1] - foresight.start[i, axis, 1],
                     )
-                    held = found.doubted[i, j, axis]
+                    held = foresight.inputs_if_lost[i, j, axis]
                     doubted += share * _add_gap(mpc, axis, x, held, u, steep, change, 0.0)
             if not plan.fresh:
-                _deviate(mpc, memory, found, plan, i, axis, distance)
-        copy(found.committed[i, axis, :d], found.horizons[i, axis])
-        copy(u, found.horizons[i, axis, d:])
+                _deviate(mpc, memory, foresight, plan, i, axis, distance)
+        copy(foresight.committed[i, axis, :d], foresight.horizons[i, axis])
+        copy(u, foresight.horizons[i, axis, d:])
     if compares:
         for stage in range(H + 1):
             furthest = max(furthest, distance[stage])
         furthest = np.sqrt(furthest)
-    for j in range(found.doubt.shape[1]):
-        sure -= found.doubt[i, j]
+    for j in range(foresight.loss_probability.shape[1]):
+        sure -= foresight.loss_probability[i, j]
     plan.state_gap, plan.cost_gap, plan.deviation_m = state_gap, cost, furthest
     plan.expected_gap = sure * cost + doubted
     for axis in range(axes):

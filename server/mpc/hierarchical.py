@@ -68,7 +68,7 @@ class PlanBatch(NamedTuple):
     """Plans being computed."""
     desired: Window
     """Desired states along the plans."""
-    found: Foresight
+    foresight: Foresight
     """Predictions for the vehicles."""
     figures: Figures
     """Costs of their plans."""
@@ -148,20 +148,20 @@ class Planner:
         """Make the next plan of this vehicle its first."""
         self._memory.step[row] = -1
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Plan for vehicles: generator, then tracker; fills in `found.horizons` and `figures`.
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.
 
         Args:
             rows: the vehicles; shape (n,).
             step: k of each; shape (n,).
-            found: their predictions.
+            foresight: their predictions.
 
         Source: eqs. (14), (15).
         """
-        window = self._desired.window(rows, step, found.ahead)
+        window = self._desired.window(rows, step, foresight.ahead)
         batch = self._batch
-        if batch is None or batch.desired is not window or batch.found is not found:
-            batch = self._batch = self._batch_of(window, found)
+        if batch is None or batch.desired is not window or batch.foresight is not foresight:
+            batch = self._batch = self._batch_of(window, foresight)
         solver, undone = self.solvers[LATER], len(rows)
         # Not isinstance: a derived solver may override `solve`, which the compiled pass would not
         # call.
@@ -172,7 +172,7 @@ class Planner:
         took_ns = self._stopwatch.lap("plan")
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
-    def _batch_of(self, window: Window, found: Foresight) -> PlanBatch:
+    def _batch_of(self, window: Window, foresight: Foresight) -> PlanBatch:
         """Arguments of the planning kernels in one tuple; it refers to the same arrays at every
         step.
         """
@@ -183,7 +183,7 @@ class Planner:
             memory=self._memory,
             draft=self._draft,
             desired=window,
-            found=found,
+            foresight=foresight,
             figures=self.figures,
             together=self._together,
             alone=self._alone,
@@ -223,18 +223,18 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axi
 
     Source: eq. (14).
     """
-    mpc, memory, draft, desired, found = (
+    mpc, memory, draft, desired, foresight = (
         batch.mpc,
         batch.memory,
         batch.draft,
         batch.desired,
-        batch.found,
+        batch.foresight,
     )
     H = memory.inputs.shape[3]
     for lane in range(len(some)):
         i = some[lane]
         plan, page, first = batch.figures[i], desired.place[i], desired.first[i]
-        x = (found.start[i, axis, 0], found.start[i, axis, 1])
+        x = (foresight.start[i, axis, 0], foresight.start[i, axis, 1])
         if not plan.fresh:
             x = planned_state(mpc, memory, plan, axis)
         draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
@@ -253,14 +253,14 @@ def _pose_tracker(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis:
 
     Source: eq. (15).
     """
-    mpc, memory, draft, found = batch.mpc, batch.memory, batch.draft, batch.found
+    mpc, memory, draft, foresight = batch.mpc, batch.memory, batch.draft, batch.foresight
     for lane in range(len(some)):
         i = some[lane]
         plan = batch.figures[i]
-        simd.p[lane], simd.v[lane] = found.start[i, axis, 0], found.start[i, axis, 1]
+        simd.p[lane], simd.v[lane] = foresight.start[i, axis, 0], foresight.start[i, axis, 1]
         planned = draft.planned[i, axis]
         simd.leader_p[lane], simd.leader_v[lane] = planned[0], planned[1]
-        simd.w[lane] = found.disturbance[i, axis]
+        simd.w[lane] = foresight.disturbance[i, axis]
         before = memory.inputs[TRACKER, plan.row, axis]
         set_previous(before, plan.gap, plan.fresh, simd, lane)
     follow(mpc, axis, simd)
@@ -321,7 +321,7 @@ def _conclude(batch: PlanBatch, i: int) -> None:
         batch.compares,
         batch.memory,
         batch.draft,
-        batch.found,
+        batch.foresight,
         batch.figures[i],
         i,
     )
@@ -333,14 +333,14 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
 
     The unsolved ones are not `solved` in their figures, and are left unchanged.
     """
-    memory, found, figures = batch.memory, batch.found, batch.figures
+    memory, foresight, figures = batch.memory, batch.foresight, batch.figures
     picked, undone = batch.picked, 0
     # An iteration without any input at its bound takes a third of the time, so vehicles that were
     # at a bound are planned for together: the others are collected from the front, these from the
     # back.
     waiting, last = 0, len(rows)
     for i in range(len(rows)):
-        begin(memory, found.ahead[i], figures[i], rows[i], steps[i])
+        begin(memory, foresight.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
             # Vehicles planned for together need the same weights; a first plan has other ones (E8),
             # and is rare.
@@ -373,7 +373,7 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
     for i in left:
         plan, single[0] = batch.figures[i], i
         if tier == GENERATOR:
-            begin(batch.memory, batch.found.ahead[i], plan, rows[i], steps[i])
+            begin(batch.memory, batch.foresight.ahead[i], plan, rows[i], steps[i])
         which = FIRST if plan.fresh else LATER
         for axis in range(len(batch.mpc.model)):
             if tier == GENERATOR:

@@ -1,1 +1,1 @@
-"""Schemes of delay compensation, and what they share."""
+"""Schemes of delay compensation, and their shared parts."""

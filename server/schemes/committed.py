@@ -1,27 +1,27 @@
-"""Committed inputs: what the vehicle has been told, and so where it is, and where it will be.
+"""The scheme "committed": plans start at k + d, after the inputs that sent horizons have fixed.
 
-A horizon reaches the vehicle within d steps or is lost. So what it flies in the next d steps is
-settled by what was sent before: these inputs are committed. They roll the newest observation on to
-x̂(k+d), where planning starts, and they are the first d inputs of the next horizon: until that
-arrives, and whenever within d steps it does, the vehicle flies the same.
+A horizon reaches the vehicle within d steps (the delay bound) or is lost. So the inputs of the next
+d steps are fixed by the horizons already sent: these inputs are committed. The server predicts with
+them from the newest observation to x̂(k+d), where planning starts, and repeats them as the first d
+inputs of the next horizon. Until that horizon arrives, at any time within d steps, the vehicle
+flies the same inputs.
 
-Every observation acknowledges the horizon in force at its step. The inputs replayed from there are
-those of this horizon; then, for every horizon in flight, its own from its step + d on. One that has
-had d steps and was not in force is lost, and left out.
+Every observation acknowledges the horizon in force at its step. The prediction replays the inputs
+of this horizon, then those of each horizon in flight, from d steps after the step it was made for.
+A horizon that was not in force d steps after that step is lost, and is left out.
 
     x(i+1) = A x(i) + B (u(i) + w)        from the observation to k + d
 
-w is what else acts on the vehicle, as an input of its own: constant wind, a wrong gain, learned by
+w is the disturbance (wind, a wrong gain) as an equivalent input, estimated by
 `server.schemes.disturbance`.
 
-With feedback aboard, a horizon tells the vehicle also where its inputs lead, x̄ from x̂(k) on, and
-how to come back to there: it flies u(i) + K (x̄(i) - x(i)). That is replayed in the same way. What
-is committed are the inputs that this comes to if nothing else happens, along x̄ from x̂(k): as K is
-always the same, it makes no difference when the next horizon replaces the one before.
+With feedback aboard, a horizon also carries its reference state x̄, which starts at x̂(k), and the
+vehicle flies u(i) + K (x̄(i) - x(i)). The server replays this feedback too. Committed are then the
+inputs that the vehicle flies along x̄ without further disturbance. As K never changes, it makes no
+difference when the next horizon replaces the present one.
 
-What was sent is followed by `schemes.sent`, kept by `schemes.sent_horizons`, and flown again along
-a course by `schemes.replay`; `schemes.loss_scenarios` tells what follows if horizons in flight are
-lost.
+`schemes.sent` tracks the horizons sent, `schemes.sent_horizons` stores them, `schemes.replay`
+predicts with them, and `schemes.loss_scenarios` predicts the cases in which some are lost.
 """
 
 from collections import Counter
@@ -36,20 +36,26 @@ from skytether.server.schemes import horizons, sent_horizons
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance
 from skytether.server.schemes.horizons import HorizonScheme
-from skytether.server.schemes.loss_scenarios import doubt
+from skytether.server.schemes.loss_scenarios import foresee_losses
 from skytether.server.schemes.observer import decay_of
-from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
-from skytether.server.schemes.sent import HOVERS, first_under_way, judge, nothing_sent, number_of
+from skytether.server.schemes.replay import FlownTrack, HorizonSchedule, fly_schedule, make_schedule
+from skytether.server.schemes.sent import (
+    HOVERS,
+    first_in_flight,
+    nothing_sent,
+    number_of,
+    update_delay_and_loss,
+)
 from skytether.server.schemes.sent_horizons import (
     AXIS_STATE,
-    LEAD,
     OBSERVATIONS,
+    REFERENCE_STATE,
     SENT_HORIZON,
     ReplayMemory,
     ReplaySettings,
-    keep,
-    remember,
     speed_of,
+    store_observation,
+    store_sent,
 )
 from skytether.shared.base.kernel import I1, kernel
 from skytether.shared.law.model import Array, Flags, Indices
@@ -60,22 +66,23 @@ from skytether.shared.wire.protocol import (
     DISTURBANCE,
     GAIN_P,
     GAIN_V,
-    LED_P,
-    LED_V,
     NO_HORIZON,
+    REFERENCE_P,
+    REFERENCE_V,
     Observation,
     committed_max,
 )
 
 
 class Replay:
-    """The committed `Scheme`: observations of, and horizons sent to, up to `capacity` vehicles.
+    """Predictor of the scheme "committed": replays sent horizons from the newest observation.
 
     Args:
-        terms: the rule of flight.
+        terms: terms of the flight.
         control: `observer_s` and `delay_bound`.
-        gain: K of feedback aboard, 0 without; shape (axes, 2).
-        clock: knows half of the smallest round trip, which is a first guess at the delay bound.
+        gain: gain K of the feedback aboard, 0 without feedback; shape (axes, 2).
+        capacity: largest number of vehicles.
+        clock: gives half of the smallest round trip, the first value of the delay bound.
     """
 
     def __init__(
@@ -93,7 +100,7 @@ class Replay:
             follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
-        # One horizon a step at most, and none is flown for longer than `age_max`.
+        # At most one horizon is sent per step, and none is flown for longer than `age_max`.
         ring = terms.age_max + H
         self._memory = ReplayMemory(
             sent=nothing_sent(capacity, ring, terms, control, most),
@@ -101,11 +108,11 @@ class Replay:
             state=np.zeros((capacity, axes), dtype=AXIS_STATE),
             horizons=np.zeros((capacity, ring), dtype=SENT_HORIZON),
             inputs=np.zeros((capacity, ring, axes, most + H), dtype=np.float32),
-            led=np.zeros((capacity, ring, axes), dtype=LEAD),
+            reference=np.zeros((capacity, ring, axes), dtype=REFERENCE_STATE),
         )
-        # From the oldest observation that counts to the end of a plan that is made from it.
+        # From the oldest usable observation to the end of a plan made from it.
         longest = terms.age_max + most + H + 1
-        self._course = HorizonsInForce(
+        self._schedule = HorizonSchedule(
             np.empty(ring + 2, dtype=np.int64), np.empty(ring + 2, dtype=np.int64)
         )
         self._track = FlownTrack(np.empty(longest), np.empty((longest, 2)))
@@ -123,36 +130,35 @@ class Replay:
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
-        told = observation
-        return keep(
+        return store_observation(
             self._memory,
             row,
-            told.step,
-            told.in_force,
-            told.since,
-            told.takes,
-            told.state,
-            told.input,
+            observation.step,
+            observation.in_force,
+            observation.since,
+            observation.takes,
+            observation.state,
+            observation.input,
         )
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`: planning starts at k + d."""
         lost = _foresee(
             self._settings,
             self._memory,
             self._clock.seen,
-            self._course,
+            self._schedule,
             self._track,
             rows,
             step,
-            found,
+            foresight,
         )
         if lost:
             self.counts["horizons_lost"] += lost
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
-        """See `Scheme`; only what was sent counts."""
-        remember(self._settings, self._memory, rows, step, found, event)
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
+        """See `Scheme`; only horizons that are sent are stored."""
+        store_sent(self._settings, self._memory, rows, step, foresight, event)
 
 
 def make(fleet: Fleet) -> HorizonScheme:
@@ -162,7 +168,7 @@ def make(fleet: Fleet) -> HorizonScheme:
 
 
 KERNELS = (sent_horizons, horizons, hierarchical, exact)
-"""See `server.schemes.table`."""
+"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
 
 
 @kernel
@@ -170,57 +176,63 @@ def _foresee(
     settings: ReplaySettings,
     memory: ReplayMemory,
     clock: Seen,
-    course: HorizonsInForce,
+    schedule: HorizonSchedule,
     track: FlownTrack,
     rows: I1,
     steps: I1,
-    found: Foresight,
+    foresight: Foresight,
 ) -> int:
-    """Fill in what is foreseen of vehicles at their steps k; the number of horizons newly lost.
+    """Fill in the predictions of vehicles at their steps k.
 
-    Both `course` and `track` are scratch.
+    Args:
+        schedule, track: scratch memory.
+
+    Returns:
+        number of horizons newly known to be lost.
     """
     axes, H, sent, lost = len(settings.laws), settings.H, memory.sent, 0
     for i in range(len(rows)):
         row, k, bound = rows[i], steps[i], sent.bound.steps
-        heard, observed = sent.heard[row], sent.observed[row]
+        delivery, observed = sent.delivery[row], sent.observed[row]
         age = k - observed
-        assert age <= settings.age_max  # the controller's promise; the track has no more room
-        # A bound so large that no plan could be flown is forgotten: nothing would be sent, and
-        # nothing that was sent could show that the delay is smaller by now.
+        assert age <= settings.age_max  # the controller ensures it; `track` holds no more steps
+        # If the bound is so large that no plan could be flown, nothing would be sent, and no
+        # acknowledgement could ever show that the delay has become smaller. So it is reset.
         if bound[row] > age and age + bound[row] > settings.age_max:
             bound[row], sent.bound.seen[row] = 0, 0
-        lost += judge(sent, clock, row)
+        lost += update_delay_and_loss(sent, clock, row)
         d = bound[row]
         if settings.decay < 1.0:
-            observe_disturbance(settings, memory, row, age + d, course, track)
-        # A vehicle that takes no horizons stands still, whatever is under way to it.
-        flying, under_way = HOVERS, range(0)
+            observe_disturbance(settings, memory, row, age + d, schedule, track)
+        # A vehicle that accepts no horizons hovers, whatever is in flight to it.
+        in_force, in_flight = HOVERS, range(0)
         if memory.seen[row].takes == 1:
-            flying = number_of(sent, row, heard.in_force)
-            under_way = range(first_under_way(sent, row, heard.in_force, observed), heard.sent)
-        legs = chart(course, sent, row, observed, flying, under_way)
-        found.ahead[i], speed = d, speed_of(memory.state[row].u)
-        found.flown[i] = max(0, lasting(d + H, k, observed, settings.age_max) - d)
+            in_force = number_of(sent, row, delivery.in_force)
+            in_flight = range(
+                first_in_flight(sent, row, delivery.in_force, observed), delivery.sent
+            )
+        legs = make_schedule(schedule, sent, row, observed, in_force, in_flight)
+        foresight.ahead[i], speed = d, speed_of(memory.state[row].u)
+        foresight.usable[i] = max(0, lasting(d + H, k, observed, settings.age_max) - d)
         for axis in range(axes):
             state, law = memory.state[row, axis], settings.laws[axis]
             x = (state.p, state.v, state.u, speed)
-            roll(settings, memory, row, axis, course, legs, k + d + H, x, track)
-            # An observation from ahead of k, where clocks disagree, is taken as it is.
-            now, then = k - observed, k + d - observed
+            fly_schedule(settings, memory, row, axis, schedule, legs, k + d + H, x, track)
+            # If clocks disagree the observation may be later than k; then it is used unchanged.
+            now, start = k - observed, k + d - observed
             for j in range(2):
-                found.estimate[i, axis, j] = track.states[max(now, 0), j]
-                found.start[i, axis, j] = track.states[max(then, 0), j]
+                foresight.estimate[i, axis, j] = track.states[max(now, 0), j]
+                foresight.start[i, axis, j] = track.states[max(start, 0), j]
             for j in range(d):
-                found.committed[i, axis, j] = track.commands[now + j] if now + j >= 0 else 0.0
+                foresight.committed[i, axis, j] = track.commands[now + j] if now + j >= 0 else 0.0
             for j in range(H):
-                found.held[i, axis, j] = track.commands[then + j] if then + j >= 0 else 0.0
-            found.disturbance[i, axis] = state.w
+                foresight.held[i, axis, j] = track.commands[start + j] if start + j >= 0 else 0.0
+            foresight.disturbance[i, axis] = state.w
             if settings.feeds_back:
-                feedback = found.feedback[i, axis]
-                feedback[LED_P] = found.estimate[i, axis, 0]
-                feedback[LED_V] = found.estimate[i, axis, 1]
+                feedback = foresight.feedback[i, axis]
+                feedback[REFERENCE_P] = foresight.estimate[i, axis, 0]
+                feedback[REFERENCE_V] = foresight.estimate[i, axis, 1]
                 feedback[DISTURBANCE] = state.w
                 feedback[GAIN_P], feedback[GAIN_V] = law.gain_p, law.gain_v
-        doubt(settings, memory, row, i, k, flying, under_way, course, track, found)
+        foresee_losses(settings, memory, row, i, k, in_force, in_flight, schedule, track, foresight)
     return lost

@@ -1,14 +1,14 @@
-"""The delay bound d: how many steps after it was made a horizon is in force at the latest.
+"""Delay bound d: number of steps from making a horizon to when it is in force at the latest.
 
-Every acknowledged horizon gives one sample: the step at which it came into force less the step that
-it was made for. With each sample of a vehicle
+Every acknowledged horizon gives one sample: the step at which it came into force minus the step
+that it was made for. With each sample of a vehicle
 
     d ← max(d, sample)
-    d ← d - 1 where of its newest RECENT none, and of its newest SAMPLES a share of at most LATE,
-              would have been later than d - 1.
+    d ← d - 1 if none of the newest RECENT samples, and at most a share LATE of the newest SAMPLES,
+              exceed d - 1.
 
-So d is a high quantile that is never below what was seen recently; it rises at once, and falls by a
-step at a time. A horizon that was lost or overtaken by a newer one was never in force: no sample.
+So d is a high quantile of the delay and never below a recent sample. It rises at once and falls by
+one step at a time. A horizon that was lost, or overtaken by a newer one, gives no sample.
 """
 
 from typing import NamedTuple
@@ -19,22 +19,22 @@ from skytether.shared.base.kernel import I1, I2, part
 from skytether.shared.base.units import seconds_to_ns
 
 SAMPLES = 128
-"""Newest samples that count."""
+"""Number of samples that are stored for each vehicle."""
 LATE = 0.01
-"""Largest share of them that may be later than d."""
+"""Largest share of these samples that may exceed d."""
 RECENT = 16
-"""Newest samples of which none may be later than d. On the paper's network d then changes every 4 s
-(Δt = 0.02 s, every step sent) to every 35 s (0.05 s, one step in ten); of the horizons in force 0.3
-to 1.3 % came later than d."""
+"""Number of newest samples of which none may exceed d. Measured on the paper's network, d then
+changes every 4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten),
+and 0.3 to 1.3 % of the horizons come later than d."""
 
 
 class DelayBound(NamedTuple):
-    """Delay bounds d of up to `capacity` vehicles, and the samples that it comes from."""
+    """Delay bounds d of up to `capacity` vehicles, and the samples behind them."""
 
     steps: I1
-    """Delay bound d of each vehicle, or 0 while nothing is known; shape (capacity,)."""
+    """Delay bound d of each vehicle, or 0 while it is unknown; shape (capacity,)."""
     samples: I2
-    """Newest samples of each [steps], a ring; shape (capacity, SAMPLES)."""
+    """Newest samples of each [steps], in a ring; shape (capacity, SAMPLES)."""
     seen: I1
     """Number of samples seen so far; shape (capacity,)."""
     least: int
@@ -44,16 +44,17 @@ class DelayBound(NamedTuple):
 
 
 def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
-    """The delay bounds of vehicles of which nothing is known yet.
+    """Delay bounds of vehicles without any sample.
 
     Args:
+        capacity: number of vehicles.
         dt_s: length of a step [s].
-        most: the largest d, what a horizon has room for.
-        fixed_s: a bound that is known [s]; None to estimate it.
+        most: largest d that fits a horizon.
+        fixed_s: fixed bound [s]; None to estimate it.
     """
     least = 1
     if fixed_s is not None:
-        # Rounded up, for d has to cover the whole delay.
+        # Rounded up: d has to cover the whole delay.
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)
     steps, seen = np.zeros((2, capacity), dtype=np.int64)
@@ -62,36 +63,37 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
 
 
 def forget(bound: DelayBound, row: int) -> None:
-    """Begin anew with a vehicle, or with a new life of it."""
+    """Forget the samples of a vehicle that is new or has restarted."""
     bound.steps[row] = bound.seen[row] = 0
 
 
 @part
-def begin(bound: DelayBound, row: int, guess: int) -> None:
-    """Set a first d [steps] of a vehicle without a sample."""
+def set_first(bound: DelayBound, row: int, guess: int) -> None:
+    """Set d of a vehicle without samples to a guess [steps]."""
     bound.steps[row] = min(max(guess, bound.least), bound.most)
 
 
 @part
-def at_least(bound: DelayBound, row: int, delay: int) -> None:
-    """Raise d of a vehicle to what every packet takes just now [steps], acknowledged or not."""
+def raise_to(bound: DelayBound, row: int, delay: int) -> None:
+    """Raise d of a vehicle to at least a delay [steps], without a sample."""
     bound.steps[row] = max(bound.steps[row], min(delay, bound.most))
 
 
 @part
-def acknowledge(bound: DelayBound, row: int, delay: int) -> None:
-    """Take a sample [steps] of a vehicle into its d, which falls by one at most."""
+def add_sample(bound: DelayBound, row: int, delay: int) -> None:
+    """Update d of a vehicle with a sample [steps]; d falls by one at most."""
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # Up at once: with too small a d every horizon enters after inputs that it did not reckon with.
+    # It rises at once: with too small a d every horizon comes into force after other inputs than
+    # its plan assumes.
     d = max(bound.steps[row], min(delay, bound.most))
-    known = min(bound.seen[row], SAMPLES)
-    needed, since = 0, known  # samples that need d, and how many came after the last of these
-    for slot in range(known):
+    count = min(bound.seen[row], SAMPLES)
+    needed, since = 0, count  # samples of d or more, and number of samples after the last of them
+    for slot in range(count):
         if bound.samples[row, slot] >= d:
             age = newest - slot if slot <= newest else newest - slot + SAMPLES
             needed, since = needed + 1, min(since, age)
-    if d > bound.least and since >= RECENT and needed <= LATE * known:
+    if d > bound.least and since >= RECENT and needed <= LATE * count:
         d -= 1
     bound.steps[row] = d

@@ -1,20 +1,24 @@
-"""Disturbance of a vehicle that flies committed inputs, learned from its observations.
+"""Disturbance observer of the scheme "committed".
 
-Each observation shows how far the velocity has come away from where the one before it, replayed,
-says; the disturbance observer (`server.schemes.observer`) follows that with a time constant of
-`control.observer_s`. Vehicles report what they take their velocity for. So the observer has a
-velocity of its own, which follows what is reported within FOLLOW_S: else it would learn the noise
-that a filter aboard has left.
+From each observation the flown horizons are replayed to the next one. The difference between the
+replayed and the observed velocity drives the disturbance observer (`server.schemes.observer`), with
+the time constant `control.observer_s`. Observed velocities are noisy. So the observer low-pass
+filters them with the time constant FOLLOW_S; else it would learn the noise.
 """
 
-from skytether.server.schemes.observer import learned
-from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
-from skytether.server.schemes.sent import UNKNOWN, first_under_way, number_of
+from skytether.server.schemes.observer import updated_disturbance
+from skytether.server.schemes.replay import (
+    FlownTrack,
+    HorizonSchedule,
+    fly_schedule,
+    make_schedule,
+)
+from skytether.server.schemes.sent import UNKNOWN, first_in_flight, number_of
 from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings, speed_of
 from skytether.shared.base.kernel import part
 
 FOLLOW_S = 0.25
-"""Time constant with which the disturbance observer follows the velocity that is reported [s]."""
+"""Time constant of the observer's low-pass filter on the observed velocity [s]."""
 
 
 @part
@@ -23,47 +27,47 @@ def observe_disturbance(
     memory: ReplayMemory,
     row: int,
     trip: int,
-    course: HorizonsInForce,
+    schedule: HorizonSchedule,
     track: FlownTrack,
 ) -> None:
-    """Disturbance observer: from the observation before to the newest, where there is a new one.
+    """Update the disturbance of a vehicle if it has a new observation.
 
     Args:
-        trip: steps from that to where planning starts; a long trip makes it slower.
+        trip: steps from the newest observation to where planning starts; long trips slow the
+            observer down.
     """
     seen, sent = memory.seen[row], memory.sent
-    heard = sent.heard[row]
+    delivery = sent.delivery[row]
     begin, end = seen.base_step, sent.observed[row]
     if end == begin:
         return
     before = number_of(sent, row, seen.base_in_force)
-    after = number_of(sent, row, heard.in_force)
-    # A vehicle that takes no horizon brakes by its failsafe: what it does then says nothing of
-    # wind.
-    by_rule = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
-    # Further back than `age_max` the horizons of that time may be gone from the ring.
-    follows = by_rule and begin >= 0 and end - begin <= settings.age_max
+    after = number_of(sent, row, delivery.in_force)
+    # A vehicle that accepts no horizons brakes by its failsafe, whose inputs the server does not
+    # know.
+    inputs_known = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
+    # Horizons older than `age_max` may be gone from the ring.
+    replayable = inputs_known and begin >= 0 and end - begin <= settings.age_max
     m, legs, speed = end - begin, 0, speed_of(memory.state[row].base_u)
-    if follows:
-        first = first_under_way(sent, row, seen.base_in_force, begin)
-        legs = chart(course, sent, row, begin, before, range(first, after))
-        # What came into force, and when, is known.
-        while legs > 1 and course.begins[legs - 1] >= heard.since:
+    if replayable:
+        first = first_in_flight(sent, row, seen.base_in_force, begin)
+        legs = make_schedule(schedule, sent, row, begin, before, range(first, after))
+        # The newest observation tells which horizon is in force, and since when.
+        while legs > 1 and schedule.begins[legs - 1] >= delivery.since:
             legs -= 1
-        if heard.since <= begin:
-            course.numbers[0] = after
-        elif heard.since < end:
-            course.begins[legs], course.numbers[legs] = heard.since, after
+        if delivery.since <= begin:
+            schedule.numbers[0] = after
+        elif delivery.since < end:
+            schedule.begins[legs], schedule.numbers[legs] = delivery.since, after
             legs += 1
     for axis in range(len(settings.laws)):
         state, law, lag = memory.state[row, axis], settings.laws[axis], 0.0
-        if follows:
+        if replayable:
             x = (state.base_p, state.base_v, state.base_u, speed)
-            roll(settings, memory, row, axis, course, legs, end, x, track)
-            # A jump of the velocity may be noise: the observer follows it with FOLLOW_S, and
-            # carries the rest on as `lag`.
+            fly_schedule(settings, memory, row, axis, schedule, legs, end, x, track)
+            # Low-pass filter: `lag` is the part of the velocity difference not yet followed.
             off, left = state.v - track.states[m, 1], settings.follow**m
-            memory.state[row, axis].w = learned(
+            memory.state[row, axis].w = updated_disturbance(
                 state.w,
                 (1.0 - left) * off,
                 m,
@@ -75,5 +79,5 @@ def observe_disturbance(
             lag = left * off
         memory.state[row, axis].base_p, memory.state[row, axis].base_v = state.p, state.v - lag
         memory.state[row, axis].base_u = state.u
-    memory.seen[row].base_step, memory.seen[row].base_in_force = end, heard.in_force
+    memory.seen[row].base_step, memory.seen[row].base_in_force = end, delivery.in_force
     memory.seen[row].base_takes = seen.takes

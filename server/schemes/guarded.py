@@ -1,7 +1,7 @@
-"""Wrapper of a plug-in's scheme: its errors end no flight.
+"""Wrapper that catches the errors of a plug-in's scheme, so that none ends the flight.
 
-If the scheme fails for a vehicle, that vehicle gets no plan at that step. It flies the plan that it
-has to its end, and then its failsafe acts.
+If the scheme fails for a vehicle, the vehicle is sent no plan at that step. It flies its present
+plan to the end, and then its failsafe acts.
 """
 
 import traceback
@@ -17,7 +17,7 @@ from skytether.server.common.scheme import (
     Figures,
     Fleet,
     Foresight,
-    Head,
+    Header,
     Scheme,
     SentPlans,
     Splines,
@@ -33,14 +33,12 @@ from skytether.shared.wire.protocol import (
 
 
 class GuardedScheme(Scheme):
-    """Plug-in's scheme with its errors caught.
-
-    It is called for all vehicles of a block together, and if that fails, for each alone.
+    """A plug-in's scheme, called for a whole block first, and for each vehicle alone if that fails.
 
     Args:
         name: name of the scheme, for messages.
         inner: the scheme.
-        fleet: flight and vehicles that it is made for.
+        fleet: flight and vehicles.
     """
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
@@ -50,7 +48,7 @@ class GuardedScheme(Scheme):
         self._ahead_max = committed_max(fleet.terms) if fleet.terms.commits else 0
         self._bounds = INPUT_TOLERANCE * np.array(fleet.terms.u_max)[:, None]
         self._withheld: set[int] = set()
-        """Rows of vehicles that are sent nothing at this step."""
+        """Rows of vehicles to which no plan is sent at this step."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
@@ -60,24 +58,24 @@ class GuardedScheme(Scheme):
             self._fail(error)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`; an observation for which it fails is not kept."""
+        """See `Scheme`; False if the scheme fails."""
         try:
             return bool(self._inner.observe(row, observation))
         except Exception as error:
             self._fail(error)
             return False
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """See `Scheme`; the scheme itself is asked in `plan`, both at once."""
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Do nothing: `plan` calls the scheme's `foresee` too."""
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """See `Scheme`; unsolved is what it fails for, and what could not be flown."""
-        for i in self._ask(len(rows), partial(self._plan, rows, step, found)):
-            _blank(_cut(found, slice(i, i + 1)), self.figures[i : i + 1], rows[i], step[i])
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """See `Scheme`; a plan is unsolved if the scheme fails or its plan cannot be flown."""
+        for i in self._call(len(rows), partial(self._plan, rows, step, foresight)):
+            _blank(_cut(foresight, slice(i, i + 1)), self.figures[i : i + 1], rows[i], step[i])
             self.figures["solved"][i], self.planned[i] = False, 0.0
 
-    def _plan(self, rows: Indices, step: Indices, found: Foresight, some: slice) -> None:
-        cut, n = _cut(found, some), some.stop - some.start
+    def _plan(self, rows: Indices, step: Indices, foresight: Foresight, some: slice) -> None:
+        cut, n = _cut(foresight, some), some.stop - some.start
         inner = self._inner
         _blank(cut, inner.figures[:n], rows[some], step[some])
         inner.foresee(rows[some].copy(), step[some].copy(), cut)
@@ -85,29 +83,29 @@ class GuardedScheme(Scheme):
         self._check(cut)
         self.figures[some], self.planned[some] = inner.figures[:n], inner.planned[:n]
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
-        """See `Scheme`; where it fails, nothing is sent."""
-        failed = self._ask(len(rows), partial(self._remember, rows, step, found, event))
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
+        """See `Scheme`; if the scheme fails for a vehicle, its plan is not sent."""
+        failed = self._call(len(rows), partial(self._remember, rows, step, foresight, event))
         self._withheld = {int(rows[i]) for i in failed}
 
     def _remember(
-        self, rows: Indices, step: Indices, found: Foresight, event: Flags, some: slice
+        self, rows: Indices, step: Indices, foresight: Foresight, event: Flags, some: slice
     ) -> None:
-        cut = _cut(found, some)
+        cut = _cut(foresight, some)
         self._inner.remember(rows[some].copy(), step[some].copy(), cut, event[some].copy())
         self._check(cut)
 
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+    def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
         for i in batch.sent.tolist():
             if int(batch.rows[i]) not in self._withheld:
                 try:
-                    yield from [*self._inner.encode(batch._replace(sent=np.array([i])), head)]
+                    yield from [*self._inner.encode(batch._replace(sent=np.array([i])), header)]
                 except Exception as error:
                     self._fail(error)
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`; zeros where it fails."""
+        """See `Scheme`; zeros if the scheme fails."""
         try:
             return self._inner.sent_plans(batch)
         except Exception as error:
@@ -116,61 +114,75 @@ class GuardedScheme(Scheme):
             axes, H = self.terms.axes, self.terms.horizon
             return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
 
-    def _ask(self, n: int, ask: Callable[[slice], None]) -> list[int]:
-        """Call for n vehicles at once, and if that fails, for each alone; indices of the failed."""
+    def _call(self, n: int, call: Callable[[slice], None]) -> list[int]:
+        """Call for n vehicles at once, or for each alone if that fails; indices of failed ones."""
         failed = []
         try:
-            ask(slice(0, n))
+            call(slice(0, n))
         except Exception:
             for i in range(n):
                 try:
-                    ask(slice(i, i + 1))
+                    call(slice(i, i + 1))
                 except Exception as error:
                     self._fail(error)
                     failed.append(i)
         return failed
 
-    def _check(self, found: Foresight) -> None:
+    def _check(self, foresight: Foresight) -> None:
         """Check that the plans can be flown.
 
         Raises:
-            ValueError: with the array that is out of bounds.
+            ValueError: an array has a value out of bounds.
         """
-        told = found.told
-        if not ((found.ahead >= 0) & (found.ahead <= self._ahead_max)).all():
-            raise ValueError(f"got other delay bounds than 0 … {self._ahead_max}")
-        if not (np.abs(found.horizons) <= self._bounds).all():  # nor is NaN
-            raise ValueError("got inputs that are not within ±model.u_max")
-        if not (np.abs(told.knots) <= FLOAT_MAX).all():
-            raise ValueError("got knots that are not finite")
-        if not ((told.number >= 1) & (told.number <= KNOTS_MAX) & (told.spacing >= 1)).all():
-            raise ValueError(f"got a spline of other than 1 to {KNOTS_MAX} knots, 1 step apart")
-        if not (np.isfinite(found.estimate).all() and np.isfinite(found.start).all()):
-            raise ValueError("got an estimate that is not finite")
+        splines = foresight.splines
+        if not ((foresight.ahead >= 0) & (foresight.ahead <= self._ahead_max)).all():
+            raise ValueError(f"expected delay bounds from 0 to {self._ahead_max} in `ahead`")
+        if not (np.abs(foresight.horizons) <= self._bounds).all():  # NaN fails too
+            raise ValueError("expected inputs within ±model.u_max in `horizons`")
+        if not (np.abs(splines.knots) <= FLOAT_MAX).all():
+            raise ValueError("expected finite numbers in `splines.knots`")
+        number = splines.number
+        if not ((number >= 1) & (number <= KNOTS_MAX) & (splines.spacing >= 1)).all():
+            raise ValueError(f"expected splines of 1 to {KNOTS_MAX} knots, at least 1 step apart")
+        if not (np.isfinite(foresight.estimate).all() and np.isfinite(foresight.start).all()):
+            raise ValueError("expected finite numbers in `estimate` and `start`")
 
     def _fail(self, error: Exception) -> None:
         if not self.counts["scheme_errors"]:
             what = f"the scheme {self._name}: {type(error).__name__}: {error}"
             trace = "".join(traceback.format_exception(error))
-            self._tell(f"{trace}{what}; where it fails, its vehicle has no plan at that step")
+            self._tell(f"{trace}{what}; a vehicle for which it fails is sent no plan at that step")
         self.counts["scheme_errors"] += 1
 
 
-def _cut(found: Foresight, some: slice) -> Foresight:
+def _cut(foresight: Foresight, some: slice) -> Foresight:
     """Predictions for some vehicles of a block; the arrays are views."""
-    arrays: Iterable[NDArray[Any]] = found[:-1]
-    told = Splines._make(each[some] for each in found.told)
-    return Foresight._make((*(each[some] for each in arrays), told))
+    arrays: Iterable[NDArray[Any]] = foresight[:-1]
+    splines = Splines._make(array[some] for array in foresight.splines)
+    return Foresight._make((*(array[some] for array in arrays), splines))
 
 
-def _blank(found: Foresight, figures: Figures, rows: Indices, step: Indices) -> None:
-    """Fill in the defaults: an input of zero from the present step on."""
-    for each in (found.ahead, found.committed, found.held, found.disturbance, found.horizons):
-        each[:] = 0
-    for each in (found.estimate, found.start, found.feedback, found.told.knots, found.told.back):
-        each[:] = 0
-    found.flown[:] = found.held.shape[-1]
-    found.told.number[:] = found.told.spacing[:] = 1
+def _blank(foresight: Foresight, figures: Figures, rows: Indices, step: Indices) -> None:
+    """Fill in defaults: inputs of zero from the present step on."""
+    splines = foresight.splines
+    for array in (
+        foresight.ahead,
+        foresight.committed,
+        foresight.held,
+        foresight.disturbance,
+        foresight.horizons,
+    ):
+        array[:] = 0
+    for array in (
+        foresight.estimate,
+        foresight.start,
+        foresight.feedback,
+        splines.knots,
+        splines.age,
+    ):
+        array[:] = 0
+    foresight.usable[:] = foresight.held.shape[-1]
+    splines.number[:] = splines.spacing[:] = 1
     figures[:] = 0
     figures["row"], figures["step"], figures["start"] = rows, step, step
     figures["gap"], figures["solved"] = 1, True

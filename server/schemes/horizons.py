@@ -1,7 +1,7 @@
-"""Schemes that send horizons of inputs: a predictor of vehicles, and the MPC that plans for them.
+"""Schemes that send horizons of inputs: a predictor, the hierarchical MPC, and the encoding.
 
-observations → x̂(k), x̂(k+d) (predictor) → U(k+d) (`mpc.hierarchical`) → d committed inputs, then
-H planned ones
+observations → x̂(k), x̂(k+d) (predictor) → U(k+d) (`mpc.hierarchical`)
+             → horizon: d committed inputs, then H planned ones
 """
 
 from collections import Counter
@@ -10,19 +10,19 @@ from typing import Protocol
 
 import numpy as np
 
-from skytether.server.common.scheme import Batch, Fleet, Foresight, Head, Scheme, SentPlans
+from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.server.mpc.hierarchical import Planner
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import FEEDBACK, Observation, committed_max, encode_horizon
 
-NOTHING = memoryview(b"")
-"""Bytes that go with a horizon without feedback."""
+NO_FEEDBACK = memoryview(b"")
+"""Encoded feedback of a horizon without feedback aboard."""
 
 
 class Predictor(Protocol):
-    """What is known of vehicles, and predicted of them; see `Scheme`."""
+    """The part of a `Scheme` that stores observations and predicts states."""
 
     observed_step: Indices
     counts: Counter[str]
@@ -33,10 +33,10 @@ class Predictor(Protocol):
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`."""
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`."""
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         """See `Scheme`."""
 
 
@@ -50,37 +50,38 @@ class InputScheme(Scheme):
         terms = fleet.terms
         self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
 
-    def encode(self, batch: Batch, head: Callable[[int], Head]) -> Iterator[tuple[int, bytes]]:
+    def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
         """See `Scheme`."""
-        # Bytes of one input on all axes, and of what goes with a horizon.
+        # Bytes of one input on all axes.
         width, planned = 4 * self.terms.axes, self.terms.planned
-        feedback, told = NOTHING, 0
+        feedback, feedback_bytes = NO_FEEDBACK, 0
         if self.terms.feedback:
-            feedback, told = batch.found.feedback.data.cast("B"), width * FEEDBACK
-        heads, inputs = self._packing.pack(batch, self.observed_step)
+            feedback = batch.foresight.feedback.data.cast("B")
+            feedback_bytes = width * FEEDBACK
+        numbers, inputs = self._packing.pack(batch, self.observed_step)
         begin = 0
-        for i, row, k, o, d in heads:
+        for i, row, k, age, d in numbers:
             end = begin + width * (d + planned)
-            vehicle, session, sent_us, number, silence = head(row)
-            extra = feedback[i * told : (i + 1) * told]
-            some, begin = inputs[begin:end], end
+            vehicle, session, sent_us, number, silence = header(row)
+            extra = feedback[i * feedback_bytes : (i + 1) * feedback_bytes]
+            own, begin = inputs[begin:end], end
             yield (
                 row,
-                encode_horizon(vehicle, session, k, sent_us, o, some, extra, number, silence),
+                encode_horizon(vehicle, session, k, sent_us, age, own, extra, number, silence),
             )
 
     def sent_plans(self, batch: Batch) -> SentPlans:
         """See `Scheme`."""
-        sent, found = batch.sent, batch.found
-        step, ahead = batch.step[sent], found.ahead[sent]
-        # Behind d committed inputs, another d of each vehicle.
+        sent, foresight = batch.sent, batch.foresight
+        step, ahead = batch.step[sent], foresight.ahead[sent]
+        # The planned inputs follow d committed ones; d differs between vehicles.
         stages = ahead[:, None] + np.arange(self.terms.planned)
-        inputs = np.take_along_axis(found.horizons[sent], stages[:, None], axis=2)
-        return SentPlans(step, step + ahead, found.start[sent], inputs)
+        inputs = np.take_along_axis(foresight.horizons[sent], stages[:, None], axis=2)
+        return SentPlans(step, step + ahead, foresight.start[sent], inputs)
 
 
 class HorizonScheme(InputScheme):
-    """A predictor, which knows where vehicles are and what they have been told, and a planner."""
+    """A scheme made of a predictor and the hierarchical MPC."""
 
     def __init__(self, predictor: Predictor, fleet: Fleet) -> None:
         super().__init__(fleet)
@@ -101,66 +102,68 @@ class HorizonScheme(InputScheme):
         """See `Scheme`."""
         return self.predictor.observe(row, observation)
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`."""
-        self.predictor.foresee(rows, step, found)
+        self.predictor.foresee(rows, step, foresight)
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         """See `Scheme`."""
-        self.predictor.remember(rows, step, found, event)
+        self.predictor.remember(rows, step, foresight, event)
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`."""
-        self.planner.plan(rows, step, found)
+        self.planner.plan(rows, step, foresight)
         self.solve_ns = self.planner.solve_ns
 
 
 class Packing:
-    """Packs the horizons that are sent, of one block of vehicles after the other.
+    """Packs the horizons of a block of vehicles into one buffer, for encoding.
 
     Args:
         axes: number of axes.
         most: largest number of inputs of a horizon on each axis.
-        planned: number of these that are planned, H; d more are committed.
+        planned: number of planned inputs H; the others are committed.
     """
 
     def __init__(self, axes: int, most: int, planned: int) -> None:
         self._width, self._planned = axes * most, planned
-        self._heads = np.empty((0, len(HEAD)), dtype=np.int64)
+        self._numbers = np.empty((0, len(COLUMNS)), dtype=np.int64)
         self._inputs = np.empty(0, dtype=np.float32)
-        self._told = self._inputs.data.cast("B")
+        self._bytes = self._inputs.data.cast("B")
 
     def pack(self, batch: Batch, observed: Indices) -> tuple[list[list[int]], memoryview]:
-        """Numbers in the columns of HEAD, and bytes of the horizons one after the other.
-
-        The bytes are valid until the next are packed.
+        """Pack the horizons that are sent.
 
         Args:
-            batch: the vehicles; their horizons have d + H inputs on each axis.
+            batch: vehicles and plans.
             observed: step of the newest observation of each vehicle; shape (capacity,).
+
+        Returns:
+            a row of COLUMNS for each horizon, and the bytes of all horizons, concatenated; each has
+            d + H inputs on each axis. The bytes are valid until the next call.
         """
         n = len(batch.sent)
-        if n > len(self._heads):
-            self._heads = np.empty((n, len(HEAD)), dtype=np.int64)
+        if n > len(self._numbers):
+            self._numbers = np.empty((n, len(COLUMNS)), dtype=np.int64)
             self._inputs = np.empty(n * self._width, dtype=np.float32)
-            self._told = self._inputs.data.cast("B")
+            self._bytes = self._inputs.data.cast("B")
         _pack(
-            batch.found.horizons,
-            batch.found.ahead,
+            batch.foresight.horizons,
+            batch.foresight.ahead,
             batch.sent,
             batch.rows,
             batch.step,
             observed,
             self._planned,
-            self._heads,
+            self._numbers,
             self._inputs,
         )
-        return self._heads[:n].tolist(), self._told
+        return self._numbers[:n].tolist(), self._bytes
 
 
-HEAD = ("index", "row", "step", "age", "ahead")
-"""Columns that `Packing` tells of a horizon: place of its vehicle in the block, and row; step k;
-age of the observation [steps]; delay bound d."""
+COLUMNS = ("index", "row", "step", "age", "ahead")
+"""Columns of `Packing.pack`: index of the vehicle in the block; its row; step k; age of the newest
+observation [steps]; delay bound d."""
 
 
 @kernel
@@ -172,15 +175,15 @@ def _pack(
     steps: I1,
     observed: I1,
     H: int,
-    heads: I2,
+    numbers: I2,
     packed: S1,
 ) -> None:
-    """Fill in what `Packing.pack` returns, as numbers; there is room for all there can be."""
+    """Fill in `numbers` and `packed`, see `Packing.pack`."""
     at = 0
     for n in range(len(sent)):
         i = sent[n]
-        heads[n, 0], heads[n, 1], heads[n, 2] = i, rows[i], steps[i]
-        heads[n, 3], heads[n, 4] = steps[i] - observed[rows[i]], ahead[i]
+        numbers[n, 0], numbers[n, 1], numbers[n, 2] = i, rows[i], steps[i]
+        numbers[n, 3], numbers[n, 4] = steps[i] - observed[rows[i]], ahead[i]
         for axis in range(horizons.shape[1]):
             for stage in range(ahead[i] + H):
                 packed[at] = horizons[i, axis, stage]

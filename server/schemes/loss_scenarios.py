@@ -1,52 +1,63 @@
-"""Doubt of committed inputs: what becomes of a vehicle where horizons in flight are lost.
+"""Predictions for the cases in which horizons in flight are lost.
 
-Case j is that the newest j + 1 of them are lost, and no more. A horizon is lost with the share that
-was lost lately, each by itself; the last case stands for all in which more are lost.
+In case j exactly the newest j + 1 horizons are lost; the last case also stands for all in which
+more are lost. Losses are taken as independent, with the share of horizons that was lost recently.
 """
 
 from skytether.server.common.scheme import Foresight
-from skytether.server.schemes.replay import FlownTrack, HorizonsInForce, chart, roll
+from skytether.server.schemes.replay import (
+    FlownTrack,
+    HorizonSchedule,
+    fly_schedule,
+    make_schedule,
+)
 from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings, speed_of
 from skytether.shared.base.kernel import part
 
 
 @part
-def doubt(
+def foresee_losses(
     settings: ReplaySettings,
     memory: ReplayMemory,
     row: int,
     i: int,
     k: int,
-    flying: int,
-    under_way: range,
-    course: HorizonsInForce,
+    in_force: int,
+    in_flight: range,
+    schedule: HorizonSchedule,
     track: FlownTrack,
-    found: Foresight,
+    foresight: Foresight,
 ) -> None:
-    """Fill in what becomes of vehicle `i` of a block where the newest horizons in flight are lost.
+    """Fill in `loss_probability`, `start_if_lost` and `inputs_if_lost` of vehicle i of a block.
 
     Args:
-        flying: number of the horizon in force at its newest observation.
-        under_way: numbers of those in flight.
+        row: row of the vehicle.
+        k: present step.
+        in_force: number of the horizon in force at its newest observation.
+        in_flight: numbers of the horizons in flight.
+        schedule, track: scratch memory.
     """
     observed, share, speed = memory.sent.observed[row], 1.0, speed_of(memory.state[row].u)
-    then, loss = k + found.ahead[i] - observed, memory.sent.heard[row].loss
-    for j in range(found.doubt.shape[1]):
-        found.doubt[i, j] = 0.0
-        left = len(under_way) - j - 1
+    start, loss = k + foresight.ahead[i] - observed, memory.sent.delivery[row].loss
+    cases = foresight.loss_probability.shape[1]
+    for j in range(cases):
+        foresight.loss_probability[i, j] = 0.0
+        left = len(in_flight) - j - 1
         if left < 0:
             continue
         share *= loss
-        # Where more may be lost than are reckoned with, or none is left, this case stands for all.
-        last = left == 0 or j + 1 == found.doubt.shape[1]
-        found.doubt[i, j] = share if last else share * (1.0 - loss)
-        some = range(under_way.start, under_way.start + left)
-        legs = chart(course, memory.sent, row, observed, flying, some)
+        # The last case stands for all in which this many or more are lost.
+        last = left == 0 or j + 1 == cases
+        foresight.loss_probability[i, j] = share if last else share * (1.0 - loss)
+        arriving = range(in_flight.start, in_flight.start + left)
+        legs = make_schedule(schedule, memory.sent, row, observed, in_force, arriving)
         for axis in range(len(settings.laws)):
             state = memory.state[row, axis]
             x = (state.p, state.v, state.u, speed)
-            roll(settings, memory, row, axis, course, legs, observed + then + settings.H, x, track)
+            end = observed + start + settings.H
+            fly_schedule(settings, memory, row, axis, schedule, legs, end, x, track)
             for n in range(2):
-                found.doubted_start[i, j, axis, n] = track.states[max(then, 0), n]
+                foresight.start_if_lost[i, j, axis, n] = track.states[max(start, 0), n]
             for n in range(settings.H):
-                found.doubted[i, j, axis, n] = track.commands[then + n] if then + n >= 0 else 0.0
+                at = start + n
+                foresight.inputs_if_lost[i, j, axis, n] = track.commands[at] if at >= 0 else 0.0

@@ -1,7 +1,7 @@
-"""The scheme "none": the paper's plans from the newest observation, taken for the present."""
+"""The scheme "none": the paper's MPC, which plans from the newest observation as if it were new."""
 
 from skytether.server.schemes import predictive
 
 make = predictive.make
 KERNELS = (predictive, *predictive.KERNELS)
-"""See `server.schemes.table`."""
+"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""

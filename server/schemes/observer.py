@@ -1,12 +1,12 @@
-"""Disturbance observer: what else acts on a vehicle, as an input that nobody gave.
+"""Disturbance observer: estimates wind and model errors as an equivalent input ŵ.
 
-Each observation shows by how much the velocity has come away from where the one before leads with
-the inputs flown since. That much of it is taken for a disturbance w that has acted all the time:
+From one observation the model predicts the velocity m steps later, with the inputs flown and ŵ. The
+difference to the observed velocity updates the estimate:
 
-    w <- w + (1 - e^(-m dt / T)) (w' - w)          w': that which explains the m steps since
+    ŵ ← ŵ + (1 - e^(-m Δt / T)) (w' - ŵ)          w': constant input that explains the difference
 
-with T = `control.observer_s`. Both schemes of delay compensation learn it so, each with the inputs
-that it knows of.
+with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with the
+flown inputs as it knows them.
 """
 
 import numpy as np
@@ -17,32 +17,32 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 TRIP_NS = 1_500_000_000
-"""Longest trip, from an observation to the plan made from it, that `control.observer_s` is meant
-for [ns]; over a longer one an observer as fast as that makes the plans swing."""
+"""Time from an observation to the start of the plan above which the observer is slowed down [ns]:
+with a longer delay an observer with T = `control.observer_s` makes the control loop oscillate."""
 
 
 def decay_of(terms: Terms, control: ControlConfig) -> float:
-    """Share of the error that is left in a step; 1 where nothing is learned."""
+    """Share e^(-Δt / T) of the observer's error that remains after a step; 1 without observer."""
     return float(np.exp(-terms.dt_s / control.observer_s)) if control.observer_s else 1.0
 
 
 @inline
-def learned(
+def updated_disturbance(
     w: float, off: float, m: int, a11: float, decay: float, trip_ns: int, bound: float
 ) -> float:
-    """Disturbance after another observation [m/s], within the bound of inputs.
+    """Estimate ŵ after another observation [m/s], limited to ±u_max.
 
     Args:
-        w: that before [m/s].
-        off: how far the velocity is from where w leads in the steps since [m/s].
-        m: number of these steps.
-        a11: share of the velocity that is left after a step.
+        w: previous estimate [m/s].
+        off: observed minus predicted velocity [m/s].
+        m: number of steps predicted.
+        a11: share of the velocity that remains after a step.
         decay: see `decay_of`.
-        trip_ns: time from the observation to where planning starts; a long trip makes it slower.
+        trip_ns: time from the observation to where planning starts [ns], see `TRIP_NS`.
         bound: u_max [m/s].
     """
-    # A change of w changes the velocity after m steps by 1 - a11^m of it.
+    # An input of 1 m/s for m steps changes the velocity by 1 - a11^m.
     missing = off / (1.0 - a11**m)
-    # Tried at the full speed: the loop swings at round trips beyond 1.5 s (docs/schemes.md).
+    # Measured without this: the loop oscillates at round trips above 1.5 s (docs/schemes.md).
     slower = max(1.0, trip_ns / TRIP_NS)
     return bounded(w + (1.0 - decay ** (m / slower)) * missing, bound)

@@ -1,16 +1,15 @@
-"""Downlink delay compensator, eq. (12)-(13): where the vehicle is now, from where it was.
+"""The scheme "predictive", the paper's: predicts the present state from an old observation.
 
     x̂(k) = A^τ x(k-τ) + Σ_{i=1…τ} A^{i-1} B û(k-i)        τ: age of the observation in steps
 
-û is the history of eq. (12): the first inputs the server computed, whether sent or not (E12). The
-sum is not formed: one step of eq. (4) after the other says the same.
+û is the input history of eq. (12): the first input of each plan computed, whether sent or not
+(E12). Eq. (13) is evaluated by repeating eq. (4), step by step.
 
-This is the scheme "predictive", and "none", which takes the newest observation for the present.
-`server.schemes.committed` is the other.
+The scheme "none" uses the same code and takes the newest observation as the present state.
 
-The paper has neither observer nor feedback. With `control.observer_s` a disturbance ŵ is learned
-from one observation to the next (`server.schemes.observer`), between the inputs that both say were
-flown, and added to every û. With feedback aboard x̂(k), ŵ and K go with the horizon.
+The paper has neither observer nor feedback aboard. With `control.observer_s` a disturbance ŵ is
+estimated between two observations (`server.schemes.observer`) and added to every û. With feedback
+aboard the horizon carries x̂(k), ŵ and K.
 """
 
 from collections import Counter
@@ -23,7 +22,7 @@ from skytether.server.common.scheme import Fleet, Foresight
 from skytether.server.mpc import exact, hierarchical
 from skytether.server.schemes import horizons
 from skytether.server.schemes.horizons import HorizonScheme
-from skytether.server.schemes.observer import decay_of, learned
+from skytether.server.schemes.observer import decay_of, updated_disturbance
 from skytether.shared.base.kernel import F2, F3, I1, S3, kernel, part
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
@@ -33,14 +32,14 @@ from skytether.shared.wire.protocol import (
     DISTURBANCE,
     GAIN_P,
     GAIN_V,
-    LED_P,
-    LED_V,
+    REFERENCE_P,
+    REFERENCE_V,
     Observation,
 )
 
 APART_NS = 250_000_000
-"""Longest time between two observations from which a disturbance is learned [ns]: the inputs flown
-in between are reckoned from those at both ends."""
+"""Longest time between two observations that update the disturbance [ns]. The inputs flown between
+them are interpolated from those at both ends, which is too coarse over longer times."""
 
 
 class EstimatorSettings(NamedTuple):
@@ -49,45 +48,47 @@ class EstimatorSettings(NamedTuple):
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
     compensate: bool
-    """Whether observations are flown on to the present."""
+    """Whether observations are predicted to the present; False for the scheme "none"."""
     dt_ns: int
     """Length of a step [ns]."""
     decay: float
-    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    """See `observer.decay_of`."""
     feeds_back: bool
-    """Whether horizons bring feedback."""
+    """Whether horizons carry feedback."""
 
 
 class EstimatorMemory(NamedTuple):
-    """State of every vehicle as the server knows it."""
+    """Newest observation and input history of every vehicle."""
 
     observed: I1
     """Step of the newest observation, or -1; shape (capacity,)."""
     state: F3
-    """State of it [m, m/s]; shape (capacity, axes, 2)."""
+    """Observed state [m, m/s]; shape (capacity, axes, 2)."""
     flown: F2
-    """Input flown at its step [m/s]; shape (capacity, axes)."""
+    """Input flown at the step of that observation [m/s]; shape (capacity, axes)."""
     base: I1
-    """Step of the one that was learned from last, or -1; shape (capacity,)."""
+    """Step of the observation that updated the disturbance last, or -1; shape (capacity,)."""
     base_velocity: F2
-    """Velocity of that [m/s]; shape (capacity, axes)."""
+    """Velocity in that observation [m/s]; shape (capacity, axes)."""
     base_flown: F2
     """Input flown at its step [m/s]; shape (capacity, axes)."""
     disturbance: F2
     """Disturbance ŵ [m/s]; shape (capacity, axes)."""
     inputs: F3
-    """Input history û, a ring over the steps; 0, hovering, where nothing was computed [m/s]."""
+    """Input history û, a ring over the steps, initially 0 [m/s]; shape (capacity, axes,
+    age_max)."""
     last: I1
-    """Step whose û was computed last, or -1; shape (capacity,)."""
+    """Newest step with an entry in the input history, or -1; shape (capacity,)."""
 
 
 class Estimator:
-    """The paper's `Scheme`: observations and inputs of up to `capacity` vehicles.
+    """Predictor of the schemes "predictive" and "none".
 
     Args:
-        terms: the rule of flight; with the scheme "none", x̂(k) is the newest observation, as it is.
-        control: `observer_s`, which the scheme "none" has no use for.
-        gain: K of feedback aboard, 0 without; shape (axes, 2).
+        terms: terms of the flight.
+        control: `observer_s`, which the scheme "none" ignores.
+        gain: gain K of the feedback aboard, 0 without feedback; shape (axes, 2).
+        capacity: largest number of vehicles.
     """
 
     def __init__(self, terms: Terms, control: ControlConfig, gain: Array, capacity: int) -> None:
@@ -108,7 +109,7 @@ class Estimator:
             base_velocity=np.zeros((capacity, n)),
             base_flown=np.zeros((capacity, n)),
             disturbance=np.zeros((capacity, n)),
-            # No older observation is planned from, so no older input is ever asked for.
+            # Observations older than `age_max` are not used, so no older input is needed.
             inputs=np.zeros((capacity, n, terms.age_max)),
             last=np.full(capacity, -1, dtype=np.int64),
         )
@@ -132,42 +133,42 @@ class Estimator:
         memory.flown[row] = observation.input
         return True
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`: planning starts at k, from x̂(k).
 
         Source: eq. (13).
         """
-        _fly_on(self._settings, self._memory, rows, step, found)
+        _predict(self._settings, self._memory, rows, step, foresight)
 
     def remember(
         self,
         rows: Indices,
         step: Indices,
-        found: Foresight,
+        foresight: Foresight,
         event: Flags,  # noqa: ARG002 - whether sent or not (E12)
     ) -> None:
-        """Take û(k) ← u(k|k); steps at which nothing was computed repeat the input before them.
+        """Append û(k) ← u(k|k); steps without a plan repeat the previous input.
 
         Source: eq. (12).
         """
-        _write_down(self._memory.inputs, self._memory.last, rows, step, found.horizons)
+        _append_inputs(self._memory.inputs, self._memory.last, rows, step, foresight.horizons)
 
 
 def make(fleet: Fleet) -> HorizonScheme:
-    """The scheme "predictive", and "none"."""
+    """Make the scheme "predictive" or "none"."""
     control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
     return HorizonScheme(Estimator(fleet.terms, control, gain, fleet.capacity), fleet)
 
 
 KERNELS = (horizons, hierarchical, exact)
-"""See `server.schemes.table`."""
+"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
 
 
 @part
 def _observe_disturbance(
     settings: EstimatorSettings, memory: EstimatorMemory, row: int, k: int
 ) -> None:
-    """Disturbance observer: from the observation before to the newest, where there is a new one."""
+    """Update the disturbance of a vehicle if it has a new observation."""
     begin, end = memory.base[row], memory.observed[row]
     m, near = end - begin, APART_NS // settings.dt_ns
     for i in range(len(settings.laws)):
@@ -176,16 +177,15 @@ def _observe_disturbance(
             memory.base_velocity[row, i],
             memory.base_flown[row, i],
         )
-        # One step at least, where Δt itself is longer than APART_NS.
+        # max: at least one step, if Δt itself is longer than APART_NS.
         if begin >= 0 and 0 < m <= max(1, near):
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity
             for step in range(m):
-                # Inputs between two observations are not told: a straight line between both is
-                # taken for them.
+                # Inputs between two observations are not reported: interpolate linearly.
                 p, v = advance(axis, p, v, u + step * change + w)
             off, trip_ns = memory.state[row, i, 1] - v, (k - end) * settings.dt_ns
-            memory.disturbance[row, i] = learned(
+            memory.disturbance[row, i] = updated_disturbance(
                 w, off, m, axis.a11, settings.decay, trip_ns, axis.bound
             )
         memory.base_velocity[row, i] = memory.state[row, i, 1]
@@ -194,10 +194,10 @@ def _observe_disturbance(
 
 
 @kernel
-def _fly_on(
-    settings: EstimatorSettings, memory: EstimatorMemory, rows: I1, steps: I1, found: Foresight
+def _predict(
+    settings: EstimatorSettings, memory: EstimatorMemory, rows: I1, steps: I1, foresight: Foresight
 ) -> None:
-    """Fill in x̂(k) as `estimate` and `start`, ŵ, and the state that feedback leads on from.
+    """Fill in x̂(k) as `estimate` and `start`, the disturbance ŵ, and the feedback.
 
     Source: eq. (13).
     """
@@ -211,21 +211,21 @@ def _fly_on(
             p, v = memory.state[row, j, 0], memory.state[row, j, 1]
             if settings.compensate:
                 for step in range(memory.observed[row], k):
-                    # Steps behind `last`, at which nothing was computed, go on with its input.
+                    # Steps after `last` repeat its input.
                     u = memory.inputs[row, j, min(step, memory.last[row]) % reach]
                     p, v = advance(axis, p, v, u + w)
-            found.estimate[i, j, 0], found.estimate[i, j, 1] = p, v
-            found.start[i, j, 0], found.start[i, j, 1] = p, v
-            found.disturbance[i, j] = w
+            foresight.estimate[i, j, 0], foresight.estimate[i, j, 1] = p, v
+            foresight.start[i, j, 0], foresight.start[i, j, 1] = p, v
+            foresight.disturbance[i, j] = w
             if settings.feeds_back:
-                feedback = found.feedback[i, j]
-                feedback[LED_P], feedback[LED_V], feedback[DISTURBANCE] = p, v, w
+                feedback = foresight.feedback[i, j]
+                feedback[REFERENCE_P], feedback[REFERENCE_V], feedback[DISTURBANCE] = p, v, w
                 feedback[GAIN_P], feedback[GAIN_V] = axis.gain_p, axis.gain_v
 
 
 @kernel
-def _write_down(inputs: F3, last_step: I1, rows: I1, steps: I1, horizons: S3) -> None:
-    """Put the first input of each horizon into the history `inputs`, see `Estimator.remember`.
+def _append_inputs(inputs: F3, last_step: I1, rows: I1, steps: I1, horizons: S3) -> None:
+    """Append the first input of each horizon to the history `inputs`, see `Estimator.remember`.
 
     Source: eq. (12).
     """
@@ -234,9 +234,9 @@ def _write_down(inputs: F3, last_step: I1, rows: I1, steps: I1, horizons: S3) ->
         row, step, last = rows[i], steps[i], last_step[rows[i]]
         if last >= 0:
             for axis in range(horizons.shape[1]):
-                held = inputs[row, axis, last % reach]
+                repeated = inputs[row, axis, last % reach]
                 for missed in range(max(last + 1, step - reach + 1), step):
-                    inputs[row, axis, missed % reach] = held
+                    inputs[row, axis, missed % reach] = repeated
         for axis in range(horizons.shape[1]):
             inputs[row, axis, step % reach] = horizons[i, axis, 0]
         last_step[row] = step

@@ -1,10 +1,11 @@
-"""Course of a vehicle: which horizon is in force from which step on, and the flight along it.
+"""Replay of horizons: a schedule of which horizon is in force when, and the flight by it.
 
-A course is charted from what is in force and under way, and rolled by the rule of flight
-(`shared.law.rule`), one axis after the other. With it the committed scheme foresees a vehicle, the
-disturbance observer replays what was flown, and doubt asks what follows from a loss.
+The schedule is made from the horizons in force and in flight, and flown by the rule of flight
+(`shared.law.rule`), one axis after the other:
 
     x(i+1) = A x(i) + B (u(i) + w)
+
+The scheme "committed", its disturbance observer and its loss scenarios use it.
 """
 
 from typing import NamedTuple
@@ -16,17 +17,17 @@ from skytether.shared.base.kernel import F1, F2, I1, inline, part
 from skytether.shared.law.rule import AxisHorizon
 
 
-class HorizonsInForce(NamedTuple):
-    """Horizons with the step from which each is in force; room for more than can be in flight."""
+class HorizonSchedule(NamedTuple):
+    """Which horizon is in force when: legs in order of time. The arrays are longer than needed."""
 
     begins: I1
     """First step of each leg."""
     numbers: I1
-    """Number of the horizon flown on it, HOVERS or UNKNOWN."""
+    """Number of the horizon in force on the leg, or HOVERS or UNKNOWN."""
 
 
 class FlownTrack(NamedTuple):
-    """Inputs flown on one axis, step by step, and the states they led to."""
+    """Inputs flown on one axis and the resulting states, one row per step."""
 
     commands: F1
     """Inputs [m/s]."""
@@ -35,126 +36,147 @@ class FlownTrack(NamedTuple):
 
 
 @part
-def chart(
-    course: HorizonsInForce,
+def make_schedule(
+    schedule: HorizonSchedule,
     sent: Sent,
     row: int,
     begin: int,
-    flown: int,
+    in_force: int,
     following: range,
 ) -> int:
-    """Number of legs of the course from `begin`: `flown`, then each of those following it.
+    """Fill in the schedule from step `begin` on.
 
     Args:
-        following: numbers of horizons, each in force when it is due.
+        schedule: output.
+        sent: tracker of the horizons.
+        row: row of the vehicle.
+        begin: first step of the schedule.
+        in_force: number of the horizon in force then.
+        following: numbers of the horizons after it, each in force from the step it is due.
+
+    Returns:
+        number of legs.
     """
     ring, legs = sent.plans.shape[1], 1
-    course.begins[0], course.numbers[0] = begin, flown
+    schedule.begins[0], schedule.numbers[0] = begin, in_force
     for number in following:
         due = sent.plans[row, number % ring].due
-        # In force already when the course begins: the newest such horizon counts.
+        # Of horizons that are due before the schedule begins, the newest is in force.
         if due <= begin:
-            course.numbers[0] = number
+            schedule.numbers[0] = number
             continue
-        course.begins[legs], course.numbers[legs] = due, number
+        schedule.begins[legs], schedule.numbers[legs] = due, number
         legs += 1
     return legs
 
 
 @part
-def roll(
+def fly_schedule(
     settings: ReplaySettings,
     memory: ReplayMemory,
     row: int,
     axis: int,
-    course: HorizonsInForce,
+    schedule: HorizonSchedule,
     legs: int,
     end: int,
     x: tuple[float, float, float, float],
     track: FlownTrack,
 ) -> None:
-    """Fly one axis along a course from its begin to step `end`, into `track`.
+    """Fly one axis by a schedule from its first step to step `end`.
 
     Args:
-        x: position [m] and velocity [m/s] at the begin, the input flown from there on [m/s], and
-            the magnitude of that over all axes [m/s].
+        settings, memory: constants, and the horizons that were sent.
+        row: row of the vehicle.
+        axis: axis that is flown.
+        schedule: the schedule.
+        legs: number of its legs.
+        end: step after the last.
+        x: observation at the first step: position [m], velocity [m/s], input flown on this axis
+            [m/s], and magnitude of the input over all axes [m/s].
+        track: output: inputs and states from the first step on.
     """
-    law, begin = settings.laws[axis], course.begins[0]
+    law, begin = settings.laws[axis], schedule.begins[0]
     model, bound, w = axis_of(law), law.bound, memory.state[row, axis].w
     gain_p, gain_v = law.gain_p, law.gain_v
-    p, v, told_first, speed_told = x
+    p, v, first_input, first_speed = x
     for leg in range(legs):
-        first = course.begins[leg]
-        last = min(end, course.begins[leg + 1] if leg + 1 < legs else end)
-        number = course.numbers[leg]
+        first = schedule.begins[leg]
+        last = min(end, schedule.begins[leg + 1] if leg + 1 < legs else end)
+        number = schedule.numbers[leg]
         if first >= last:
             continue
         if number < 0:
-            # Unknown horizon: assume that the last input is held.
+            # Horizon unknown: assume that the observed input is held.
             brake = settings.brake if number == HOVERS else 0.0
-            stands = AxisHorizon(
-                model, (told_first,), 1, True, speed_told, brake, bound, False, 0.0, 0.0, 0.0
+            one_input = AxisHorizon(
+                model, (first_input,), 1, True, first_speed, brake, bound, False, 0.0, 0.0, 0.0
             )
-            p, v = _fly(stands, begin, 0.0, 0.0, p, v, w, first, last, begin, told_first, track)
+            p, v = _fly(one_input, begin, 0.0, 0.0, p, v, w, first, last, begin, first_input, track)
             continue
         slot = number % memory.sent.plans.shape[1]
-        horizon, led = memory.horizons[row, slot], memory.led[row, slot, axis]
-        made_for, led_p, led_v = memory.sent.plans[row, slot].step, led.p, led.v
-        held = AxisHorizon(
+        sent, reference = memory.horizons[row, slot], memory.reference[row, slot, axis]
+        made_for, ref_p, ref_v = memory.sent.plans[row, slot].step, reference.p, reference.v
+        horizon = AxisHorizon(
             model,
             memory.inputs[row, slot, axis],
-            horizon.length,
+            sent.length,
             True,
-            horizon.speed,
+            sent.speed,
             settings.brake,
             bound,
             settings.feeds_back,
             gain_p,
             gain_v,
-            led.w,
+            reference.w,
         )
         if settings.feeds_back:
-            led_p, led_v = reference_at(held, led.stage, first - made_for, led_p, led_v)
-            if leg == 0 and first - made_for > led.stage:
-                led.stage, led.p, led.v = first - made_for, led_p, led_v
-        p, v = _fly(held, made_for, led_p, led_v, p, v, w, first, last, begin, told_first, track)
+            stage = first - made_for
+            ref_p, ref_v = reference_at(horizon, reference.stage, stage, ref_p, ref_v)
+            if leg == 0 and stage > reference.stage:
+                reference.stage, reference.p, reference.v = stage, ref_p, ref_v
+        p, v = _fly(
+            horizon, made_for, ref_p, ref_v, p, v, w, first, last, begin, first_input, track
+        )
     after = max(end - begin, 0)
     track.states[after, 0], track.states[after, 1] = p, v
 
 
 @inline
 def _fly(
-    held: AxisHorizon,
+    horizon: AxisHorizon,
     made_for: int,
-    led_p: float,
-    led_v: float,
+    ref_p: float,
+    ref_v: float,
     p: float,
     v: float,
     w: float,
     first: int,
     last: int,
     begin: int,
-    told_first: float,
+    first_input: float,
     track: FlownTrack,
 ) -> tuple[float, float]:
-    """Fly one axis by a horizon from step `first` to `last`, into `track`; the state then.
+    """Fly one axis by a horizon from step `first` to `last`.
 
     Args:
-        held: the horizon.
+        horizon: the horizon.
         made_for: step that it was made for.
-        led_p, led_v: where it leads at `first`, x̄ [m, m/s].
+        ref_p, ref_v: its reference state x̄ at `first` [m, m/s].
         p, v: position [m] and velocity [m/s] at `first`.
         w: disturbance [m/s].
-        first, last: steps.
-        begin: step at which the track begins.
-        told_first: input that the vehicle says it flies there [m/s].
-        track: what is filled in.
+        first, last: first step, and step after the last.
+        begin: first step of `track`.
+        first_input: observed input at that step [m/s].
+        track: output: inputs and states.
+
+    Returns:
+        position [m] and velocity [m/s] at `last`.
     """
     for k in range(first, last):
-        u, _, led_p, led_v = step(held, k - made_for, led_p, led_v, p, v)
+        u, _, ref_p, ref_v = step(horizon, k - made_for, ref_p, ref_v, p, v)
         if k == begin:
-            u = told_first  # as it says itself, whatever the rule
+            u = first_input  # as observed, whatever the rule of flight gives
         track.commands[k - begin] = u
         track.states[k - begin, 0], track.states[k - begin, 1] = p, v
-        p, v = advance(held.model, p, v, u + w)
+        p, v = advance(horizon.model, p, v, u + w)
     return p, v

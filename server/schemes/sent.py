@@ -1,9 +1,9 @@
-"""Tracker of what was sent to vehicles: what is in force, in flight, or lost.
+"""Tracker of the plans sent to vehicles: which are in force, in flight, or lost.
 
-Plans (horizons or trajectories) are numbered from 0 in the order of sending, and the newest lie in
-a ring. An observation names the plan in force by the step that it was made for; here that becomes
-its number again. What was made later is under way until it is due, by the delay bound d
-(`schemes.delay_bound`), and lost from then on.
+Plans (horizons or trajectories) are numbered from 0 in the order of sending; the newest are stored
+in a ring. An observation names the plan in force by the step that it was made for, from which its
+number is found. A later plan is in flight until it is due, d steps after the step it was made for
+(`schemes.delay_bound`). If it is not in force by then, it is lost.
 """
 
 from typing import Annotated, NamedTuple
@@ -15,10 +15,10 @@ from skytether.server.common.clock import Seen, half_trip_ns, shortest_ns
 from skytether.server.schemes import delay_bound as delay
 from skytether.server.schemes.delay_bound import (
     DelayBound,
-    acknowledge,
-    at_least,
-    begin,
+    add_sample,
     delay_bound,
+    raise_to,
+    set_first,
 )
 from skytether.shared.base.kernel import I1, part, record, records
 from skytether.shared.law.terms import Terms
@@ -26,32 +26,31 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
-"""Number of a plan where there is none (the vehicle brakes and stands still), and where it was sent
-in an earlier life of the server, or dropped aboard."""
+"""In place of a plan's number: no plan is in force, so the vehicle brakes and hovers; or a plan of
+which nothing is stored, sent before the server restarted or dropped aboard."""
 MARGIN = 2
-"""Steps on top of half a round trip, until a plan has been acknowledged."""
-LOSS, LEARNED = 0.1, 0.05
-"""Share of lost plans that is assumed at first, and by how much of itself each plan that has come
-into force, or is lost, moves it."""
+"""Steps added to half a round trip for the first delay bound, before any acknowledgement."""
+FIRST_LOSS, LOSS_WEIGHT = 0.1, 0.05
+"""Loss rate assumed at first, and weight of each new plan in its exponential average."""
 
 
-class Heard:
-    """Record: what a vehicle has said of the plans that were sent to it."""
+class Delivery:
+    """Record: delivery of the plans sent to a vehicle, as its observations report it."""
 
     in_force: int
     """Step that the plan in force at its newest observation was made for, or NO_HORIZON."""
     since: int
-    """First step flown with it."""
+    """First step flown with that plan."""
     acknowledged: int
-    """Step that the plan last seen to have come into force was made for, or NO_HORIZON."""
+    """Step that the newest plan with a delay sample was made for, or NO_HORIZON."""
     judged: int
-    """Step up to which plans were seen in force, lost or overtaken."""
+    """Step up to which losses have been counted."""
     sent: int
     """Number of plans sent so far."""
     first: int
-    """Number of the first that may be held: those before were dropped aboard."""
+    """Number of the first plan that the vehicle may still have: it dropped those before."""
     loss: float
-    """Share of plans that were lost lately."""
+    """Loss rate of recent plans, from 0 to 1."""
 
 
 class SentPlan:
@@ -60,21 +59,21 @@ class SentPlan:
     step: int
     """Step that it was made for."""
     due: int
-    """Step at which it is in force, or lost."""
+    """Step at which it is either in force or lost."""
 
 
-HEARD, SENT_PLAN = record(Heard), record(SentPlan)
+DELIVERY, SENT_PLAN = record(Delivery), record(SentPlan)
 
 
 class Sent(NamedTuple):
-    """What was sent to each vehicle, and what it has said of that."""
+    """Plans sent to each vehicle, and their delivery."""
 
     observed: I1
-    """Step of its newest observation, or -1; shape (capacity,)."""
-    heard: Annotated[NDArray[np.void], records(HEARD, 1)]
-    """Shape (capacity,)."""
+    """Step of the newest observation of each, or -1; shape (capacity,)."""
+    delivery: Annotated[NDArray[np.void], records(DELIVERY, 1)]
+    """Delivery state of each vehicle; shape (capacity,)."""
     plans: Annotated[NDArray[np.void], records(SENT_PLAN, 2)]
-    """Newest plans, a ring: number n has index n modulo `ring`; shape (capacity, ring)."""
+    """Newest plans, in a ring: plan n has index n modulo `ring`; shape (capacity, ring)."""
     bound: DelayBound
     """Delay bound d."""
     dt_ns: int
@@ -82,19 +81,19 @@ class Sent(NamedTuple):
 
 
 def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
-    """Tracker of vehicles to which nothing was sent.
+    """Tracker without any plan.
 
     Args:
         capacity: number of vehicles.
-        ring: number of plans that are remembered of each.
-        terms: the rule of flight.
+        ring: number of plans stored for each vehicle.
+        terms: terms of the flight.
         control: `delay_bound`.
-        most: largest d, what a plan has room for.
+        most: largest delay bound d that fits a plan.
     """
     fixed_s = None if control.delay_bound == "auto" else control.delay_bound
     sent = Sent(
         observed=np.full(capacity, -1, dtype=np.int64),
-        heard=np.zeros(capacity, dtype=HEARD),
+        delivery=np.zeros(capacity, dtype=DELIVERY),
         plans=np.zeros((capacity, ring), dtype=SENT_PLAN),
         bound=delay_bound(capacity, terms.dt_s, most, fixed_s),
         dt_ns=terms.dt_ns,
@@ -105,45 +104,45 @@ def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig,
 
 
 def forget(sent: Sent, row: int) -> None:
-    """Begin anew with a vehicle."""
+    """Forget the plans sent to a vehicle, and its delay bound."""
     sent.observed[row] = -1
-    sent.heard[row] = (NO_HORIZON, 0, NO_HORIZON, -1, 0, 0, LOSS)
+    sent.delivery[row] = (NO_HORIZON, 0, NO_HORIZON, -1, 0, 0, FIRST_LOSS)
     delay.forget(sent.bound, row)
 
 
 @part
-def judge(sent: Sent, clock: Seen, row: int) -> int:
-    """Take what the newest observation of a vehicle says of delays and losses.
+def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
+    """Update delay bound and loss rate of a vehicle from its newest observation.
 
     Returns:
-        how many plans are newly known to be lost.
+        number of plans newly known to be lost.
     """
-    heard, bound, observed = sent.heard[row], sent.bound, sent.observed[row]
-    # No sample yet: half a round trip, rounded up, and a margin.
+    delivery, bound, observed = sent.delivery[row], sent.bound, sent.observed[row]
+    # No sample yet: half a round trip, rounded up, plus a margin.
     if bound.steps[row] == 0:
-        begin(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
-    at_least(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
-    # Those that were due and are not in force have been overtaken, or are lost. They stay in the
-    # ring, and are counted once.
+        set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
+    raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
+    # Plans later than the one in force that are due now are lost. They stay in the ring, so
+    # `judged` keeps them from being counted twice.
     lost = 0
-    for number in range(first_after(sent, row, heard.in_force), heard.sent):
-        if heard.judged < sent.plans[row, number % sent.plans.shape[1]].due <= observed:
+    for number in range(first_after(sent, row, delivery.in_force), delivery.sent):
+        if delivery.judged < sent.plans[row, number % sent.plans.shape[1]].due <= observed:
             lost += 1
-            heard.loss += LEARNED * (1.0 - heard.loss)
-    heard.judged = observed
-    if heard.in_force != heard.acknowledged and number_of(sent, row, heard.in_force) >= 0:
-        heard.loss -= LEARNED * heard.loss
-        acknowledge(bound, row, heard.since - heard.in_force)
-        heard.acknowledged = heard.in_force
+            delivery.loss += LOSS_WEIGHT * (1.0 - delivery.loss)
+    delivery.judged = observed
+    if delivery.in_force != delivery.acknowledged and number_of(sent, row, delivery.in_force) >= 0:
+        delivery.loss -= LOSS_WEIGHT * delivery.loss
+        add_sample(bound, row, delivery.since - delivery.in_force)
+        delivery.acknowledged = delivery.in_force
     return lost
 
 
 @part
-def note(sent: Sent, row: int, step: int, d: int) -> int:
-    """Take note that the plan made for a step is sent, due d steps later; its index in the ring."""
-    heard = sent.heard[row]
-    slot = heard.sent % sent.plans.shape[1]
-    heard.sent += 1
+def add_plan(sent: Sent, row: int, step: int, d: int) -> int:
+    """Store that a plan made for a step is sent, due d steps later; its index in the ring."""
+    delivery = sent.delivery[row]
+    slot = delivery.sent % sent.plans.shape[1]
+    delivery.sent += 1
     plan = sent.plans[row, slot]
     plan.step, plan.due = step, step + d
     return slot
@@ -151,16 +150,16 @@ def note(sent: Sent, row: int, step: int, d: int) -> int:
 
 @part
 def oldest(sent: Sent, row: int) -> int:
-    """Number of the oldest plan that is remembered, and may be held."""
-    return max(sent.heard[row].first, sent.heard[row].sent - sent.plans.shape[1])
+    """Number of the oldest plan that is stored and that the vehicle may still have."""
+    return max(sent.delivery[row].first, sent.delivery[row].sent - sent.plans.shape[1])
 
 
 @part
 def number_of(sent: Sent, row: int, made_for: int) -> int:
-    """Number of the plan made for a step; HOVERS of none, UNKNOWN of one that is not remembered."""
+    """Number of the plan made for a step: HOVERS if negative, UNKNOWN if it is not stored."""
     if made_for < 0:
         return HOVERS
-    # From the newest down: the plan in force is mostly one of the last few.
+    # Search from the newest plan down: the plan in force is usually one of the last few.
     number = first_after(sent, row, made_for) - 1
     if number < oldest(sent, row):
         return UNKNOWN
@@ -170,16 +169,23 @@ def number_of(sent: Sent, row: int, made_for: int) -> int:
 @part
 def first_after(sent: Sent, row: int, step: int) -> int:
     """Number of the first plan made for a later step."""
-    ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.heard[row].sent
+    ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least and sent.plans[row, (number - 1) % ring].step > step:
         number -= 1
     return number
 
 
 @part
-def first_under_way(sent: Sent, row: int, in_force: int, observed: int) -> int:
-    """Number of the first plan made after the one in force that is not due yet when observed."""
-    ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.heard[row].sent
+def first_in_flight(sent: Sent, row: int, in_force: int, observed: int) -> int:
+    """Number of the first plan in flight at an observation: after the one in force, not yet due.
+
+    Args:
+        sent: the tracker.
+        row: row of the vehicle.
+        in_force: step that the plan in force was made for.
+        observed: step of the observation.
+    """
+    ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least:
         plan = sent.plans[row, (number - 1) % ring]
         if plan.step <= in_force or plan.due <= observed:

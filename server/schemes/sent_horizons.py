@@ -1,6 +1,6 @@
-"""Memory of committed inputs: newest observations of each vehicle, and the horizons sent to it.
+"""Memory of the scheme "committed": newest observations of each vehicle, and its sent horizons.
 
-Which of these are in force, in flight or lost is kept by `schemes.sent`.
+`schemes.sent` tracks which of the horizons are in force, in flight or lost.
 """
 
 from typing import Annotated, NamedTuple
@@ -13,20 +13,20 @@ from skytether.server.common.scheme import Foresight
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.sent import Sent
 from skytether.shared.base.kernel import B1, I1, R1, R2, S4, kernel, part, record, records
-from skytether.shared.wire.protocol import DISTURBANCE, LED_P, LED_V
+from skytether.shared.wire.protocol import DISTURBANCE, REFERENCE_P, REFERENCE_V
 
 
 class Observations:
     """Record: the two newest observations of a vehicle."""
 
     base_step: int
-    """Step of the observation before, or -1."""
+    """Step of the previous observation, or -1."""
     base_in_force: int
-    """Step that the horizon in force there was made for, or NO_HORIZON."""
+    """Step that the horizon in force in the previous observation was made for, or NO_HORIZON."""
     takes: int
-    """1 if horizons that come are flown at its newest observation, else 0."""
+    """1 if the vehicle accepts horizons in its newest observation, else 0."""
     base_takes: int
-    """1 if horizons that come were flown at the observation before, else 0."""
+    """1 if the vehicle accepted horizons in the previous observation, else 0."""
 
 
 class ObservedAxis:
@@ -35,46 +35,46 @@ class ObservedAxis:
     p: float
     """Position in the newest observation [m]."""
     v: float
-    """Velocity in it [m/s]."""
+    """Velocity in the newest observation [m/s]."""
     u: float
-    """Input flown at its step [m/s]."""
+    """Input flown at the step of the newest observation [m/s]."""
     base_p: float
-    """Position in the observation before [m]."""
+    """Position in the previous observation [m]."""
     base_v: float
-    """Velocity in it, as the disturbance observer follows it [m/s]."""
+    """Velocity in the previous observation, low-pass filtered by the observer [m/s]."""
     base_u: float
-    """Input flown at that step [m/s]."""
+    """Input flown at the step of the previous observation [m/s]."""
     w: float
     """Disturbance ŵ [m/s]."""
 
 
 class SentHorizon:
-    """Record: how a horizon that was sent is flown."""
+    """Record: a horizon that was sent, without its inputs."""
 
     length: int
-    """Number of its inputs that are flown."""
+    """Number of inputs that are flown before they are too old."""
     speed: float
-    """Magnitude of the last of these over all axes [m/s]."""
+    """Magnitude of the last of these inputs over all axes [m/s]."""
 
 
-class Lead:
-    """Record: where a horizon leads on one axis, x̄.
+class ReferenceState:
+    """Record: reference state x̄ of a horizon on one axis.
 
-    It goes on with what is observed, for nothing before is ever replayed again.
+    It is advanced to the newest observation, as replays never start before that.
     """
 
     stage: int
-    """Stage that x̄ belongs to."""
+    """Stage of the horizon that x̄ belongs to."""
     p: float
-    """Position there [m]."""
+    """Position of x̄ [m]."""
     v: float
-    """Velocity there [m/s]."""
+    """Velocity of x̄ [m/s]."""
     w: float
-    """Disturbance ŵ that the horizon reckons with [m/s]."""
+    """Disturbance ŵ that the horizon compensates [m/s]."""
 
 
 OBSERVATIONS, AXIS_STATE = record(Observations), record(ObservedAxis)
-SENT_HORIZON, LEAD = record(SentHorizon), record(Lead)
+SENT_HORIZON, REFERENCE_STATE = record(SentHorizon), record(ReferenceState)
 
 
 class ReplaySettings(NamedTuple):
@@ -83,40 +83,41 @@ class ReplaySettings(NamedTuple):
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
     H: int
-    """Steps planned ahead."""
+    """Number of planned inputs."""
     age_max: int
-    """Largest age of an observation that counts [steps]."""
+    """Largest age of an observation that is used [steps]."""
     dt_ns: int
     """Length of a step [ns]."""
     brake: float
     """Speed that braking takes away in a step [m/s]."""
     decay: float
-    """Share of the error that the disturbance observer leaves in a step; 1 for no observer."""
+    """See `observer.decay_of`."""
     follow: float
-    """Share of a velocity's jump that the observer has not followed after a step."""
+    """Share of a jump of the observed velocity that the observer's low-pass filter has not followed
+    after a step."""
     feeds_back: bool
-    """Whether horizons bring feedback."""
+    """Whether horizons carry feedback."""
 
 
 class ReplayMemory(NamedTuple):
-    """State of every vehicle, and the horizons sent to it."""
+    """Newest observations of every vehicle, and the horizons sent to it."""
 
     sent: Sent
-    """Which horizons are in force, in flight or lost; as many as the ring has room for."""
+    """Tracker of which horizons are in force, in flight or lost."""
     seen: Annotated[NDArray[np.void], records(OBSERVATIONS, 1)]
-    """Shape (capacity,)."""
+    """Newest observations; shape (capacity,)."""
     state: Annotated[NDArray[np.void], records(AXIS_STATE, 2)]
-    """Shape (capacity, axes)."""
+    """Newest observations on each axis; shape (capacity, axes)."""
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4
     """Inputs of these horizons [m/s]; shape (capacity, ring, axes, largest d + H)."""
-    led: Annotated[NDArray[np.void], records(LEAD, 3)]
-    """States that the horizons lead to; shape (capacity, ring, axes)."""
+    reference: Annotated[NDArray[np.void], records(REFERENCE_STATE, 3)]
+    """Reference states of these horizons; shape (capacity, ring, axes)."""
 
 
 @kernel
-def keep(
+def store_observation(
     memory: ReplayMemory,
     row: int,
     step: int,
@@ -126,12 +127,12 @@ def keep(
     state: R2,
     flown: R1,
 ) -> bool:
-    """Write down an observation, see `Replay.observe`."""
+    """Store an observation, see `Replay.observe`."""
     sent = memory.sent
     if step <= sent.observed[row]:
         return False
     sent.observed[row] = step
-    sent.heard[row].in_force, sent.heard[row].since = in_force, since
+    sent.delivery[row].in_force, sent.delivery[row].since = in_force, since
     memory.seen[row].takes = takes
     for axis in range(len(state)):
         memory.state[row, axis].p, memory.state[row, axis].v = state[axis, 0], state[axis, 1]
@@ -140,28 +141,34 @@ def keep(
 
 
 @kernel
-def remember(
-    settings: ReplaySettings, memory: ReplayMemory, rows: I1, steps: I1, found: Foresight, event: B1
+def store_sent(
+    settings: ReplaySettings,
+    memory: ReplayMemory,
+    rows: I1,
+    steps: I1,
+    foresight: Foresight,
+    event: B1,
 ) -> None:
-    """Write down the horizons that are sent, see `Replay.remember`."""
+    """Store the horizons that are sent, see `Replay.remember`."""
     for i in range(len(rows)):
         if not event[i]:
             continue
         row, squares = rows[i], 0.0
-        slot = tracker.note(memory.sent, row, steps[i], found.ahead[i])
-        stages = found.ahead[i] + settings.H
+        slot = tracker.add_plan(memory.sent, row, steps[i], foresight.ahead[i])
+        stages = foresight.ahead[i] + settings.H
         length = lasting(stages, steps[i], memory.sent.observed[row], settings.age_max)
         for axis in range(len(settings.laws)):
             for stage in range(length):
-                memory.inputs[row, slot, axis, stage] = found.horizons[i, axis, stage]
-            # Just as `HorizonFollower` does it aboard: both ends have to brake from the same
-            # speed.
-            last = bounded(float(found.horizons[i, axis, length - 1]), settings.laws[axis].bound)
+                memory.inputs[row, slot, axis, stage] = foresight.horizons[i, axis, stage]
+            # As `HorizonFollower` computes it aboard: both ends have to brake from the same speed.
+            last = bounded(
+                float(foresight.horizons[i, axis, length - 1]), settings.laws[axis].bound
+            )
             squares += last * last
-            led = memory.led[row, slot, axis]
-            feedback = found.feedback[i, axis]
-            led.stage, led.w = 0, feedback[DISTURBANCE]
-            led.p, led.v = feedback[LED_P], feedback[LED_V]
+            reference = memory.reference[row, slot, axis]
+            feedback = foresight.feedback[i, axis]
+            reference.stage, reference.w = 0, feedback[DISTURBANCE]
+            reference.p, reference.v = feedback[REFERENCE_P], feedback[REFERENCE_V]
         horizon = memory.horizons[row, slot]
         horizon.length, horizon.speed = length, np.sqrt(squares)
 

@@ -1,9 +1,10 @@
-"""Code of the schemes: that of ours is the module of its name in this package.
+"""Table of the schemes' code. Each built-in scheme is the module of its name in this package.
 
-Such a module has
+The module of a scheme has
 
-- `make`, which makes the scheme of a `Fleet`, and
-- KERNELS, modules and packages whose kernels it calls, beside its own and those that all call.
+- `make`, which makes the scheme from a `Fleet`, and
+- KERNELS, the other modules and packages whose kernels it calls. Kernels that every scheme calls
+  are left out.
 """
 
 from importlib import import_module
@@ -22,11 +23,11 @@ from skytether.shared.scenario.registry import SCHEMES
 OURS = {
     name: import_module(f"{__package__}.{name}") for name, entry in SCHEMES.items() if entry.is_ours
 }
-"""Module of each of our schemes."""
+"""Module of each built-in scheme."""
 
 
 def make(fleet: Fleet) -> Scheme:
-    """The scheme that a scenario names.
+    """Make the scheme that a scenario names.
 
     Raises:
         ConfigError: a plug-in's scheme cannot be made.
@@ -34,13 +35,14 @@ def make(fleet: Fleet) -> Scheme:
     text = fleet.scenario.control.scheme
     call = schemes.call(text)
     if SCHEMES[call.name].is_ours:
-        made: Scheme = OURS[text].make(fleet)
-        return made
+        scheme: Scheme = OURS[text].make(fleet)
+        return scheme
     other = InputScheme if fleet.terms.splines else SplineScheme
     try:
-        inner = SCHEMES.made(call, (), fleet)
+        inner = SCHEMES.make(call, (), fleet)
         if isinstance(inner, other):
-            raise TypeError(f"flown as {fleet.terms.scheme!r}, it is no {other.__name__}")
+            flown_as = f"flown_as={fleet.terms.scheme!r}"
+            raise TypeError(f"a scheme with {flown_as} must not extend {other.__name__}")
         return GuardedScheme(text, inner, fleet)
     except Exception as error:
         wrong = f"a scheme that can be made ({type(error).__name__}: {error})"
@@ -48,7 +50,7 @@ def make(fleet: Fleet) -> Scheme:
 
 
 def kernels(text: str) -> tuple[ModuleType, ...]:
-    """Modules and packages whose kernels a scheme calls, beside those that all call."""
+    """Modules and packages whose kernels a scheme calls, without those that every scheme calls."""
     if text in OURS:
         return (OURS[text], *OURS[text].KERNELS)
     return (splines if schemes.properties(text).splines else horizons,)

@@ -1,32 +1,33 @@
-"""Trajectories: the vehicle is told the desired trajectory, and which one it holds is estimated.
+"""The scheme "trajectory": sends the desired trajectory as a spline, which the vehicle follows.
 
-What is sent at step k is the trajectory to be followed from there on: where the server sees ahead,
-the nominal motion of the vehicle along what it sees (`server.mpc.nominal`), or what it sees
-itself where the horizon is shorter than the time h below; and else the state of the target at k. It
-is sent as a spline with as few uniform knots as keep within `control.spline_error_m` of it
-(`shared.law.spline`); of a state that is one. The vehicle regulates itself along the spline, so all
-that is known of the vehicle is its newest observation.
+At step k the server sends the trajectory to follow from k on:
 
-Which trajectory it follows is not certain: every observation acknowledges the one in force, and
-those sent since may be on their way, or lost. With the share ℓ of losses and the share S(t) of
-delays longer than t, both as measured, one that was sent t before an observation that does not know
-of it will come with the probability
+- the nominal motion of the vehicle along the known desired trajectory (`server.mpc.nominal`);
+- the known desired trajectory itself, if the horizon is shorter than the time h below;
+- the target's present state, if the server knows nothing ahead.
+
+It is sent as a spline with the fewest uniform knots that keep it within `control.spline_error_m`
+(`shared.law.spline`); a single state is one knot. A regulator aboard follows the spline, so the
+server's estimate is simply the newest observation.
+
+The server is not certain which trajectory the vehicle follows: an observation acknowledges the one
+in force, and later ones may be in flight or lost. With the measured loss rate ℓ and the share S(t)
+of delays longer than t, a trajectory sent a time t before an observation that does not acknowledge
+it will still arrive with the probability
 
     π = (1 - ℓ) S(t) / ((1 - ℓ) S(t) + ℓ)
 
-and from the delay bound d on it is lost (`schemes.delay_bound`). The newest that comes is the one
-that is followed. So the expected gap is
+and is lost once it is older than the delay bound d (`schemes.delay_bound`). The vehicle follows the
+newest trajectory that arrives. So the expected gap is
 
-    E[ Q_p Σ (Δp + h Δv)² ]          Δp, Δv: trajectory followed - the one known now
+    E[ Q_p Σ (Δp + h Δv)² ]          Δp, Δv: trajectory followed - trajectory that would be sent now
 
-over the axes and these cases, with the weight Q_p on the position [1/m²] and h = (1 + K_v) / K_p,
-the time by which the regulator itself weighs the two: K_p (Δp + h Δv) is by how much the input
-would be another. It is the mean of that at k + d, when a packet of now is in force at the latest,
-k + 2 d, when it is known whether it came, and k + 3 d, when one that is sent then would be: looking
-at k + d alone, a trajectory that ends is replaced too late if a packet is lost. Where nothing has
-come into force the vehicle hovers where it was observed.
-
-This is the scheme "trajectory", and stands in place of its planner.
+summed over the axes, with the expectation over these cases, the weight Q_p on the position [1/m²]
+and h = (1 + K_v) / K_p, with which the regulator weighs velocity: K_p (Δp + h Δv) is the change of
+its input. The gap is averaged over the steps k + d, when a packet sent now is in force at the
+latest; k + 2 d, when the server knows whether it arrived; and k + 3 d, when a packet sent then
+would be in force. With k + d alone, a trajectory that ends was replaced too late if a packet was
+lost. A vehicle to which no trajectory has arrived hovers where it was observed.
 """
 
 from typing import Annotated, NamedTuple
@@ -47,11 +48,11 @@ from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
 from skytether.server.schemes.knots import fewest_knots, spline_at
 from skytether.server.schemes.sent import (
     Sent,
-    first_under_way,
-    judge,
-    note,
+    add_plan,
+    first_in_flight,
     nothing_sent,
     number_of,
+    update_delay_and_loss,
 )
 from skytether.shared.base.kernel import (
     B1,
@@ -72,16 +73,16 @@ from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
-ROOM = 64
-"""Number of trajectories that are remembered of each vehicle: the newest that were sent."""
-CHANCES = 3
-"""Number of delay bounds ahead at whose ends trajectories are compared."""
-SURE = 1e-3
-"""Probability below which what is left of the cases is not looked at."""
+RING = 64
+"""Number of sent trajectories that are stored for each vehicle."""
+COMPARED = 3
+"""Number of steps at which trajectories are compared: k + d, k + 2 d, k + 3 d."""
+IGNORED = 1e-3
+"""Total probability of cases that are left out of the expected gap."""
 RUNS_OUT = 1e-2
-"""Largest probability that all trajectories are lost that are to follow one that ends."""
+"""Probability of losing all trajectories in flight above which one that ends soon is replaced."""
 TINY = 1e-9
-"""Smallest K_p, for weights that ask for none [1/s]."""
+"""Smallest K_p, so that weights with K_p = 0 do not divide by 0 [1/s]."""
 
 along, guided_to = shared(spline.along), shared(spline.guided_to)
 regulated = shared(spline.regulated)
@@ -90,10 +91,10 @@ follow = shared(spline.follow)
 
 
 class SentTrajectory:
-    """Record: how a trajectory that was sent is flown."""
+    """Record: a trajectory that was sent, without its knots."""
 
     ends: int
-    """Step after the last at which it is flown."""
+    """First step at which it is too old to be flown."""
     spacing: int
     """Steps from one knot to the next."""
     count: int
@@ -109,9 +110,9 @@ class Settings(NamedTuple):
     dt_s: float
     """Length of a step [s]."""
     age_max: int
-    """Largest age of an observation that counts [steps]."""
+    """Largest age of an observation that is used [steps]."""
     seen: int
-    """Steps that the server sees ahead, H at most."""
+    """Steps ahead for which the desired trajectory is known, at most H."""
     bounds: F1
     """Largest velocity on each axis [m/s]; shape (axes,)."""
     weight: float
@@ -119,37 +120,37 @@ class Settings(NamedTuple):
     lead_s: F1
     """Time h of each axis [s]; shape (axes,)."""
     error_m: float
-    """Largest distance of a spline from what is seen on an axis, if its knots suffice [m]."""
+    """`control.spline_error_m`: largest error of a spline on each axis, if KNOTS_MAX suffices
+    [m]."""
     plans: bool
-    """Whether what is seen is planned along, and not told as it is."""
+    """Whether the nominal motion is sent, and not the desired trajectory itself."""
 
 
 class Memory(NamedTuple):
-    """State of every vehicle, and the trajectories sent to it."""
+    """Newest observation of every vehicle, and the trajectories sent to it."""
 
     sent: Sent
     """Which trajectories are in force, in flight or lost."""
     state: F3
     """State in the newest observation [m, m/s]; shape (capacity, axes, 2)."""
     trajectories: Annotated[NDArray[np.void], records(TRAJECTORY, 2)]
-    """Trajectories in the ring; shape (capacity, ROOM)."""
+    """Trajectories in the ring; shape (capacity, RING)."""
     knots: F4
-    """Knots of these trajectories as they are read aboard [m, m/s]; shape
-    (capacity, ROOM, axes, 2 KNOTS_MAX)."""
+    """Knots of these trajectories, rounded as they are sent [m, m/s]; shape
+    (capacity, RING, axes, 2 KNOTS_MAX)."""
 
 
 class Guidance(SplineScheme):
-    """The scheme "trajectory", and what is sent to its vehicles."""
+    """The scheme "trajectory"."""
 
     def __init__(self, fleet: Fleet) -> None:
         super().__init__(fleet)
         terms, control, desired = fleet.terms, fleet.scenario.control, fleet.desired
         capacity, block, axes = fleet.capacity, fleet.block, terms.axes
         gain = regulator(fleet.scenario)
-        # TINY: weights that ask for no gain on position would divide by 0.
         lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
-        # A plan shorter than h ends before the vehicle is near what it follows, and beyond its end
-        # the spline goes straight on: measured, such plans led up to 12 m away (docs/studies.md).
+        # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
+        # end the spline is a straight line: measured errors reached 12 m (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self._desired, self._clock = desired, fleet.clock
         self._loop_gain = np.array(terms.gain)
@@ -164,55 +165,56 @@ class Guidance(SplineScheme):
             plans=bool(plans),
         )
         self._memory = Memory(
-            sent=nothing_sent(capacity, ROOM, terms, control, committed_max(terms)),
+            sent=nothing_sent(capacity, RING, terms, control, committed_max(terms)),
             state=np.zeros((capacity, axes, 2)),
-            trajectories=np.zeros((capacity, ROOM), dtype=TRAJECTORY),
-            knots=np.zeros((capacity, ROOM, axes, 2 * KNOTS_MAX)),
+            trajectories=np.zeros((capacity, RING), dtype=TRAJECTORY),
+            knots=np.zeros((capacity, RING, axes, 2 * KNOTS_MAX)),
         )
         self.observed_step = self._memory.sent.observed
         self._nominal = make_nominal(terms, control, capacity if plans else 0)
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
-        """Trajectories that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1,
-        2)."""
+        """Trajectory of each vehicle that would be sent now, from k on [m, m/s]; shape
+        (block, axes, seen + 1, 2)."""
 
     def forget(self, row: int) -> None:
         """See `Scheme`."""
         tracker.forget(self._memory.sent, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`; a vehicle that takes nothing holds nothing either."""
-        heard = self._memory.sent.heard[row]
+        """See `Scheme`."""
+        delivery = self._memory.sent.delivery[row]
         if observation.step <= self.observed_step[row]:
             return False
         self.observed_step[row] = observation.step
-        heard["in_force"], heard["since"] = observation.in_force, observation.since
+        delivery["in_force"], delivery["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
-        # A vehicle that takes none has dropped what it held, and drops what is under way.
+        # A vehicle that accepts no trajectories has dropped those it had, and drops those in
+        # flight.
         if not observation.takes:
-            heard["first"], heard["in_force"] = heard["sent"], NO_HORIZON
+            delivery["first"], delivery["in_force"] = delivery["sent"], NO_HORIZON
         return True
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
-        """See `Scheme`: what was observed, as it is."""
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
+        """See `Scheme`: the estimate is the newest observation."""
         n = len(rows)
-        found.estimate[:n] = found.start[:n] = self._memory.state[rows]
+        foresight.estimate[:n] = foresight.start[:n] = self._memory.state[rows]
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Fill in `figures`, of flying on, and the velocity of now in place of a plan.
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Make the trajectories that would be sent now, and fill in `figures` and `planned`.
 
-        `planned` are the states at k of the trajectories sent last.
+        `planned` has the states at k of the trajectories sent last.
 
         Args:
-            rows: the vehicles; shape (n,).
-            step: k of each; shape (n,).
-            found: what is filled in.
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: output: first column of `horizons`, the velocity at k as an input.
         """
         lost, unsolved = _appraise(
             self._settings,
             self._memory,
             self._clock.seen,
             self._nominal,
-            self._desired.window(rows, step, found.ahead),
+            self._desired.window(rows, step, foresight.ahead),
             rows,
             step,
             self.figures,
@@ -224,27 +226,29 @@ class Guidance(SplineScheme):
         if unsolved:
             self.counts["unsolved"] += unsolved
         n = len(rows)
-        found.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
+        foresight.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
 
-    def remember(self, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
-        """See `Scheme`; only what is sent is made, and counts."""
+    def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
+        """See `Scheme`; splines are fitted only for vehicles whose trajectory is sent."""
         intended = self._intended
-        _remember(self._settings, self._memory, intended, rows, step, event, found.told)
+        _fit_and_store(self._settings, self._memory, intended, rows, step, event, foresight.splines)
 
 
 make = Guidance
 KERNELS = (knots, splines, exact)
-"""See `server.schemes.table`."""
+"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
 
 
 @inline
 def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
-    """State of a trajectory at a stage on one axis, position [m] and velocity [m/s].
+    """State of the trajectory that would be sent now at a stage, on one axis [m, m/s].
 
     Args:
+        settings: `seen` and `dt_s`.
         intended: states from k on [m, m/s]; shape (seen + 1, 2).
+        stage: steps after k.
     """
-    # Behind what is seen the trajectory goes straight on, as the spline will.
+    # After its end the trajectory is a straight line, as the spline is.
     last = min(stage, settings.seen)
     v = intended[last, 1]
     return intended[last, 0] + (stage - last) * settings.dt_s * v, v
@@ -254,14 +258,18 @@ def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
 def _followed(
     settings: Settings, memory: Memory, row: int, number: int, axis: int, step: int
 ) -> tuple[float, float]:
-    """State of a trajectory that was sent at a step on one axis [m, m/s]; of none, where it hovers.
+    """State of a sent trajectory at a step, on one axis [m, m/s].
 
     Args:
-        number: of the trajectory; negative for none.
+        settings, memory: constants, and the trajectories that were sent.
+        row: row of the vehicle.
+        number: number of the trajectory; negative if the vehicle hovers without one.
+        axis: the axis.
+        step: the step.
     """
     if number < 0:
         return memory.state[row, axis, 0], 0.0
-    slot = number % ROOM
+    slot = number % RING
     trajectory = memory.trajectories[row, slot]
     knots = memory.knots[row, slot, axis, : 2 * trajectory.count]
     since = step - memory.sent.plans[row, slot].step
@@ -270,20 +278,21 @@ def _followed(
 
 @part
 def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
-    """Probability that a packet comes, of which an observation so many steps later knows nothing.
+    """Probability π that a packet will arrive, although an observation does not acknowledge it.
 
     Args:
-        loss: share of packets that are lost.
-        since: steps from sending to the observation; negative if that was made before.
+        bound: delay samples of the vehicles.
+        row: row of the vehicle.
+        loss: loss rate, from 0 to 1.
+        since: steps from sending to the observation; negative if the observation is older.
     """
     left = 1.0 - loss
     if since > 0:
-        known, later = min(bound.seen[row], SAMPLES), 0
-        for slot in range(known):
-            # Laplace's rule below, (later + 1) / (known + 1): without samples the share is 1, and
-            # never quite 0.
+        count, later = min(bound.seen[row], SAMPLES), 0
+        for slot in range(count):
             later += bound.samples[row, slot] > since
-        left *= (later + 1) / (known + 1)
+        # As in Laplace's rule, + 1: the share is 1 without samples, and never 0.
+        left *= (later + 1) / (count + 1)
     return left / (left + loss)
 
 
@@ -291,34 +300,41 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
 def _gap(
     settings: Settings, memory: Memory, intended: F3, row: int, number: int, k: int, d: int
 ) -> tuple[float, float]:
-    """Mean of Q_p Σ (Δp + h Δv)² of a trajectory that may be followed, and |Δp| at k + d [m].
+    """Mean of Q_p Σ (Δp + h Δv)² if a sent trajectory is followed, and |Δp| at k + d [m].
 
     Args:
-        intended: what would be sent now, from k on [m, m/s]; shape (axes, seen + 1, 2).
-        number: of the trajectory; negative for none.
+        settings, memory: constants, and the trajectories that were sent.
+        intended: trajectory that would be sent now [m, m/s]; shape (axes, seen + 1, 2).
+        row: row of the vehicle.
+        number: number of the sent trajectory; negative if the vehicle hovers without one.
+        k: present step.
+        d: delay bound [steps].
     """
-    gap, away = 0.0, 0.0
-    for stage in range(d, CHANCES * d + 1, d):
+    gap, squares = 0.0, 0.0
+    for stage in range(d, COMPARED * d + 1, d):
         for axis in range(len(settings.bounds)):
             p, v = _ahead(settings, intended[axis], stage)
-            led_p, led_v = _followed(settings, memory, row, number, axis, k + stage)
-            off = led_p - p + settings.lead_s[axis] * (led_v - v)
-            gap += off * off / CHANCES
+            sent_p, sent_v = _followed(settings, memory, row, number, axis, k + stage)
+            off = sent_p - p + settings.lead_s[axis] * (sent_v - v)
+            gap += off * off / COMPARED
             if stage == d:
-                away += (led_p - p) ** 2
-    return settings.weight * gap, np.sqrt(away)
+                squares += (sent_p - p) ** 2
+    return settings.weight * gap, np.sqrt(squares)
 
 
 @part
 def _intend(
     settings: Settings, nominal: Nominal, row: int, k: int, desired: F3, intended: F3
 ) -> bool:
-    """Fill in the trajectory that would be sent now; False where no plan is found.
+    """Fill in the trajectory that would be sent now; False if the nominal MPC finds no plan.
 
     Args:
-        desired: states from k on [m, m/s]; shape (axes, seen + 1 or more, 2).
-        intended: what is filled in; where the server sees ahead, its first stage is where the
-            vehicle is led at k [m, m/s]; shape (axes, seen + 1, 2).
+        settings, nominal: constants, and the nominal MPC.
+        row: row of the vehicle.
+        k: present step.
+        desired: desired trajectory from k on [m, m/s]; shape (axes, seen + 1 or more, 2).
+        intended: output; its first stage, the state at k, is input to the nominal MPC [m, m/s];
+            shape (axes, seen + 1, 2).
     """
     if settings.plans and plan_nominal(nominal, row, k, desired, intended):
         return True
@@ -344,24 +360,24 @@ def _appraise(
     planned: F3,
     intended: F4,
 ) -> tuple[int, int]:
-    """Fill in what `Guidance.plan` says.
+    """Fill in `figures`, `planned` and `intended`, see `Guidance.plan`.
 
     Returns:
-        how many trajectories are newly known to be lost, and how many plans were not found.
+        number of trajectories newly known to be lost, and number of plans not foresight.
     """
     sent, lost, unsolved, axes = memory.sent, 0, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
-        lost += judge(sent, clock, row)
-        heard, d, observed = sent.heard[row], sent.bound.steps[row], sent.observed[row]
-        flown = number_of(sent, row, heard.in_force)
-        newest, ends, held = flown, -1, np.inf
-        if flown >= 0:
-            held = ends = memory.trajectories[row, flown % ROOM].ends
-        first_in_flight = first_under_way(sent, row, heard.in_force, observed)
-        for number in range(first_in_flight, heard.sent):
-            newest, ends = number, max(ends, memory.trajectories[row, number % ROOM].ends)
-        # Only if the new one would be young enough: otherwise one would be sent at each step.
+        lost += update_delay_and_loss(sent, clock, row)
+        delivery, d, observed = sent.delivery[row], sent.bound.steps[row], sent.observed[row]
+        in_force = number_of(sent, row, delivery.in_force)
+        newest, ends, in_force_ends = in_force, -1, np.inf
+        if in_force >= 0:
+            in_force_ends = ends = memory.trajectories[row, in_force % RING].ends
+        first = first_in_flight(sent, row, delivery.in_force, observed)
+        for number in range(first, delivery.sent):
+            newest, ends = number, max(ends, memory.trajectories[row, number % RING].ends)
+        # Only if a new one could be flown at k + d: otherwise one would be sent at each step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         for axis in range(axes):
             p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
@@ -374,16 +390,16 @@ def _appraise(
         if not _intend(settings, nominal, row, k, desired, intended[i]):
             unsolved += 1
         share, expected = 1.0, 0.0
-        for number in range(heard.sent - 1, first_in_flight - 1, -1):
-            if share <= SURE:
+        for number in range(delivery.sent - 1, first - 1, -1):
+            if share <= IGNORED:
                 break
-            since = observed - sent.plans[row, number % ROOM].step
-            comes = _arrives(sent.bound, row, heard.loss, since)
+            since = observed - sent.plans[row, number % RING].step
+            arrives = _arrives(sent.bound, row, delivery.loss, since)
             gap, _ = _gap(settings, memory, intended[i], row, number, k, d)
-            expected += share * comes * gap
-            share *= 1.0 - comes
-        if share > SURE:
-            gap, _ = _gap(settings, memory, intended[i], row, flown, k, d)
+            expected += share * arrives * gap
+            share *= 1.0 - arrives
+        if share > IGNORED:
+            gap, _ = _gap(settings, memory, intended[i], row, in_force, k, d)
             expected += share * gap
         plan.row, plan.step, plan.start, plan.gap = row, k, k, 1
         plan.solved = True
@@ -391,33 +407,33 @@ def _appraise(
         plan.cost_gap, plan.deviation_m = 0.0, 0.0
         if not plan.fresh:
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
-        # What is held ends soon, and all that was sent since may be lost: the vehicle would brake.
-        soon = held <= k + CHANCES * d <= observed + settings.age_max
+        # The trajectory in force ends soon and all in flight may be lost: the vehicle would brake.
+        soon = in_force_ends <= k + COMPARED * d <= observed + settings.age_max
         plan.fresh |= soon and share > RUNS_OUT
     return lost, unsolved
 
 
 @kernel
-def _remember(
+def _fit_and_store(
     settings: Settings,
     memory: Memory,
     intended: F4,
     rows: I1,
     steps: I1,
     event: B1,
-    told: Splines,
+    splines: Splines,
 ) -> None:
-    """Make and write down the trajectories that are sent, see `Guidance.remember`."""
+    """Fit and store the splines that are sent, see `Guidance.remember`."""
     for i in range(len(rows)):
         if not event[i]:
             continue
         row, dt_s = rows[i], settings.dt_s
-        count, spacing = fewest_knots(intended[i], dt_s, settings.error_m, told.knots[i])
-        told.number[i], told.spacing[i] = count, spacing
-        slot = note(memory.sent, row, steps[i], memory.sent.bound.steps[row])
+        count, spacing = fewest_knots(intended[i], dt_s, settings.error_m, splines.knots[i])
+        splines.number[i], splines.spacing[i] = count, spacing
+        slot = add_plan(memory.sent, row, steps[i], memory.sent.bound.steps[row])
         trajectory = memory.trajectories[row, slot]
         trajectory.ends = memory.sent.observed[row] + settings.age_max + 1
         trajectory.spacing, trajectory.count = spacing, count
         for axis in range(len(settings.bounds)):
             for number in range(2 * count):
-                memory.knots[row, slot, axis, number] = told.knots[i, axis, number]
+                memory.knots[row, slot, axis, number] = splines.knots[i, axis, number]

@@ -13,7 +13,7 @@ class ExtraMissing(ModuleNotFoundError):
     """An extra is needed; the message says which, and how to install it."""
 
     def __init__(self, module: str, extra: str) -> None:
-        command = f"pip install 'skytether[{extra}]'"
+        command = f"pip install 'skytether[{extra}]', or in a checkout make setup"
         super().__init__(f"{module} is not installed, expected it: {command}", name=module)
 
 

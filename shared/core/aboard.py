@@ -27,6 +27,15 @@ class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} = {value}: {self.meaning}{expected}"
 
 
+class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
+    """Base of the events about parameters of an autopilot."""
+
+    parameters: tuple[AutopilotParameter, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters)
+
+
 class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
     """The client has heard the vehicle's autopilot for the first time."""
 
@@ -39,14 +48,8 @@ class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
 
 
-class ParametersRead(VehicleEvent, frozen=True, kw_only=True):
+class ParametersRead(ParametersEvent, frozen=True, kw_only=True):
     """The client has read the parameters that decide how the autopilot reacts to silence."""
-
-    parameters: tuple[AutopilotParameter, ...]
-
-    def __str__(self) -> str:
-        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
-        return "\n".join(lines)
 
 
 class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
@@ -192,21 +195,24 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
 
 
-class ParametersUnsafe(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not armed because its autopilot would react unsafely to silence."""
+class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
+    """A vehicle is not armed because its autopilot would react unsafely to silence, by parameters
+    that are unsafe or could not be set.
+    """
 
-    parameters: tuple[AutopilotParameter, ...]
-    """Parameters that are unsafe, or could not be set."""
-
-    def __str__(self) -> str:
-        lines = [f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters]
-        return "\n".join(lines)
+    sets: bool = False
+    """Whether they were to be set."""
 
     @property
     def brief(self) -> str:
-        """Names of the parameters in one line."""
-        names = ", ".join(parameter.name for parameter in self.parameters)
-        return f"vehicle {self.vehicle} is not armed: {names}; --set-parameters sets them"
+        """Names of the parameters in one line, and what to do."""
+        unknown = ", ".join(each.name for each in self.parameters if each.value is None)
+        unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
+        does = "could not set" if self.sets else "sets"
+        told = [f"{unsafe}; --set-parameters {does} them"] if unsafe else []
+        if unknown:
+            told.append(f"its autopilot has not answered about {unknown}, or does not have it")
+        return f"vehicle {self.vehicle} is not armed: {'; '.join(told)}"
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):

@@ -20,7 +20,7 @@ from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.dotted import lay, value, whole
+from skytether.shared.scenario.dotted import set_keys, text_key, value
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 
@@ -154,9 +154,9 @@ class Running:
         may, table = sorted(self.changeable), reading.to_table(self._scenario)
         found: dict[str, Any] = {}
         for key, given in values.items():
-            text = whole(key)
+            text = text_key(key)
             if text in may:
-                lay({key: given}, table)
+                set_keys({key: given}, table)
                 found[text] = value(table, text)
                 continue
             try:
@@ -180,12 +180,13 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         values: plain values by key.
 
     Raises:
-        ConfigError: a key is unknown, or the scenario cannot be flown so.
+        ConfigError: a key is unknown, or the scenario cannot be flown so. A network may become too
+            bad to fly over.
     """
     table = reading.to_table(scenario)
-    lay(values, table)
+    set_keys(values, table)
     try:
-        return reading.check(table, known=scenario)
+        return reading.check(table, known=scenario, any_network=True)
     except RecursionError:
         raise ConfigError("got values that are nested too deeply") from None
 

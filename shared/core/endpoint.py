@@ -174,6 +174,9 @@ class Endpoint(ABC):
         """Report an event that originates outside the endpoint."""
         self._events.append(event)
 
+    def undelivered(self, socket: int, reason: str) -> None:  # noqa: B027 - most cannot help it
+        """Note that a datagram from a socket could not be sent, or was refused on its way."""
+
     def figures(self) -> dict[str, Any]:
         """Figures counted so far, by name; a nested dictionary is a group.
 

@@ -195,6 +195,33 @@ class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         )
 
 
+class TooLong(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """netem has dropped a packet because of its length, the first of that kind."""
+
+    size: int
+    """UDP payload [B]."""
+    most: int
+    """Longest UDP payload that passes [B]."""
+
+    def __str__(self) -> str:
+        return (
+            f"a packet of {self.size} B is dropped, and so are all longer than network.mtu, which "
+            f"is {self.most} B"
+        )
+
+
+class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """A packet of netem to the server could not be sent, or was refused on its way."""
+
+    host: str
+    port: int
+    reason: str
+
+    def __str__(self) -> str:
+        at = address_text(self.host, self.port)
+        return f"packets to {at} are lost until it answers: {self.reason}"
+
+
 class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """An autopilot has sent a status text."""
 
@@ -254,15 +281,24 @@ class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"a change is refused: {self.reason}"
 
 
-class SessionOpened(VehicleEvent, frozen=True, kw_only=True):
-    """The server has received the first observation of a session."""
+class PeerEvent(VehicleEvent, frozen=True, kw_only=True):
+    """Base of the events of one vehicle and the other end of its link."""
 
     host: str
-    """Host of the vehicle's HELLO."""
+    """Host of the vehicle where the server reports, of the server where the vehicle does."""
     port: int
 
+    @property
+    def peer(self) -> str:
+        """HOST:PORT."""
+        return address_text(self.host, self.port)
+
+
+class SessionOpened(PeerEvent, frozen=True, kw_only=True):
+    """The server has received the first observation of a session."""
+
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} flies, from {address_text(self.host, self.port)}"
+        return f"vehicle {self.vehicle} flies, from {self.peer}"
 
 
 class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
@@ -286,19 +322,15 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"
 
 
-class ServerFull(VehicleEvent, frozen=True, kw_only=True):
+class ServerFull(PeerEvent, frozen=True, kw_only=True):
     """The server has refused a vehicle because it is full."""
 
-    host: str
-    """Host of the vehicle's HELLO."""
-    port: int
     room: int
     """Largest number of vehicles."""
 
     def __str__(self) -> str:
-        address = address_text(self.host, self.port)
         full = f"the server is full (room for {self.room}); see --vehicles"
-        return f"vehicle {self.vehicle} from {address} is refused: {full}"
+        return f"vehicle {self.vehicle} from {self.peer} is refused: {full}"
 
 
 class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
@@ -311,27 +343,20 @@ class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
         )
 
 
-class NumberTaken(VehicleEvent, frozen=True, kw_only=True):
+class NumberTaken(PeerEvent, frozen=True, kw_only=True):
     """The server has refused a vehicle because its number is in use by another one."""
 
-    host: str
-    """Host of the refused vehicle's HELLO."""
-    port: int
     holder: str
     """HOST:PORT of the vehicle that already uses this number."""
 
     def __str__(self) -> str:
-        address = address_text(self.host, self.port)
         taken = f"another client flies under this number, from {self.holder}; see --id"
-        return f"vehicle {self.vehicle} from {address} is refused: {taken}"
+        return f"vehicle {self.vehicle} from {self.peer} is refused: {taken}"
 
 
-class NoSession(VehicleEvent, frozen=True, kw_only=True):
+class NoSession(PeerEvent, frozen=True, kw_only=True):
     """The server opens no session for a vehicle, which keeps asking."""
 
-    host: str
-    """Host to which the vehicle sends HELLO."""
-    port: int
     reason: Literal["full", "taken"]
     """Whether the server is full, or another client uses the vehicle's number."""
 
@@ -340,52 +365,40 @@ class NoSession(VehicleEvent, frozen=True, kw_only=True):
             "full": "the server is full; see its --vehicles",
             "taken": "another client flies under this number; see --id",
         }[self.reason]
-        return f"vehicle {self.vehicle} is refused by {address_text(self.host, self.port)}: {why}"
+        return f"vehicle {self.vehicle} is refused by {self.peer}: {why}"
 
 
-class NoAnswer(VehicleEvent, frozen=True, kw_only=True):
+class NoAnswer(PeerEvent, frozen=True, kw_only=True):
     """A vehicle has given up without having heard the server."""
 
-    host: str
-    """Host to which it sent HELLO."""
-    port: int
     waited_s: float
     """Time since its first HELLO [s]."""
     secure: bool = False
     """Whether it has a key, so that only answers with that key count."""
 
     def __str__(self) -> str:
-        address = address_text(self.host, self.port)
         if self.secure:
-            said = f"nobody who knows this key answers at {address} in {self.waited_s:.0f} s"
+            said = f"nobody who knows this key answers at {self.peer} in {self.waited_s:.0f} s"
             return f"vehicle {self.vehicle}: {said}"
-        return f"vehicle {self.vehicle}: no answer from {address} in {self.waited_s:.0f} s"
+        return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
 
 
-class Unanswered(VehicleEvent, frozen=True, kw_only=True):
+class Unanswered(PeerEvent, frozen=True, kw_only=True):
     """No answer from the server yet; the vehicle keeps asking."""
 
-    host: str
-    """Host to which it sends HELLO."""
-    port: int
     left_s: float
     """Time until it gives up [s]."""
 
     def __str__(self) -> str:
-        at, left = address_text(self.host, self.port), f"{self.left_s:.0f} s"
-        return f"vehicle {self.vehicle}: no answer from {at} yet, asking for another {left}"
+        left = f"{self.left_s:.0f} s"
+        return f"vehicle {self.vehicle}: no answer from {self.peer} yet, asking for another {left}"
 
 
-class Welcomed(VehicleEvent, frozen=True, kw_only=True):
+class Welcomed(PeerEvent, frozen=True, kw_only=True):
     """The server has opened a session for a vehicle that cannot be flown yet."""
 
-    host: str
-    """Host to which the vehicle sends HELLO."""
-    port: int
-
     def __str__(self) -> str:
-        at = address_text(self.host, self.port)
-        return f"vehicle {self.vehicle}: session open with the server at {at}"
+        return f"vehicle {self.vehicle}: session open with the server at {self.peer}"
 
 
 class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
@@ -631,6 +644,8 @@ Event = (
     | Fault
     | FlowOpened
     | Returned
+    | TooLong
+    | Unreachable
     | AutopilotSaid
     | AboardEvent
     | Unauthenticated

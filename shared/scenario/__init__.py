@@ -1,6 +1,6 @@
-"""Scenarios of flights: their keys, the files that hold them, triggers, trajectories."""
+"""Scenarios of flights: keys, files, triggers, desired trajectories, zones, network impairments."""
 
-# With these the tables of what a scenario can name hold what comes with Skytether.
+# Importing these modules fills the tables of `registry` with the built-in entries.
 from skytether.shared.scenario import observing, trajectories, triggers, zones
 
 __all__ = ["observing", "trajectories", "triggers", "zones"]

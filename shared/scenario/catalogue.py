@@ -1,7 +1,7 @@
-"""Catalogue of a scenario's keys: their owners, the terms made of them, and which may change.
+"""Catalogue of a scenario's keys: owner, term, and whether it may change in flight.
 
-Whatever both ends predict with is a term. Every other key belongs to one end, which may set it as
-it likes. There is no third kind: a key that does not name its owner cannot be imported.
+A key that both ends use for predictions is a term, and must be equal at both. Any other key belongs
+to one end, or to each end separately. A key without an owner in its type fails at import.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,19 +16,19 @@ from skytether.shared.scenario.schema import Scenario, Section
 
 
 def keys(section: type[Section], prefix: str = "") -> Iterator[tuple[str, Key]]:
-    """Every key of a section and of those within it, with dots, and its metadata."""
+    """Dotted name and metadata of every key of a section, subsections included."""
     for field in msgspec.structs.fields(section):
         if isinstance(field.type, type) and issubclass(field.type, Section):
             yield from keys(field.type, f"{prefix}{field.name}.")
         else:
             metadata = getattr(field.type, "__metadata__", ())
-            found = [each for each in metadata if isinstance(each, Key)]
-            assert len(found) == 1, f"{prefix}{field.name}: expected one owner, as in OfServer[int]"
-            yield f"{prefix}{field.name}", found[0]
+            owned = [each for each in metadata if isinstance(each, Key)]
+            assert len(owned) == 1, f"{prefix}{field.name}: expected one owner, as in OfServer[int]"
+            yield f"{prefix}{field.name}", owned[0]
 
 
 KEYS: Mapping[str, Key] = MappingProxyType(dict(keys(Scenario)))
-"""Every key of a scenario, with dots, and its metadata."""
+"""Metadata of every key of a scenario, by dotted name."""
 
 TERMS: Mapping[str, str] = MappingProxyType(
     {
@@ -37,16 +37,16 @@ TERMS: Mapping[str, str] = MappingProxyType(
         if key.owner is Owner.BOTH
     }
 )
-"""Key that each term is made of, by the term's field in `Terms`."""
+"""Dotted key of each term, by the term's field in `Terms`."""
 
 
 def keys_of(*groups: InFlight) -> frozenset[str]:
-    """Keys that may change in flight, of these groups."""
+    """Dotted names of the keys in these groups, which may change in flight."""
     return frozenset(name for name, key in KEYS.items() if key.in_flight in groups)
 
 
 def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
-    """Every term on which two ends differ, told by its key."""
+    """Terms on which two ends differ, named by their keys."""
     return tuple(
         Difference(TERMS[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(Terms._fields, here, there, strict=True)
@@ -55,7 +55,7 @@ def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
 
 
 def _text(field: str, value: object) -> str:
-    """A term as the scenario writes it."""
+    """Value of a term as it is written in a scenario."""
     if field == "dt_ns" and isinstance(value, int):
         return f"{value / SECOND_NS:g}"
     if isinstance(value, tuple):

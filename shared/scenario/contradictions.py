@@ -1,4 +1,4 @@
-"""Contradictions: values of a scenario that are right one by one and impossible together."""
+"""Contradictions: values of a scenario that are each valid, but not together."""
 
 import math
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import schemes
-from skytether.shared.scenario.fence import inner, is_home_inside, margins
+from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margins
 from skytether.shared.scenario.grammar import GrammarError, leaves
-from skytether.shared.scenario.mission import Mission, given, written
+from skytether.shared.scenario.mission import Mission, format_goals, parse_goals
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import (
     TABLES,
@@ -23,7 +23,7 @@ from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
 Contradiction = tuple[str, object, str]
-"""A key, the value that it was given, and what was expected."""
+"""Key, its value, and what was expected."""
 
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
@@ -34,11 +34,16 @@ LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
 
-def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterator[Contradiction]:
-    """Contradictions of a scenario whose values are right one by one.
+def contradictions(
+    scenario: Scenario, known: Scenario | None = None, *, any_network: bool = False
+) -> Iterator[Contradiction]:
+    """Contradictions of a scenario whose values are each valid.
 
     Args:
-        known: a scenario with which nothing is wrong; a trajectory that it has is not made again.
+        scenario: the scenario.
+        known: a scenario that was checked before; if the desired trajectory is the same, it is not
+            checked again.
+        any_network: whether its network may be too slow, or lose too much, to fly over.
     """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
@@ -88,7 +93,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
     if wrong:
         return
     yield from _no_mission(scenario)
-    yield from list(_no_impairments(scenario)) or _too_late(scenario)
+    yield from list(_no_impairments(scenario)) or (() if any_network else _too_late(scenario))
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     yield from _no_way(scenario, known)
@@ -97,7 +102,7 @@ def contradictions(scenario: Scenario, known: Scenario | None = None) -> Iterato
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
-    """Why the desired trajectory cannot be made, or a mission's places not be reached."""
+    """Contradictions of the desired trajectory, zones and goals."""
     wrong = list(_no_zones(scenario)) or list(_no_goals(scenario))
     same = known and (scenario.reference, scenario.model.axes) == (
         known.reference,
@@ -111,22 +116,22 @@ def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradictio
 
 
 def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why there is no such scheme, or it does not fly what is asked for."""
+    """Contradictions of `control.scheme`: unknown, or unfit for feedback or mission."""
     control = scenario.control
     try:
-        said = control.properties
+        properties = control.properties
     except GrammarError as error:
         yield "control.scheme", repr(error.given), error.expected
         return
-    if said.feedback not in (None, control.feedback):
-        feedback, needed = (str(each).lower() for each in (control.feedback, said.feedback))
+    if properties.feedback not in (None, control.feedback):
+        feedback, needed = (str(each).lower() for each in (control.feedback, properties.feedback))
         yield "control.feedback", feedback, f"{needed} with control.scheme = {control.scheme!r}"
-    if scenario.is_mission and not said.missions:
+    if scenario.is_mission and not properties.missions:
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
 
 
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why vehicles cannot keep apart on a mission, whichever packets are lost."""
+    """Contradictions of a mission, whose vehicles keep apart whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not scenario.is_mission:
         if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
@@ -147,13 +152,14 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
     mission = scenario.mission
     if 0.0 < mission.height_m < mission.separation_m - TINY:
-        # Tubes are as high as wide: in a metric that is stretched upwards they would not fit.
+        # Heights are scaled by separation_m / height_m: a factor above 1 would make tubes, which
+        # are as high as wide, too high.
         expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
         yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
         expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected
-    # A vehicle that hears nothing flies its motion to the end before it brakes.
+    # A vehicle that receives nothing flies its motion to the end before it brakes.
     longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
     for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
         if value < longest_s - TINY:
@@ -161,7 +167,7 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _is_one(trigger: str, name: str) -> bool:
-    """Whether a trigger is one policy of this name, and nothing else."""
+    """Whether a trigger is a single policy with this name."""
     try:
         return TRIGGERS.one(trigger).name == name
     except GrammarError:
@@ -169,7 +175,7 @@ def _is_one(trigger: str, name: str) -> bool:
 
 
 def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why there can be no such zones."""
+    """Contradictions of `mission.zones`."""
     least_m = scenario.mission.tube_m
     try:
         for zone in scenario.zones.zones:
@@ -182,26 +188,28 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why goals cannot be given: to nobody, in a zone, or too near to each other."""
+    """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too near to another
+    goal.
+    """
     mission = scenario.mission
     if not (mission.goals and scenario.is_mission):
         return
     try:
-        goals = given(mission.goals, scenario.model.axes)
-        flown = scenario.given_reference()
+        goals = parse_goals(mission.goals, scenario.model.axes)
+        flown = scenario.unallocated_reference()
     except GrammarError as error:
         yield "mission.goals", repr(error.given), error.expected
         return
-    except ValueError:  # which `_no_reference` tells
+    except ValueError:  # reported by `_no_reference`
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
-    # Where others end: who is allocated which goal, the server alone finds out.
+    # Last goals of other vehicles; with `allocate` they are only known in the server.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     beside = " to the side" if scenario.lands else ""
     for vehicle, place in goals.items():
-        named = written({vehicle: place})
+        named = format_goals({vehicle: place})
         near = [each for each, at in ends.items() if _away_m(scenario, at - place) < apart_m]
         ends[vehicle] = place
         if vehicle not in flown.vehicles:
@@ -217,13 +225,13 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _away_m(scenario: Scenario, off: Array) -> float:
-    """Distance of two goals as `mission.height_m` and landing have it [m]."""
+    """Distance of two goals, heights scaled by `Scenario.rest_scale` [m]."""
     return math.hypot(*off[:2], *(scenario.rest_scale * off[2:]))
 
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why vehicles cannot be at their goals: too near to each other, or to zones."""
-    mission, goals = scenario.mission, scenario.given_reference()
+    """Contradictions of a mission's goals: too near to each other, or to zones."""
+    mission, goals = scenario.mission, scenario.unallocated_reference()
     assert isinstance(goals, Mission)
     if mission.allocate and not goals.in_step:
         expected = "false, or a goal of each vehicle at each time that one of them has one"
@@ -237,11 +245,16 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
             goal, zone = near[0]
             at = ", ".join(f"{each:.3g}" for each in places[goal])
             expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
+            if zones.zones[zone].is_fence:
+                expected = (
+                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}, for "
+                    "vehicles stay within every fence"
+                )
             yield "mission.zones", zones.zones[zone].name, expected
             return
-    found = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)
-    if found:
-        one, other, at_s, away_m = found
+    too_near = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)
+    if too_near:
+        one, other, at_s, away_m = too_near
         margin_m = scenario.clearances.margin_m
         most = f"with 2 · mission.tube_m and {margin_m:g} m at most {away_m:.3g} m"
         expected = f"{most}, as the goals of vehicles {one} and {other} at {at_s:g} s"
@@ -251,23 +264,23 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why plans come too late over the scenario's network, or end too early."""
+    """Contradictions of horizon and network: plans arrive too late, or end too early."""
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
 
 
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why no horizon can come in time over the scenario's network."""
+    """Contradictions of limits that are shorter than the network's delays."""
     control, link, axes = scenario.control, scenario.link, scenario.model.axes
     up, down = scenario.uplink, scenario.downlink
-    # As the server sees it, whose clock map knows no more than half of the smallest round trip.
+    # Delay as the server estimates it: its clock map knows only half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound
-    said = control.properties
-    if said.indexed and not said.commits and H * dt < delay_s - TINY:
+    properties = control.properties
+    if properties.indexed and not properties.commits and H * dt < delay_s - TINY:
         yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
-    if said.commits:
+    if properties.commits:
         if bound_s != "auto" and bound_s < delay_s - TINY:
             yield "control.delay_bound", bound_s, f"at least {seen}"
         steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))
@@ -277,14 +290,16 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
         if most < H:
             fit = f"at most {most} beside {steps} committed steps with {axes} axes"
             yield "control.horizon", H, f"{fit}, to fit one datagram"
-    ahead_s = bound_s if said.commits and bound_s != "auto" else up.mean_s
+    ahead_s = bound_s if properties.commits and bound_s != "auto" else up.mean_s
     trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
     if link.age_max_s < trip_s - TINY:
         yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
 
 
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why the vehicle would brake further than it follows plans; the more so, the more are lost."""
+    """Contradiction of a horizon that is short compared with the time the vehicle needs to
+    brake.
+    """
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
@@ -301,7 +316,7 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why a direction of the network cannot be made."""
+    """Contradictions of `network.uplink` and `network.downlink`."""
     for way in ("uplink", "downlink"):
         try:
             getattr(scenario, way)
@@ -313,7 +328,7 @@ def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
-    """Why there can be no such trigger."""
+    """Contradictions of `control.trigger`."""
     try:
         make_trigger(control, 1)
     except GrammarError:
@@ -327,7 +342,7 @@ def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
 def _no_policies(
     key: str, text: str, table: PluginTable, control: ControlConfig
 ) -> Iterator[Contradiction]:
-    """Why a text is no combination of a table's policies, or none for the scheme."""
+    """Contradictions of a text of policies: bad grammar, or figures that the scheme lacks."""
     try:
         expression = table.parse(text)
     except GrammarError as error:
@@ -337,12 +352,12 @@ def _no_policies(
         needs = table[name].needs
         if needs and needs not in control.properties.computes:
             able = " or ".join(map(repr, schemes.that_compute(needs)))
-            expected = f"{able or 'one with ' + needs} with the {key.split('.')[1]} {name}"
+            expected = f"{able or 'one that computes ' + needs} with the {key.split('.')[1]} {name}"
             yield "control.scheme", repr(control.scheme), expected
 
 
 def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why the desired trajectory cannot be made."""
+    """Contradictions of `reference`, for a built-in shape."""
     ref, axes = scenario.reference, scenario.model.axes
     least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
     if len(ref.points_m) < least:
@@ -362,19 +377,19 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
     elif ref.shape in ("waypoints", *TABLES):
         try:
-            scenario.given_reference()
+            scenario.unallocated_reference()
         except ValueError as error:
             if ref.shape in TABLES:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
             else:
-                given = [list(point) for point in route]
-                yield "reference.points_m", given, "points that are further apart"
+                points = [list(point) for point in route]
+                yield "reference.points_m", points, "points that are further apart"
 
 
 def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
-    """Why a fence has no room within it; asked once nothing else is wrong."""
+    """Contradictions of a fence that leaves no space inside its margins."""
     fence = scenario.fence
-    low, high, radius = inner(scenario)
+    low, high, radius = inner_bounds(scenario)
     drawn = max(margins(scenario))
     wind = f"fence.wind_mps = {fence.wind_mps:g}"
     fastest = scenario.u_max * scenario.model_gain
@@ -389,22 +404,25 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _outside(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a desired trajectory that leads over the fence, or is too fast."""
+    """Contradictions of desired trajectories that cross the fence, or are too fast."""
     steps = min(scenario.steps, FENCED_STEPS_MAX)
-    given, times_s = scenario.given_reference(), np.arange(steps + 1) * scenario.control.dt
-    for vehicle in given.vehicles if isinstance(given, Mission) else (1,):
-        flown = scenario.given_reference(vehicle)(times_s)
-        wrong = list(_over_fence(scenario, scenario.start_m(vehicle), flown))
+    reference, times_s = (
+        scenario.unallocated_reference(),
+        np.arange(steps + 1) * scenario.control.dt,
+    )
+    for vehicle in reference.vehicles if isinstance(reference, Mission) else (1,):
+        states = scenario.unallocated_reference(vehicle)(times_s)
+        wrong = list(_over_fence(scenario, scenario.start_m(vehicle), states))
         yield from wrong
         if wrong:
             return
 
 
 def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
-    """Contradictions of a flight that begins at home and leaves the fence, or is too fast."""
+    """First contradiction of a trajectory from home that leaves the fence, or is too fast."""
     fence = scenario.fence
     position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
-    low, high, radius = inner(scenario)
+    low, high, radius = inner_bounds(scenario)
     far = np.linalg.norm(position - home, axis=1)
     checks = (
         ("fence.low_m", list(fence.low_m), (position < low).any(axis=1), "lower"),
@@ -423,12 +441,12 @@ def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Cont
 
 
 def _no_shape(scenario: Scenario) -> list[Contradiction]:
-    """Why there is no such shape, or a plug-in's that cannot be flown."""
+    """Contradictions of `reference.shape`: unknown, or a plug-in's that cannot be flown."""
     ref = scenario.reference
     try:
         shape = REFERENCES.one(ref.shape)
         if not REFERENCES[shape.name].is_ours:
-            shapes.sampled(scenario.given_reference(), scenario.model.axes)
+            shapes.sampled(scenario.unallocated_reference(), scenario.model.axes)
     except GrammarError as error:
         return [("reference.shape", repr(error.given), error.expected)]
     except Exception as error:

@@ -1,7 +1,7 @@
-"""Keys with dots, as in `control.horizon`, and the tables within tables that they lead into.
+"""Dotted keys such as `control.horizon`, for reading and setting values in nested tables.
 
-A key may lead on into a text: `network.uplink.loss` is the first argument of `loss` in
-`network.uplink`, and `control.trigger.state_gap.decay_rate` an argument by its name.
+A key may also address an argument in a text: `network.uplink.loss` is the first argument of `loss`
+in `network.uplink`, and `control.trigger.state_gap.decay_rate` is an argument by name.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,11 +28,11 @@ TEXTS: Mapping[str, PluginTable] = MappingProxyType(
         "network.downlink": IMPAIRMENTS,
     }
 )
-"""Keys whose value is a text, and the table of what it may name."""
+"""Keys whose value is a text with arguments, and the table of the entries it may name."""
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys of a table, with dots, and their values."""
+    """Dotted keys and values of a nested table."""
     for key, value in table.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}.")
@@ -40,12 +40,15 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield f"{prefix}{key}", value
 
 
-def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
-    """Put values into a table, where their keys with dots say.
+def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
+    """Set values in a nested table.
+
+    Args:
+        changes: values by dotted key.
+        table: the table, which is changed.
 
     Raises:
-        ConfigError: a key leads through something that is no table and no text, or a text has no
-            such argument.
+        ConfigError: a key is unknown, or a text has no such argument.
     """
     for path, value in changes.items():
         *sections, key = path.split(".")
@@ -63,17 +66,17 @@ def lay(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
             section[key] = value
 
 
-def whole(key: str) -> str:
-    """Key of the text that an argument's key leads into; any other key itself."""
+def text_key(key: str) -> str:
+    """Key of the text in which a key addresses an argument; any other key unchanged."""
     return next((each for each in TEXTS if key.startswith(f"{each}.")), key)
 
 
 def value(table: Any, key: str) -> Any:
-    """Value under a key with dots.
+    """Value of a dotted key.
 
     Raises:
-        KeyError, TypeError: there is none.
-        GrammarError: the text that it leads into is wrong.
+        KeyError, TypeError: there is no such key.
+        GrammarError: the key addresses an argument in an invalid text.
     """
     *sections, last = key.split(".")
     for depth, name in enumerate(sections):
@@ -84,7 +87,13 @@ def value(table: Any, key: str) -> Any:
 
 
 def with_argument(key: str, text: str, path: str, value: object) -> str:
-    """The text of a key with another argument, whose own key is `path`.
+    """Text with one argument changed.
+
+    Args:
+        key: dotted key of the text.
+        text: present text.
+        path: dotted key of the argument.
+        value: new value of the argument.
 
     Raises:
         ConfigError: the text has no such argument.

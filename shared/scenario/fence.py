@@ -1,7 +1,7 @@
-"""The bounds of a fence as they are drawn in, for the vehicle and for whoever checks a trajectory.
+"""Inner bounds of a fence: the stated bounds, moved inwards by margins.
 
-A vehicle that is led up to these is not blown, or carried by an error of its model, over those that
-the scenario states: see `client.fence`.
+A desired trajectory must stay within the inner bounds. Wind and model errors then do not carry the
+vehicle over the stated ones, see `client.fence`.
 """
 
 import math
@@ -10,23 +10,23 @@ from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import FenceConfig, Scenario
 
 SLOW_STEPS = 2
-"""Steps by which T of the fence is longer than the vehicle's time constant."""
+"""Steps by which the fence's time constant T exceeds the vehicle's."""
 ERROR_S = 0.06
-"""Time by which the model's errors together may lead the vehicle on at its largest speed [s]."""
+"""Margin for all model errors together, as a time at the vehicle's largest speed [s]."""
 WEAK = 1.25
-"""Factor by which wind leads a vehicle further if its gain is a fifth less than the model's."""
+"""Factor on the wind's margin, for a vehicle whose gain is 20 % below the model's."""
 LATER_S = 0.1
-"""Time by which the vehicle's dead time may be longer than the model's [s]."""
+"""Largest excess of the vehicle's dead time over the model's [s]."""
 
 
 def is_home_inside(fence: FenceConfig) -> bool:
-    """Whether a vehicle that returns to where it took off stays inside in the plane."""
+    """Whether home (0, 0) is inside the fence, in the horizontal plane."""
     low = all(each <= 0.0 for each in fence.low_m[:ALTITUDE])
     return low and all(each >= 0.0 for each in fence.high_m[:ALTITUDE])
 
 
 def margins(scenario: Scenario) -> list[float]:
-    """Distance m by which the bounds of each axis are drawn in, and last that from home [m]."""
+    """Margin of the bounds on each axis, and as last item that of `fence.radius_m` [m]."""
     terms, fence, dt = scenario.terms(), scenario.fence, scenario.control.dt
     fastest = fence.speed_mps or math.inf
     blown = [
@@ -40,10 +40,10 @@ def margins(scenario: Scenario) -> list[float]:
     ]
 
 
-def inner(scenario: Scenario) -> tuple[list[float], list[float], float]:
-    """Lowest and highest position of each axis, and distance from home, up to which it is led [m].
+def inner_bounds(scenario: Scenario) -> tuple[list[float], list[float], float]:
+    """Inner bounds: lowest and highest position on each axis, and largest distance from home [m].
 
-    They are infinite where the fence has no such bound.
+    A bound that the fence lacks is infinite.
     """
     fence, (*drawn, around) = scenario.fence, margins(scenario)
     axes = len(drawn)

@@ -1,17 +1,17 @@
-"""Regulators aboard: the limit of eq. (9) for a horizon without end and an input without bounds.
+"""Gains of the regulators aboard: eq. (9) with infinite horizon and unbounded input.
 
-Along a trajectory it is the linear-quadratic regulator of eq. (9) itself, which weighs changes of
-the input. The cost of each step and the optimal input are
+Along a trajectory the regulator is the linear-quadratic regulator of eq. (9), which weighs changes
+of the input. The cost of each step and the optimal input are
 
     xᵀ Q x + R u² + S (u - u(k-1))²         u = λ u(k-1) - (1 - λ) K x
 
-so the vehicle moves from the input flown until now towards -K x, by the same share at each step.
+so at each step the input moves from the previous one towards -K x by the share 1 - λ.
 
-Around a horizon of inputs there is feedback on position and velocity alone, u = -K x: which input
-is told before depends on the packets that arrive. There S counts like R.
+Around a horizon of inputs the feedback uses position and velocity only, u = -K x, because the
+previous input depends on which packets arrived. There S is added to R.
 
-The model's gain is in K. A dead time is not: feedback is on the state in which the next input meets
-the vehicle, for which there is none (`shared.law.dead_time`).
+K accounts for the model's gain. It needs no dead time: the feedback uses the state predicted for
+the time when the next input takes effect (`shared.law.dead_time`).
 """
 
 from functools import lru_cache
@@ -22,14 +22,14 @@ from skytether.shared.law.model import Array, Model
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 
 ROUNDS = 10_000
-"""Largest number of rounds of the recursion, for weights with which it hardly settles."""
+"""Largest number of iterations of the Riccati recursion, for weights with slow convergence."""
 
 
 def feedback_gain(scenario: Scenario) -> Array:
-    """K of a scenario; 0 without feedback.
+    """Gain K of the feedback around a horizon; 0 without `control.feedback`.
 
     Returns:
-        on position [1/s] and velocity; shape (axes, 2).
+        gain on position [1/s] and velocity; shape (axes, 2).
     """
     model, control = scenario.terms().model, scenario.control
     if not control.feedback:
@@ -38,14 +38,14 @@ def feedback_gain(scenario: Scenario) -> Array:
 
 
 def stationary_gain(model: Model, control: ControlConfig) -> Array:
-    """K for a model.
+    """Gain K of the feedback around a horizon.
 
     Args:
         model: eq. (4).
-        control: the weights; S counts like R.
+        control: weights; S is added to R.
 
     Returns:
-        on position [1/s] and velocity; shape (axes, 2).
+        gain on position [1/s] and velocity; shape (axes, 2).
     """
     weight = control.input_weight + control.change_weight
     gain = _settled(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)
@@ -53,10 +53,10 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
 
 
 def regulator(scenario: Scenario) -> Array:
-    """Regulator along a trajectory.
+    """Gain of the regulator along a trajectory.
 
     Returns:
-        K on position [1/s] and velocity, and λ; shape (axes, 3).
+        K on position [1/s] and velocity, then λ; shape (axes, 3).
     """
     model, control = scenario.terms().model, scenario.control
     Q, R, S = control.state_weight, control.input_weight, control.change_weight
@@ -73,18 +73,22 @@ def _settled(
     input_weight: float,
     change_weight: float,
 ) -> Array:
-    """Gain on position, velocity and the input before, shape (axes, 3), from A and B of eq. (4), Q,
-    R and S; cached, for many vehicles of one scenario need it.
+    """Gain on position, velocity and previous input, from A and B of eq. (4), Q, R and S.
+
+    Cached, because all vehicles of a scenario use it.
+
+    Returns:
+        shape (axes, 3).
     """
     B = np.pad(np.frombuffer(b).reshape(-1, 2), ((0, 0), (0, 1)), constant_values=1.0)
     A = np.pad(np.frombuffer(a).reshape(-1, 2, 2), ((0, 0), (0, 1), (0, 1)))
     Q, R = np.diag([*state_weight, change_weight]), input_weight + change_weight
     cross = np.array([0.0, 0.0, -change_weight])
-    """Weight of the input times the input before: half of that in S (u - u(k-1))²."""
+    # Cross weight of the input and the previous input in S (u - u(k-1))², halved.
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 3, 3))
     gain = np.zeros_like(B)
     for _ in range(ROUNDS):
-        # Riccati recursion until the cost matrix stands still, but for rounding.
+        # Riccati recursion, until the cost matrix changes by rounding only.
         if (np.abs(cost - before) <= 1e-12 * np.abs(before)).all():
             break
         ahead = np.einsum("ai,aij->aj", B, cost)
@@ -93,6 +97,6 @@ def _settled(
         left = A - B[:, :, None] * gain[:, None, :]
         rolled = np.einsum("aji,ajk,akl->ail", A, cost, left)
         cost, before = Q + rolled - cross[:, None] * gain[:, None, :], cost
-    # Shared by all that ask for it: nobody may write into it.
+    # Read-only, as the cached array is shared.
     gain.setflags(write=False)
     return gain

@@ -1,12 +1,12 @@
-"""Texts of a scenario such as `cost_gap & budget(5, burst=2) | silence(1)`: names with arguments.
+"""Grammar of texts in a scenario such as `cost_gap & budget(5, burst=2) | silence(1)`.
 
     text     := call | text & text | text "|" text | ( text )
     call     := name | name(argument, …)
     argument := value | key=value
 
-`&` binds tighter than `|`. A value is a number, or a word such as the name of a file, which in
-quotes may have any character but a quote. Impairments, zones and goals are calls joined by `&`
-alone. What may be named stands in the tables of `shared.scenario.registry`.
+`&` binds tighter than `|`. A value is a number or a word, such as a file name; in quotes it may
+have any character but a quote. Impairments, zones and goals are calls joined by `&` only. The
+tables in `shared.scenario.registry` list the names.
 """
 
 import re
@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 TEXT_MAX = 200
-"""Largest number of characters of a trigger, a report, a shape or a vehicle."""
+"""Largest number of characters of a trigger, report, shape, scheme or vehicle."""
 TOKENS_MAX, NESTED_MAX = 200, 100
-"""Largest numbers of calls, operators and parentheses, and of opening ones."""
+"""Largest number of tokens (calls, operators and parentheses), and of opening parentheses."""
 
 Value = float | str
 
@@ -31,12 +31,12 @@ _TOKEN = re.compile(
 _ARGUMENT = re.compile(
     rf"\s*(?:([a-z_]\w*)\s*=)?\s*((?:{_QUOTED}|[^,\"])*?)\s*,", re.IGNORECASE | re.ASCII
 )
-"""An argument with the comma behind it."""
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
+"""An argument and the comma after it."""
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 
 
 class GrammarError(Exception):
-    """Error: a text is not what it should be; says which part of it, and what was expected."""
+    """Error in a text: the invalid part `given`, and what was `expected`."""
 
     def __init__(self, given: str, expected: str) -> None:
         super().__init__(f"got {given!r}, expected {expected}")
@@ -50,13 +50,13 @@ class Call:
 
     name: str
     values: tuple[Value, ...] = ()
-    """Arguments as they are written; once a table has bound the call, one for each parameter."""
+    """Arguments as written; after `PluginTable` has bound the call, one for each parameter."""
     keys: tuple[str, ...] = ()
-    """Name before the `=` of each argument as written, empty without; none of a bound call."""
+    """Name of each argument, empty for a positional one; no names after binding."""
     text: str = field(default="", compare=False)
-    """The call as it is written."""
+    """The call as written."""
     begin: int = field(default=0, compare=False)
-    """Index of its first character in the whole text."""
+    """Index of its first character in the text."""
 
     def __str__(self) -> str:
         arguments = ", ".join(
@@ -67,7 +67,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Combination:
-    """Two texts, joined by & or |."""
+    """Two expressions joined by & or |."""
 
     operator: Literal["&", "|"]
     left: "Expression"
@@ -78,14 +78,14 @@ Expression = Call | Combination
 
 
 def parse(text: str, form: str) -> Expression:
-    """Calls combined with & and |, as a text has them.
+    """Parse calls combined with & and |.
 
     Args:
-        text: what is written.
-        form: what is expected, in messages.
+        text: the text.
+        form: expected form of the text, for messages.
 
     Raises:
-        GrammarError: it is no such text.
+        GrammarError: the text is invalid.
     """
     tokens = deque(_tokens(text, form))
     if len(tokens) > TOKENS_MAX or tokens.count("(") > NESTED_MAX:
@@ -112,10 +112,10 @@ def parse(text: str, form: str) -> Expression:
     def either() -> Expression:
         return joined("|", lambda: joined("&", operand))
 
-    found = either()
+    expression = either()
     if tokens:
         raise GrammarError(text, form)
-    return found
+    return expression
 
 
 def leaves(expression: Expression) -> Iterator[Call]:
@@ -129,7 +129,7 @@ def leaves(expression: Expression) -> Iterator[Call]:
 
 
 def calls(text: str, form: str) -> list[Call]:
-    """Calls joined by & alone, of a text as long as may be; none of an empty one.
+    """Parse calls joined by & only; an empty text has none. The text's length is not limited.
 
     Raises:
         GrammarError: see `parse`.
@@ -137,35 +137,34 @@ def calls(text: str, form: str) -> list[Call]:
     if not text.strip():
         return []
     tokens = _tokens(text, form)
-    found = [token for token in tokens[::2] if isinstance(token, Call)]
-    if len(tokens) != 2 * len(found) - 1 or any(mark != "&" for mark in tokens[1::2]):
+    parsed = [token for token in tokens[::2] if isinstance(token, Call)]
+    if len(tokens) != 2 * len(parsed) - 1 or any(mark != "&" for mark in tokens[1::2]):
         raise GrammarError(text, form)
-    return found
+    return parsed
 
 
 def _tokens(text: str, form: str) -> list[Call | str]:
     """Calls, operators and parentheses of a text."""
-    found: list[Call | str] = []
+    tokens: list[Call | str] = []
     at = 0
     while at < len(text):
         token = _TOKEN.match(text, at)
         if not token:
             raise GrammarError(text, form)
         name, arguments, mark = token.groups()
-        found.append(mark or _call(name, arguments, text, token.start(1), token.end()))
+        tokens.append(mark or _call(name, arguments, text, token.start(1), token.end()))
         at = token.end()
-    return found
+    return tokens
 
 
 def _call(name: str, arguments: str | None, text: str, begin: int, end: int) -> Call:
-    """The call at a place of a text, with the arguments between its parentheses."""
-    written = f"{arguments}," if arguments and arguments.strip() else ""
-    pairs = _ARGUMENT.findall(written)
+    terminated = f"{arguments}," if arguments and arguments.strip() else ""
+    pairs = _ARGUMENT.findall(terminated)
     values = tuple(_value(word) for _, word in pairs)
     return Call(name, values, tuple(key for key, _ in pairs), text[begin:end].rstrip(), begin)
 
 
 def _value(word: str) -> Value:
-    if _NUMBER.fullmatch(word):
+    if NUMBER.fullmatch(word):
         return float(word) if re.search(r"[.e]", word, re.IGNORECASE) else int(word)
     return word[1:-1] if word[:1] == word[-1:] == '"' else word

@@ -1,6 +1,6 @@
-"""Missions: goals of several vehicles, which the server keeps apart on their ways.
+"""Missions: timed goals of several vehicles, which the server keeps apart.
 
-A mission is the reference of each of its vehicles: the goal from each time on, at rest.
+A mission is also the reference of a vehicle: its present goal, with velocity 0.
 """
 
 from bisect import bisect_right
@@ -13,27 +13,28 @@ from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import GrammarError, calls
-from skytether.shared.scenario.reference import FAR_M, Reference, read_table
+from skytether.shared.scenario.reference import FAR_M, Reference, check_times, read_table
 
 SWAP_AT_S = 2.0
-"""Time at which vehicles that swap places leave [s]."""
+"""Time at which vehicles that swap places depart [s]."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-"""Angle by which points that are spread evenly over a sphere turn from one to the next [rad]."""
+"""Azimuth between consecutive points of a Fibonacci sphere [rad]."""
 VEHICLES_MAX = 65_535
 """Largest number of a vehicle."""
 CROWDED = 32
-"""Number of stays at one time and place above which two of them are too near in any case."""
+"""Number of stays in neighbouring cells at one time above which two of them are surely too near."""
 
 
 class Mission:
-    """Goals of several vehicles, each from a time on: the reference of one of them.
+    """Timed goals of all vehicles, and the reference of one of them.
 
-    A vehicle begins at its first goal. One that the mission does not know stays at the origin.
+    A vehicle starts at its first goal. A vehicle without goals stays at the origin.
 
     Args:
-        goals: times, rising [s; shape (n,)], and goals from then on [m; shape (n, axes)], of each
-            vehicle by its number.
-        vehicle: number of the one whose reference it is.
+        goals: rising times [s; shape (n,)] and the goal from each time on [m; shape (n, axes)], by
+            number of the vehicle.
+        axes: number of axes.
+        vehicle: number of the vehicle whose reference this is.
     """
 
     def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
@@ -83,42 +84,42 @@ class Mission:
         return state
 
     def nearest(self, apart_m: float, height: float) -> tuple[int, int, float, float] | None:
-        """Two vehicles whose goals are nearer than apart_m at one time; None where none are.
+        """First two vehicles whose goals are nearer than `apart_m` at the same time.
 
         Args:
             apart_m: distance [m].
-            height: by what distances along the third axis are multiplied.
+            height: factor on distances along the third axis.
 
         Returns:
-            their numbers, when that is [s], and the distance [m].
+            numbers of the two vehicles, time [s] and distance [m]; None if there are no such two.
         """
         stays = _Stays.of(self._goals, height)
-        found = stays.nearest(apart_m)
-        if found is None:
+        pair = stays.nearest(apart_m)
+        if pair is None:
             return None
-        one, other = sorted(stays.vehicles[list(found)].tolist())
-        return one, other, float(stays.begin_s[list(found)].max()), stays.distance_m(*found)
+        one, other = sorted(stays.vehicles[list(pair)].tolist())
+        return one, other, float(stays.begin_s[list(pair)].max()), stays.distance_m(*pair)
 
     def allocated(self) -> "Mission":
-        """A mission whose goals of one time are given to the vehicles that are nearest to them.
+        """Mission with the goals of each time allocated to vehicles by linear assignment.
 
-        At each time the sum of the squares of all distances is the least (linear assignment), so
-        ways cross less. The mission must be `in_step`.
+        It minimises the sum of the squared distances to the next goals, so that paths cross less.
+        The mission must be `in_step`.
         """
         from scipy.optimize import linear_sum_assignment  # a client does without scipy
 
         times_s = next(iter(self._goals.values()))[0]
         wanted = np.stack([points_m for _, points_m in self._goals.values()], axis=1)
-        given = wanted[:1]
+        assigned = wanted[:1]
         for goals in wanted[1:]:
-            cost = ((given[-1][:, None] - goals[None]) ** 2).sum(axis=2)
-            given = np.append(given, goals[None, linear_sum_assignment(cost)[1]], axis=0)
-        shared = {vehicle: (times_s, given[:, i]) for i, vehicle in enumerate(self._goals)}
-        return Mission(shared, self._axes, 1)
+            cost = ((assigned[-1][:, None] - goals[None]) ** 2).sum(axis=2)
+            assigned = np.append(assigned, goals[None, linear_sum_assignment(cost)[1]], axis=0)
+        allocated = {vehicle: (times_s, assigned[:, i]) for i, vehicle in enumerate(self._goals)}
+        return Mission(allocated, self._axes, 1)
 
 
 class _Stays(NamedTuple):
-    """Stays of vehicles at their goals, each from a goal's time until that of the next."""
+    """Stays of all vehicles: a goal, from its time until that of the vehicle's next goal."""
 
     vehicles: NDArray[np.int64]
     """Number of each stay's vehicle; shape (n,)."""
@@ -127,11 +128,11 @@ class _Stays(NamedTuple):
     end_s: Array
     """Time at which each stay ends [s]; shape (n,)."""
     places_m: Array
-    """Place of each stay, its height scaled [m]; shape (n, axes)."""
+    """Goal of each stay, heights scaled [m]; shape (n, axes)."""
 
     @classmethod
     def of(cls, goals: Mapping[int, tuple[Array, Array]], height: float) -> "_Stays":
-        """Stays at the goals of vehicles, ordered by the time at which they begin."""
+        """Stays at the vehicles' goals, sorted by the time at which they begin."""
         counts = [len(times_s) for times_s, _ in goals.values()]
         begin_s = np.concatenate([times_s for times_s, _ in goals.values()])
         ends_s = [np.append(times_s[1:], np.inf) for times_s, _ in goals.values()]
@@ -146,11 +147,11 @@ class _Stays(NamedTuple):
         return float(np.linalg.norm(self.places_m[one] - self.places_m[other]))
 
     def nearest(self, apart_m: float) -> tuple[int, int] | None:
-        """First two stays at one time that are nearer than apart_m; None where there are none.
+        """First two simultaneous stays nearer than `apart_m`; None if there are none.
 
-        Stays are sorted into cells of apart_m, and within a cell by time: each is compared with
-        those only that begin in its own cell and in those around it before it ends. That takes a
-        time in proportion to the stays, unless they are too near.
+        Stays are sorted into a grid with cells of `apart_m`, and by time within a cell. A stay is
+        compared only with stays that begin before it ends, in its own and the neighbouring cells.
+        So the time needed is proportional to the number of stays, unless many are too near.
         """
         cells = np.floor(self.places_m / apart_m)
         index, levels = np.empty(cells.shape, np.int64), []
@@ -158,19 +159,19 @@ class _Stays(NamedTuple):
             level, index[:, axis] = np.unique(column, return_inverse=True)
             levels.append(level)
         shape = [len(level) for level in levels]
-        # Stays come in the order of time, so that a stay's number is also its rank in time.
+        # Stays are sorted by time, so the index of a stay is also its rank in time.
         until = np.searchsorted(self.begin_s, self.end_s)
         own = np.ravel_multi_index(tuple(index.T), shape)
-        known, cell = np.unique(own, return_inverse=True)
+        occupied, cell = np.unique(own, return_inverse=True)
         key = np.sort(cell * len(cell) + np.arange(len(cell)))
-        found: list[tuple[float, float, int, int]] = []
+        pairs: list[tuple[float, float, int, int]] = []
         for offset in product((-1, 0, 1), repeat=len(shape)):
-            around, is_there = _neighbours(cells + offset, levels, shape, known)
-            stays = np.flatnonzero(is_there)
+            around, is_occupied = _neighbours(cells + offset, levels, shape, occupied)
+            stays = np.flatnonzero(is_occupied)
             first = np.searchsorted(key, around * len(cell) + stays + 1)
             behind = np.searchsorted(key, around * len(cell) + until[stays])
-            found += self._pairs(stays, first, behind, key % len(cell), apart_m)
-        return min(found)[2:] if found else None
+            pairs += self._pairs(stays, first, behind, key % len(cell), apart_m)
+        return min(pairs)[2:] if pairs else None
 
     def _pairs(
         self,
@@ -180,20 +181,22 @@ class _Stays(NamedTuple):
         others: NDArray[np.int64],
         apart_m: float,
     ) -> list[tuple[float, float, int, int]]:
-        """Time, distance and numbers of stays that are too near, the first at each turn.
+        """Time, distance and indices of pairs of stays that are too near.
+
+        Each turn compares every stay with its next candidate and keeps the earliest such pair.
 
         Args:
             stays: stays to compare with later ones; shape (m,).
-            first: index in `others` of the first one to compare with; shape (m,).
-            behind: index behind the last one to compare with; shape (m,).
-            others: stays by cell and time; shape (n,).
+            first: index in `others` of the first candidate; shape (m,).
+            behind: index in `others` after the last candidate; shape (m,).
+            others: stays sorted by cell and time; shape (n,).
             apart_m: distance [m].
         """
-        found: list[tuple[float, float, int, int]] = []
+        pairs: list[tuple[float, float, int, int]] = []
         for turn in count():
             left = first + turn < behind
-            if not left.any() or (found and turn > CROWDED):
-                return found
+            if not left.any() or (pairs and turn > CROWDED):
+                return pairs
             stays, first, behind = stays[left], first[left], behind[left]
             with_ = others[first + turn]
             away_m = np.linalg.norm(self.places_m[stays] - self.places_m[with_], axis=1)
@@ -202,48 +205,50 @@ class _Stays(NamedTuple):
                 at = np.flatnonzero(near)
                 one = at[np.lexsort((away_m[at], self.begin_s[with_[at]]))[0]]
                 number = int(with_[one])
-                told = float(self.begin_s[number]), float(away_m[one])
-                found.append((*told, int(stays[one]), number))
-        raise AssertionError  # numbers do not end
+                at_s, distance_m = float(self.begin_s[number]), float(away_m[one])
+                pairs.append((at_s, distance_m, int(stays[one]), number))
+        raise AssertionError  # `count` is endless
 
 
 def _neighbours(
-    cells: Array, levels: Sequence[Array], shape: Sequence[int], known: NDArray[np.int64]
+    cells: Array, levels: Sequence[Array], shape: Sequence[int], occupied: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Index of each cell among those in which anybody stays, and whether it is one of them.
+    """Index of each cell among the occupied ones.
 
     Returns:
-        the indices of those that are, shape (m,); and which are, shape (n,).
+        indices of those cells that are occupied, shape (m,); and which are, shape (n,).
     """
-    is_there = np.ones(len(cells), dtype=bool)
+    is_occupied = np.ones(len(cells), dtype=bool)
     index = np.empty(cells.shape, np.int64)
     for axis, level in enumerate(levels):
         index[:, axis] = np.minimum(np.searchsorted(level, cells[:, axis]), len(level) - 1)
-        is_there &= level[index[:, axis]] == cells[:, axis]
-    code = np.ravel_multi_index(tuple(index[is_there].T), tuple(shape))
-    at = np.minimum(np.searchsorted(known, code), len(known) - 1)
-    hit = known[at] == code
-    is_there[is_there] = hit
-    return at[hit], is_there
+        is_occupied &= level[index[:, axis]] == cells[:, axis]
+    code = np.ravel_multi_index(tuple(index[is_occupied].T), tuple(shape))
+    at = np.minimum(np.searchsorted(occupied, code), len(occupied) - 1)
+    hit = occupied[at] == code
+    is_occupied[is_occupied] = hit
+    return at[hit], is_occupied
 
 
 class Guided:
-    """References of a mission's vehicles, whose goals can be given in flight.
+    """References of a mission's vehicles, with goals that may be replaced in flight.
 
     Args:
-        references: the reference of a vehicle, by its number.
-        goals: goals that are given [m], by vehicle.
+        references: gives the reference of a vehicle by its number.
+        goals: goals that replace those of the mission [m; shape (axes,)], by vehicle.
     """
 
     def __init__(self, references: Callable[[int], Reference], goals: Mapping[int, Array]) -> None:
         self._references, self.goals = references, goals
 
     def of(self, vehicle: int) -> Reference:
-        """The reference of a vehicle, whose goal may change; where it begins it does not."""
-        made = self._references(vehicle)
+        """Reference of a vehicle: its replaced goal, if any; its start at time 0 is never
+        replaced.
+        """
+        original = self._references(vehicle)
 
         def reference(t: NDArray[Any]) -> Array:
-            state = made(t)
+            state = original(t)
             if vehicle in self.goals:
                 state[np.asarray(t) > 0.0, :, 0] = self.goals[vehicle]
             return state
@@ -251,11 +256,11 @@ class Guided:
         return reference
 
 
-def given(text: str, axes: int) -> dict[int, Array]:
-    """Goals [m] by vehicle that a text names.
+def parse_goals(text: str, axes: int) -> dict[int, Array]:
+    """Goals in a text such as `goal(1, 2.5, 0) & goal(2, -1, 0)`, by vehicle [m; shape (axes,)].
 
     Raises:
-        GrammarError: with the part of it that is wrong.
+        GrammarError: a part of the text is invalid.
     """
     goals = {}
     form = "goal(vehicle, x, y)" if axes == 2 else "goal(vehicle, x, y, z)"
@@ -272,8 +277,8 @@ def given(text: str, axes: int) -> dict[int, Array]:
     return goals
 
 
-def written(goals: Mapping[int, Array]) -> str:
-    """The text that names these goals."""
+def format_goals(goals: Mapping[int, Array]) -> str:
+    """Text from which `parse_goals` makes these goals."""
     return " & ".join(
         f"goal({vehicle}, {', '.join(f'{at:.6g}' for at in place)})"
         for vehicle, place in goals.items()
@@ -281,7 +286,7 @@ def written(goals: Mapping[int, Array]) -> str:
 
 
 def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> Mission:
-    """Places on a circle, from which each vehicle goes to the one opposite."""
+    """Mission in which vehicles on a circle go to the opposite place."""
     goals, times_s = {}, np.array([0.0, SWAP_AT_S])
     for number in range(1, vehicles + 1):
         angle = 2.0 * np.pi * (number - 1) / vehicles
@@ -294,10 +299,10 @@ def swap(vehicles: int, radius_m: float, axes: int, altitude_m: float = 0.0) -> 
 
 
 def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
-    """Places on a sphere, from which each vehicle goes to the one opposite.
+    """Mission in which vehicles on a sphere go to the opposite place.
 
-    Vehicles with odd numbers begin on the upper half, spread evenly by the golden angle, and the
-    vehicle with the next number begins opposite to each.
+    Vehicles with odd numbers start on the upper half, spread evenly by the golden angle; each even
+    number starts opposite to the odd number before it.
     """
     goals, times_s = {}, np.array([0.0, SWAP_AT_S])
     pairs = -(-vehicles // 2)
@@ -312,23 +317,23 @@ def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
 
 
 def mission(content: bytes, axes: int) -> Mission:
-    """Goals from a table with the columns vehicle, t [s], x, y, z [m] (as many as there are axes).
+    """Mission from a CSV table with the columns vehicle, t [s], x, y and, with three axes, z [m].
 
     Raises:
-        ValueError: with what is wrong, and in which line.
+        ValueError: the table is invalid; says what and in which line.
     """
-    rows = read_table(content, ["vehicle", "t", "x", "y", "z"][: axes + 2])
+    rows, lines = read_table(content, ["vehicle", "t", "x", "y", "z"][: axes + 2])
     numbers = rows[:, 0]
-    known = (numbers >= 1) & (numbers <= VEHICLES_MAX) & (numbers == np.rint(numbers))
-    if not len(rows) or not known.all():
+    valid = (numbers >= 1) & (numbers <= VEHICLES_MAX) & (numbers == np.rint(numbers))
+    if not len(rows) or not valid.all():
         raise ValueError(f"column vehicle: expected numbers from 1 to {VEHICLES_MAX}")
     numbers = numbers.astype(np.int64)
     goals = {}
     order = np.argsort(numbers, kind="stable")
     names, begins = np.unique(numbers[order], return_index=True)
-    for number, own in zip(names.tolist(), np.split(rows[order], begins[1:]), strict=True):
-        if own[0, 1] != 0.0 or (np.diff(own[:, 1]) <= 0.0).any():
-            raise ValueError(f"vehicle {number}: column t must start at 0 and rise")
+    for number, at in zip(names.tolist(), np.split(order, begins[1:]), strict=True):
+        own = rows[at]
+        check_times(own[:, 1], lines[at])
         goals[number] = own[:, 1], own[:, 2:]
     if (np.abs(rows[:, 2:]) > FAR_M).any():
         raise ValueError(f"expected at most {FAR_M:g} m from the origin")

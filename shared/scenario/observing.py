@@ -1,8 +1,8 @@
-"""Policies of `vehicle.report`: when an observation is sent.
+"""Policies of `vehicle.report`, which decide when the vehicle sends an observation.
 
-They combine with & and | like those of a trigger (`shared.scenario.grammar`), and are asked once a
-step, aboard, by `client.reporting`. The first observation of a session is sent whatever they say,
-and so is one after the longest silence that the server asks for.
+They are combined with & and | like policies of a trigger (`shared.scenario.grammar`), and
+`client.reporting` evaluates them aboard, once per step. Two observations are sent in any case: the
+first of a session, and one after the longest silence that the server asks for.
 """
 
 from collections.abc import Callable
@@ -15,22 +15,22 @@ from skytether.shared.scenario.registry import PERIOD_MAX, REPORTS
 
 
 class Unreported(NamedTuple):
-    """Knowledge that the server lacks, at one step of one vehicle."""
+    """Input of a policy, at one step: what the server cannot know without a new observation."""
 
     off_m: float
-    """Distance between the vehicle and the place where the server must believe it [m]; see
+    """Distance between the vehicle and where the server expects it [m], see
     `client.reporting.BelievedState`."""
     is_news: bool
-    """Whether another horizon has come into force since the newest observation, or another mode, or
-    the horizon in force has come once more: then the server may not know that it is."""
+    """Whether, since the last observation, another horizon has come into force, the mode has
+    changed, or the horizon in force was received again, so that the server may not know of it."""
     steps: int
-    """Number of steps since the newest observation."""
+    """Number of steps since the last observation."""
     dt_s: float
     """Length of a step [s]."""
 
 
 Report = Callable[[Unreported], bool]
-"""Whether to send an observation."""
+"""Function that decides whether to send an observation."""
 
 
 @REPORTS
@@ -47,9 +47,8 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
 
 @REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
-    """Sends where the vehicle has left where the server believes it by more than so many metres,
-    where another horizon has come into force or the same one has come once more, and where its mode
-    has changed.
+    """Sends if the vehicle is more than so many metres from where the server expects it, if another
+    horizon has come into force or the same one was received again, or if its mode has changed.
     """
     return now.is_news or now.off_m > metres
 
@@ -61,12 +60,12 @@ def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)])
 
 
 def is_always(text: str) -> bool:
-    """Whether a report is at every step, and that is all there is to it."""
+    """Whether a text of `vehicle.report` is just `always`."""
     return REPORTS.parse(text) == Call("always")
 
 
 def make_report(text: str) -> Report:
-    """The report that a text describes; it must be one."""
+    """Make the report rule from a text that has been checked."""
 
     def make(expression: Expression) -> Report:
         if isinstance(expression, Combination):

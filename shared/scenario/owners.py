@@ -1,10 +1,10 @@
-"""Owners of a scenario's keys, which stand beside each key in its type.
+"""Owners of a scenario's keys, as metadata in the type of each key.
 
     dt: Annotated[float, Meta(ge=0.001, le=1), Key(Owner.BOTH, term="dt_ns")] = 0.05
     observer_s: OfServer[Duration] = 4.0
 
-msgspec and tyro pass over this metadata. `catalogue.py` collects it: there the terms of a flight
-find their keys, and each endpoint the keys that may change in flight.
+msgspec and tyro ignore this metadata. `catalogue.py` collects it, for the keys of the terms and the
+keys that may change in flight.
 """
 
 from enum import Enum, auto
@@ -14,21 +14,21 @@ import msgspec
 
 
 class Owner(Enum):
-    """Owner of a key: which end uses its value, and so whether two ends may have different ones."""
+    """Owner of a key: which end uses its value, and whether the ends may have different values."""
 
     BOTH = "both ends"
-    """Value with which both ends predict: a term of the flight, which must be equal."""
+    """Both ends predict with it: a term of the flight, which must be equal."""
     EACH = "each end"
-    """Value that each end has for itself."""
+    """Each end uses its own value."""
     SERVER = "server"
     VEHICLE = "vehicle"
     NETEM = "netem"
     VIRTUAL_TIME = "virtual time"
-    """Value that describes the computers in virtual time; real ones are as they are."""
+    """Describes computers and clocks in virtual time; no effect on real ones."""
 
 
 class InFlight(Enum):
-    """Group of keys that may get other values in flight, and take effect together."""
+    """Group of keys that may change in flight, together."""
 
     TRIGGER = auto()
     """Rule for sending horizons."""
@@ -37,9 +37,9 @@ class InFlight(Enum):
     ARMED = auto()
     """Whether plans may be flown."""
     ORIGIN = auto()
-    """Where the scenario's origin is, of a vehicle in the air that does not know."""
+    """Origin of the scenario, for a vehicle in the air that has lost it."""
     LEAP = auto()
-    """Choice after a leap of the position."""
+    """Operator's choice after a leap of the position."""
     WIND = auto()
     """Wind and gusts."""
     IMPAIRMENT = auto()
@@ -47,7 +47,7 @@ class InFlight(Enum):
     ZONES = auto()
     """Zones of a mission."""
     GOALS = auto()
-    """Goals of a mission that are given in flight."""
+    """Goals of a mission."""
 
 
 class Key(msgspec.Struct, frozen=True):
@@ -55,9 +55,9 @@ class Key(msgspec.Struct, frozen=True):
 
     owner: Owner
     in_flight: InFlight | None = None
-    """Group with which the key may change in flight; None: it may not."""
+    """Group with which the key may change in flight; None if it may not change."""
     term: str = ""
-    """Field of `Terms` for a key of both ends; empty: the field has the key's name."""
+    """Field of `Terms` for a key of both ends; empty if it has the key's name."""
 
 
 T = TypeVar("T")

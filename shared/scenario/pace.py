@@ -1,7 +1,7 @@
-"""Pace of a desired trajectory: where it is faster than the vehicle can fly.
+"""Check whether a desired trajectory is faster than the vehicle can fly.
 
-A vehicle's largest speed on an axis is u_max times its gain. Nothing follows a trajectory that is
-faster for long, such as one whose table is in millimetres: the vehicle falls behind at full speed.
+A vehicle's largest speed on an axis is u_max times its gain. On a faster trajectory, such as one
+from a table in millimetres, it falls behind at full speed.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
 
 STEPS_MAX = 100_000
-"""Largest number of steps that are looked at before a flight."""
+"""Largest number of steps that are checked before a flight."""
 TINY = 1e-9
-"""Relative tolerance of rounding."""
+"""Relative tolerance for rounding."""
 
 
 class TooFast(NamedTuple):
@@ -25,21 +25,23 @@ class TooFast(NamedTuple):
     at_s: float
     """Time in the flight [s]."""
     speed_mps: float
-    """Desired speed along the axis that asks most [m/s]."""
+    """Desired speed along the axis with the largest excess [m/s]."""
     most_mps: float
     """Largest speed of the vehicle along that axis [m/s]."""
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight."""
+    """Whether the desired trajectory is known before the flight: no live point, target or
+    mission.
+    """
     return scenario.reference.shape not in ("live", "target") and not scenario.is_mission
 
 
 def excess(scenario: Scenario, velocity: Array) -> Array:
-    """Desired speed over the vehicle's largest, on each axis.
+    """Ratio of the desired speed to the vehicle's largest, on each axis; shape (n, axes).
 
     Args:
-        scenario: gives u_max and the gain.
+        scenario: has u_max and the gain.
         velocity: desired velocity [m/s]; shape (n, axes).
     """
     ratio: Array = np.abs(velocity) / (scenario.u_max * scenario.model_gain)
@@ -47,20 +49,24 @@ def excess(scenario: Scenario, velocity: Array) -> Array:
 
 
 def is_too_fast(scenario: Scenario, velocity: Array) -> Flags:
-    """Whether the vehicle cannot have each desired velocity; shape (n,); see `excess`."""
-    found: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
-    return found
+    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,).
+
+    Args:
+        scenario, velocity: see `excess`.
+    """
+    over: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
+    return over
 
 
 def first_too_fast(scenario: Scenario) -> TooFast | None:
-    """First step at which the desired trajectory is too fast; None where it never is, or nobody
-    knows it before the flight.
+    """First step at which the desired trajectory is too fast; None if there is none, or if the
+    trajectory is not known before the flight.
     """
     if not is_known(scenario):
         return None
     times_s = np.arange(min(scenario.steps, STEPS_MAX) + 1) * scenario.control.dt
     if not REFERENCES[REFERENCES.one(scenario.reference.shape).name].is_ours:
-        times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # where a plug-in's has been checked
+        times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # as `sampled` checked it
     velocity = scenario.make_reference()(times_s)[..., 1]
     over = is_too_fast(scenario, velocity)
     if not over.any():

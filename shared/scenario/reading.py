@@ -1,9 +1,8 @@
-"""Reading a scenario: one TOML file, laid over those it extends, every value checked once.
+"""Reading a scenario from a TOML file, with the scenarios it extends and the files it names.
 
-The files that a scenario names are read here, too: whatever is made of a scenario opens none.
-
-A scenario may say `extends = "other"` (a scenario's name, or a file beside it) and then holds only
-what differs. `skytether scenarios` lists those that come with Skytether.
+A scenario with `extends = "other"` (name of a built-in scenario, or a file beside it) holds only
+what differs from the other. Every value is checked here, and every file that a scenario names is
+read here, so that endpoints open no files. `skytether scenarios` lists the built-in scenarios.
 """
 
 import math
@@ -22,17 +21,17 @@ from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario.contradictions import Contradiction, contradictions
-from skytether.shared.scenario.dotted import TEXTS, flat, lay, with_argument
+from skytether.shared.scenario.dotted import TEXTS, flat, set_keys, with_argument
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, ZONES, File, Files, PluginTable
 from skytether.shared.scenario.schema import TABLES, Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
-"""Folder of the scenarios that come with Skytether."""
+"""Folder of the built-in scenarios."""
 EXTENDS_MAX = 20
-"""Largest number of scenarios that a scenario is laid over, each over the next."""
+"""Largest length of a chain of `extends`."""
 GIVEN_MAX = 200
-"""Largest number of characters that a message repeats of what was given."""
+"""Largest number of characters of a value that a message repeats."""
 FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
     {
         "network.uplink": (IMPAIRMENTS, 128 * 1024 * 1024),
@@ -40,18 +39,18 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
         "mission.zones": (ZONES, 4_000_000),
     }
 )
-"""Keys whose text may name files: what it is made of, and the largest size of a file [B]."""
+"""Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX = 16_000_000
-"""Largest size of the file of a reference [B]."""
+"""Largest size of `reference.file` [B]."""
 COMPARED = "compare"
-"""The file of the scenarios that `skytether compare` flies."""
+"""Name of the file with the scenarios of `skytether compare`."""
 
 
 def names(file: str = "") -> list[str]:
-    """Names of the scenarios that come with Skytether, or of those in a file of scenarios.
+    """Names of the built-in scenarios, or of the scenarios in a file of several.
 
     Args:
-        file: COMPARED, or the path of a file that holds a scenario in each of its tables.
+        file: COMPARED, or the path of a file with one scenario per table; empty: built-in ones.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -64,47 +63,56 @@ def names(file: str = "") -> list[str]:
 
 
 def load(name: str) -> Scenario:
-    """Scenario by its name, or from a file by its path (anything that ends in .toml).
+    """Load a scenario by name, or from a file by path (any text that ends in .toml).
 
-    Behind the name or path of a file of scenarios stands the table: `compare/paper-event-gusts`.
+    In a file of several scenarios, one is named by its table: `compare/paper-event-gusts`.
 
     Raises:
-        ConfigError: it does not exist, or something in it is wrong.
+        ConfigError: the scenario does not exist or is invalid.
     """
     return _without_contradictions(load_base(name), name)
 
 
 def load_base(name: str) -> Scenario:
-    """Scenario that flags are laid over, by its name or path as for `load`.
+    """Load a scenario as `load` does, without looking for contradictions.
 
-    Every value is checked by itself. Contradictions are left to `check`, which judges the final
-    values: a flag may end one that the file has.
+    Command-line flags are applied to it next, which may resolve a contradiction of the file;
+    `check` then judges the final values.
 
     Raises:
-        ConfigError: it does not exist, or a value in it is wrong.
+        ConfigError: the scenario does not exist, or a value is invalid.
     """
     return convert(_read(name), name)
 
 
-def check(raw: Mapping[str, Any], source: str = "", *, known: Scenario | None = None) -> Scenario:
-    """The scenario in a table of plain values, every one of them checked.
+def check(
+    raw: Mapping[str, Any],
+    source: str = "",
+    *,
+    known: Scenario | None = None,
+    any_network: bool = False,
+) -> Scenario:
+    """Make a scenario from a table of plain values, and check it for contradictions.
 
     Args:
-        source: the file or command line they come from, for the message.
-        known: a scenario that was checked before: where its trajectory is the same, no file of it
-            is read again.
+        raw: the table.
+        source: file or command line of the values, for messages.
+        known: a scenario that was checked before; if the desired trajectory is the same, its files
+            are not read again.
+        any_network: whether its network may be too slow, or lose too much, to fly over.
 
     Raises:
-        ConfigError: the first thing that is wrong.
+        ConfigError: the first error.
     """
-    return _without_contradictions(convert(raw, source), source, known=known)
+    scenario = convert(raw, source)
+    return _without_contradictions(scenario, source, known=known, any_network=any_network)
 
 
 def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
-    """The scenario in a table of plain values, each checked by itself; see `check`.
+    """Make a scenario from a table of plain values, checking each value by itself; see `check`.
 
     Raises:
-        ConfigError: the first value that is wrong.
+        ConfigError: the first invalid value.
     """
     raw = _with_texts(raw, source)
     try:
@@ -116,39 +124,44 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
 
 
 def _without_contradictions(
-    scenario: Scenario, source: str, *, known: Scenario | None = None
+    scenario: Scenario, source: str, *, known: Scenario | None = None, any_network: bool = False
 ) -> Scenario:
-    """Scenario with its files, refused unless its values are possible together; see `check`."""
+    """Scenario with its files, refused if it has contradictions; see `check`."""
     scenario = _with_files(scenario, source, known)
-    _refuse_first(contradictions(scenario, known), source)
+    _refuse_first(contradictions(scenario, known, any_network=any_network), source)
     return scenario
 
 
 def _refuse_first(wrong: Iterator[Contradiction], source: str) -> None:
-    """Raise the first of these contradictions, if there is one, as a ConfigError."""
+    """Raise the first contradiction, if any, as a ConfigError."""
     for key, given, expected in wrong:
         raise ConfigError(f"{_where(source)}{key}: got {_short(str(given))}, expected {expected}")
 
 
 def _where(source: str) -> str:
-    """Beginning of a message about a source."""
+    """Prefix of a message: the source, if there is one."""
     return f"{source}: " if source else ""
 
 
 def to_table(scenario: Scenario) -> dict[str, Any]:
-    """The plain values of a scenario, from which `check` makes it again."""
+    """Plain values of a scenario, from which `check` makes it again."""
     return {
         name: msgspec.to_builtins(getattr(scenario, name)) for name in Scenario.__struct_fields__
     }
 
 
 def to_toml(scenario: Scenario) -> bytes:
-    """The scenario as a file that `load` reads."""
+    """Content of a file from which `load` makes the scenario again."""
     return msgspec.toml.encode(to_table(scenario))
 
 
 def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
-    """The raw table of a scenario, laid over those that it extends; `seen` extend it in turn."""
+    """Raw table of a scenario, merged with those it extends.
+
+    Args:
+        name: name or path of the scenario.
+        seen: scenarios that extend this one, directly or indirectly, to detect circles.
+    """
     file, _, entry = name.rpartition("/")
     if name.endswith(".toml") or name in names():
         file, entry = name, ""
@@ -177,47 +190,49 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
 
 
 def _relative_to(folder: Path, raw: dict[str, Any]) -> None:
-    """Change the names of files in a raw table, which are relative to a folder, to whole paths."""
+    """Replace file names in a raw table, which are relative to a folder, by full paths."""
     for key, value in flat(raw):
         if key == "reference.file" and isinstance(value, str) and value:
-            lay({key: str(folder / value)}, raw)
+            set_keys({key: str(folder / value)}, raw)
         elif key in FILES and isinstance(value, str):
-            with suppress(GrammarError):  # said by `check`
-                lay({key: FILES[key][0].with_files(value, lambda file: str(folder / file))}, raw)
+            with suppress(GrammarError):  # reported by `check`
+                set_keys(
+                    {key: FILES[key][0].with_files(value, lambda file: str(folder / file))}, raw
+                )
 
 
 def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scenario:
-    """A scenario with the content of the files that it names.
+    """Scenario with the contents of the files that it names.
 
     Raises:
-        ConfigError: one cannot be read.
+        ConfigError: a file cannot be read.
     """
     now, before = (dict(flat(to_table(each))) if each else {} for each in (scenario, known))
-    found: dict[str, File] = {}
+    contents: dict[str, File] = {}
     for key in ("reference.file", *FILES):
         if key == "reference.file" and scenario.reference.shape not in TABLES:
             continue
-        with suppress(GrammarError):  # said by `contradictions`
+        with suppress(GrammarError):  # reported by `contradictions`
             own = known.files if known and before[key] == now[key] else ()
-            found |= {file.name: file for file in files_of(key, now[key], source, own)}
-    if not found:
+            contents |= {file.name: file for file in files_of(key, now[key], source, own)}
+    if not contents:
         return scenario
     keys = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
-    return WithFiles(**keys, contents=tuple(found.values()))
+    return WithFiles(**keys, contents=tuple(contents.values()))
 
 
 def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
-    """The files that the value of a key names, with their contents.
+    """Files that the value of a key names, with their contents.
 
     Args:
         key: `reference.file`, or one of FILES.
-        text: its value.
-        source: where it comes from, for the message.
-        known: files that need not be read.
+        text: value of the key.
+        source: file or command line of the value, for messages.
+        known: files that have been read already.
 
     Raises:
-        ConfigError: one cannot be read.
-        GrammarError: the text is wrong.
+        ConfigError: a file cannot be read.
+        GrammarError: the text is invalid.
     """
     table, most = FILES.get(key, (None, TABLE_BYTES_MAX))
     read = {file.name: file for file in known}
@@ -237,7 +252,7 @@ def _content(where: str, name: str, most: int) -> bytes:
 
 
 def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """A raw table in which arguments of texts are laid over the texts where nothing is written."""
+    """Raw table in which keys of single arguments are applied to the default texts."""
     default = to_table(Scenario())
     for key in TEXTS:
         section, name = key.split(".")
@@ -249,7 +264,7 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: str) -> str:
-    """The text of a key with other arguments."""
+    """Text of a key with some arguments changed."""
     try:
         for path, value in flat(arguments, f"{key}."):
             text = with_argument(key, text, path, value)
@@ -259,7 +274,7 @@ def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: s
 
 
 def _path(file: str) -> Path:
-    """Path of a file, given by its path or by the name of one that comes with Skytether."""
+    """Path of a scenario file, from a path or the name of a built-in file."""
     if not file.endswith(".toml"):
         return SCENARIOS / f"{file}.toml"
     try:
@@ -269,7 +284,7 @@ def _path(file: str) -> Path:
 
 
 def _toml(path: Path, file: str) -> dict[str, Any]:
-    """The raw table of a whole file, which the user calls `file`."""
+    """Raw table of a file, named `file` in messages."""
     try:
         return toml.loads(files.read(path, toml.BYTES_MAX).decode())
     except OSError as error:
@@ -281,7 +296,7 @@ def _toml(path: Path, file: str) -> dict[str, Any]:
 def _overlay(
     below: dict[str, Any], above: dict[str, Any], source: str, prefix: str = ""
 ) -> dict[str, Any]:
-    """A raw table over another; arguments of a text change those in the text below."""
+    """Merge two raw tables, `above` taking precedence; keys of single arguments change the text."""
     merged = dict(below)
     for name, value in above.items():
         key, old = f"{prefix}{name}", merged.get(name)
@@ -303,19 +318,19 @@ _PLAIN = {
     "array": "a list",
     "object": "a table",
 }
-"""Words of msgspec's messages, and what stands for them in ours."""
+"""Words of msgspec's messages, and the words that ours use instead."""
 
 _ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
 
 
 def _explain(message: str, raw: Mapping[str, Any]) -> str:
-    """Message of msgspec, put as `key: got …, expected …`."""
-    # First, as a key may hold whatever msgspec puts behind it.
-    if strange := _strange(raw, Scenario):
-        return strange
-    found = _ERROR.fullmatch(message)
-    assert found is not None
-    what, path = found["what"], found["path"] or ""
+    """Message of msgspec, reworded as `key: got …, expected …`."""
+    # Unknown keys first: their names may contain anything, also the syntax of msgspec's messages.
+    if unknown := _unknown_key(raw, Scenario):
+        return unknown
+    parts = _ERROR.fullmatch(message)
+    assert parts is not None
+    what, path = parts["what"], parts["path"] or ""
     section, given = Scenario, raw
     for part in filter(None, path.split(".")):
         key, *index = part.replace("]", "").split("[")
@@ -324,15 +339,15 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
             given = given[int(digits)] if digits.isdigit() else given
         section = typing.get_type_hints(section).get(key, section)
     if what.startswith("Invalid enum value") or " | " in what:
-        return f"{path}: got {_written(given)}, expected {_choices(section)}"
+        return f"{path}: got {_represented(given)}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
     for theirs, ours in _PLAIN.items():
         expected = re.sub(rf"^{theirs}\b", ours, expected)
-    return f"{path or 'the scenario'}: got {_written(given)}, expected {expected}"
+    return f"{path or 'the scenario'}: got {_represented(given)}, expected {expected}"
 
 
-def _strange(table: object, section: Any, at: str = "") -> str | None:
-    """Message about the first key of a table that is unknown; None if all are known."""
+def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
+    """Message about the first unknown key of a table; None if all are known."""
     if not (isinstance(table, Mapping) and hasattr(section, "__struct_fields__")):
         return None
     kinds = typing.get_type_hints(section)
@@ -341,26 +356,26 @@ def _strange(table: object, section: Any, at: str = "") -> str | None:
             return (
                 f"{at}{_short(str(key))}: no such key; {hint(str(key), section.__struct_fields__)}"
             )
-        if below := _strange(value, kinds[key], f"{at}{key}."):
+        if below := _unknown_key(value, kinds[key], f"{at}{key}."):
             return below
     return None
 
 
-def _written(given: object) -> str:
-    """A value as Python writes it, as far as a line has room for it."""
+def _represented(given: object) -> str:
+    """`repr` of a value, cut to GIVEN_MAX characters."""
     try:
         return _short(repr(given))
-    except ValueError:  # Python writes no number of more than 4300 digits
+    except ValueError:  # Python formats no number of more than 4300 digits
         return "a number of thousands of digits"
 
 
 def _short(given: str) -> str:
-    """Value as it was given, cut to what a line has room for."""
+    """Text cut to GIVEN_MAX characters."""
     return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
 
 
 def _choices(kind: Any) -> str:
-    """Values that are allowed: the words of a Literal, or one of several types."""
+    """Allowed values in words: the words of a Literal, or the types of a union."""
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is tuple:
         return _PLAIN["array"]
@@ -370,7 +385,7 @@ def _choices(kind: Any) -> str:
 
 
 def _infinite(value: object, key: str = "") -> Iterator[Contradiction]:
-    """Numbers that TOML knows and no flight has a use for: key, given, expected."""
+    """Contradictions for infinite numbers and NaN, which TOML allows."""
     if isinstance(value, float) and not math.isfinite(value):
         yield key, value, "a finite number"
     elif isinstance(value, dict):

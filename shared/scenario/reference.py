@@ -1,36 +1,37 @@
 """Desired trajectories x_d(t): position and velocity at any time (E6: the paper has positions).
 
-A reference is a function of time since the epoch [s; any shape] that gives the desired state
-[m, m/s; that shape + (axes, 2)] in the world frame, metres, third axis up.
+A reference is a function from time since the epoch [s; any shape] to the desired state
+[m, m/s; that shape + (axes, 2)], in the world frame with the third axis up.
 """
 
 import io
 from collections.abc import Callable
+from contextlib import suppress
+from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.law.model import Array
+from skytether.shared.law.model import Array, Indices
 
 FAR_M = 1e6
 """Largest coordinate of a trajectory [m]."""
 FAST_MPS = 1e6
-"""Largest velocity along an axis of a trajectory that is given by its points [m/s]."""
+"""Largest velocity along an axis of a trajectory made from points [m/s]."""
 GRID_S = 0.05
-"""Time between two points at which the velocity of a target is drawn [s]; in between it is
-interpolated."""
+"""Time between the random velocities of a target [s]; they are interpolated linearly."""
 TURN_S = 3600.0
-"""Time after which a target goes its way back, and then forth again [s]: what is drawn of it stays
-bounded, whatever time it is asked for."""
+"""Time after which a target's path is run backwards, then forwards again [s]. This bounds the
+memory for the random walk."""
 GRID_BLOCK = 1024
-"""Number of points that are drawn at a time."""
+"""Number of random velocities that are drawn at a time."""
 COLUMNS_MAX = 64
-"""Most columns of a table: each line takes time and memory for each of them."""
+"""Largest number of columns of a table, which bounds time and memory per line."""
 
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
-"""Times at which a plug-in's trajectory is looked at before a flight [s]: densely for two minutes,
-then ever more rarely up to a day; on no grid that a trajectory might have."""
+"""Times at which a plug-in's trajectory is checked before a flight [s]: densely for two minutes,
+then more and more rarely up to a day. No round numbers, as a trajectory may be special at those."""
 
 Reference = Callable[[NDArray[Any]], Array]
 
@@ -41,7 +42,10 @@ def _planar(
     axes: int,
     altitude_m: float,
 ) -> Reference:
-    """A plane curve from (position, velocity) of x and of y; in 3-D at constant altitude."""
+    """Planar curve from functions of time to (position, velocity) for x and y.
+
+    With three axes it is flown at constant altitude.
+    """
 
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
@@ -78,15 +82,15 @@ def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float 
 
 
 def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Reference:
-    """Path of straight lines between points reached at given times.
+    """Path of straight lines between points, each reached at its time.
 
     Args:
-        times_s: rising, from 0; shape (n,).
-        points_m: shape (n, axes).
-        loop: start again at the end; otherwise stop at the last point and stay.
+        times_s: rising times, from 0 [s]; shape (n,).
+        points_m: points [m]; shape (n, axes).
+        loop: start again after the last point; otherwise stay there.
 
     Raises:
-        ValueError: no vehicle can be told to be so far away, or so fast.
+        ValueError: a point is beyond FAR_M, or a speed above FAST_MPS.
     """
     times_s, points_m = np.asarray(times_s, float), np.asarray(points_m, float)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -100,18 +104,20 @@ def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Refere
         leg = np.clip(np.searchsorted(times_s, t, side="right") - 1, 0, len(slopes) - 1)
         moving = (t >= times_s[0]) & (t < times_s[-1])
         velocity = np.where(moving[..., None], slopes[leg], 0.0)
-        held = np.clip(t, times_s[0], times_s[-1])
-        position = points_m[leg] + slopes[leg] * (held - times_s[leg])[..., None]
+        clipped = np.clip(t, times_s[0], times_s[-1])
+        position = points_m[leg] + slopes[leg] * (clipped - times_s[leg])[..., None]
         return np.stack([position, velocity], axis=-1)
 
     return sample
 
 
 def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
-    """Path through the points at constant speed; `loop` flies back to the first, and on.
+    """Path through points [m; shape (n, axes)] at constant speed.
+
+    With `loop` it returns to the first point and repeats.
 
     Raises:
-        ValueError: see `timed_path`; two points may be too close to each other, too.
+        ValueError: see `timed_path`; or two points are too close to each other.
     """
     points = np.asarray(points_m, dtype=np.float64)
     if loop:
@@ -121,7 +127,7 @@ def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Refer
 
 
 def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Square with corners at (±radius, ±radius), one round a period, from (radius, -radius)."""
+    """Square with corners at (±radius, ±radius), from (radius, -radius), counter-clockwise."""
     corners = np.zeros((4, axes))
     corners[:, :2] = radius_m * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
     corners[:, 2:] = altitude_m
@@ -129,7 +135,7 @@ def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0)
 
 
 def hover(point_m: Array) -> Reference:
-    """Rest at one point [m; shape (axes,)], for ever."""
+    """Constant position [m; shape (axes,)]."""
     point = np.asarray(point_m, dtype=np.float64)
 
     def sample(t: Array) -> Array:
@@ -150,19 +156,19 @@ def target(
     radius_m: float,
     turn_every_s: float = 0.0,
 ) -> Reference:
-    """Random walk from the origin: white acceleration, or turns, which nobody can foresee.
+    """Random walk from the origin, by white acceleration or by random turns.
 
-    The velocity is reflected where it would become too large, and the position where it would leave
-    its bounds. Before time 0 the target rests at the origin, and after TURN_S it comes back the way
-    it went.
+    Velocity and position are reflected at their bounds. Before time 0 the target rests at the
+    origin. After TURN_S it runs its path backwards.
 
     Args:
-        rng: chance of this walk alone; it is asked for more as later times are.
-        agility: strength of the acceleration [m/s per √s].
+        rng: generator used by this walk only; later times draw more numbers from it.
+        axes: number of axes.
+        agility: strength of the white acceleration [m/s per √s].
         speed_mps: largest velocity along an axis [m/s].
         radius_m: largest coordinate [m].
-        turn_every_s: mean time between two turns [s], at which alone the velocity changes, by as
-            much as it would have in that time; 0: it changes all the time.
+        turn_every_s: mean time between two turns [s]; the velocity then changes at turns only, by
+            as much as it would have since the last one. 0: it changes all the time.
     """
     walk = _Walk(rng, axes, turn_every_s)
 
@@ -186,18 +192,20 @@ def target(
 
 
 class _Walk:
-    """Velocity and position of a target on a grid of GRID_S, drawn as far as they are asked for."""
+    """Velocity and position of a target on a time grid of GRID_S, drawn as needed."""
 
     def __init__(self, rng: np.random.Generator, axes: int, turn_every_s: float) -> None:
         self._rng = rng
         self._turns = min(GRID_S / turn_every_s, 1.0) if turn_every_s else 1.0
-        """Share of the points of the grid at which the velocity changes."""
+        """Probability of a turn at a grid point."""
         self._free = np.zeros((1, axes))
         self._velocities = np.zeros((1, axes))
         self._positions = np.zeros((1, axes))
 
     def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
-        """Velocities [m/s] and positions [m] up to a point of the grid; each (points, axes)."""
+        """Velocities [m/s] and positions [m] at grid points 0 … last at least; each (points,
+        axes).
+        """
         while len(self._free) <= last:
             kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
             if self._turns < 1.0:
@@ -213,10 +221,10 @@ class _Walk:
 
 
 def reflected(free: Any, bound: float) -> tuple[Any, Any]:
-    """Motion between walls that reflect it: where it is, and which way it goes (1 or -1).
+    """Coordinate reflected at walls, and its direction: 1, or -1 if reversed.
 
     Args:
-        free: where it would be without walls; a number or an array.
+        free: coordinate without walls; number or array.
         bound: the walls are at ±bound.
     """
     crossed = np.floor((free + bound) / (2.0 * bound))
@@ -225,63 +233,83 @@ def reflected(free: Any, bound: float) -> tuple[Any, Any]:
 
 
 def sampled(reference: Reference, axes: int) -> bytes:
-    """States of a trajectory at SAMPLED_S to the mm and mm/s, the same on every computer.
+    """States of a trajectory at SAMPLED_S, rounded to mm and mm/s to be equal on every computer.
 
     Raises:
-        ValueError: it gives something else than finite states that can be flown.
+        ValueError: the states have a wrong type or shape, or are too large or not finite.
     """
     for times in (np.zeros(()), SAMPLED_S):
         states, shape = np.asarray(reference(times)), (*times.shape, axes, 2)
         if states.shape != shape or states.dtype.kind != "f":
             got = f"{states.dtype.name} of shape {states.shape}"
             raise ValueError(f"got {got} at {times.size} times, expected floats of shape {shape}")
-        if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # nor is NaN
+        if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # NaN fails too
             raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
     return np.rint(1000.0 * states).astype(np.int64).tobytes()
 
 
 def from_csv(content: bytes, axes: int) -> Reference:
-    """Path from a table with the columns t [s], x, y, z [m] (as many as there are axes).
+    """Path from a CSV table with the columns t [s], x, y and, with three axes, z [m].
 
     Raises:
-        ValueError: with what is wrong, and in which line.
+        ValueError: the table is invalid; says what and in which line.
     """
-    data = read_table(content, ["t", "x", "y", "z"][: axes + 1])
+    data, lines = read_table(content, ["t", "x", "y", "z"][: axes + 1])
     if len(data) < 2:
         raise ValueError("expected at least two lines of finite numbers")
-    if data[0, 0] != 0.0 or (np.diff(data[:, 0]) <= 0.0).any():
-        raise ValueError("column t must start at 0 and rise from line to line")
+    check_times(data[:, 0], lines)
     return timed_path(data[:, 0], data[:, 1:])
 
 
-def read_table(content: bytes, names: list[str]) -> Array:
-    """Columns of a table; shape (rows, columns).
+def check_times(times_s: Array, lines: Indices) -> None:
+    """Refuse times in a table that do not start at 0, or do not rise.
 
     Raises:
-        ValueError: with what is wrong, and in which line.
+        ValueError: with the first such line.
     """
-    import csv  # for files alone
+    if times_s[0] != 0.0:
+        raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
+    for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:
+        after, got = times_s[i : i + 2]
+        raise ValueError(f"line {lines[i + 1]}: expected t above {after:g}, got {got:g}")
 
-    text = io.StringIO(content.decode("utf-8-sig"), newline="")
+
+def read_table(content: bytes, names: list[str]) -> tuple[Array, Indices]:
+    """Named columns of a CSV table, shape (rows, columns), and the number of each row's line.
+
+    Raises:
+        ValueError: the table is invalid; says what and in which line.
+    """
+    import csv  # only needed for files
+
+    try:
+        text = io.StringIO(content.decode("utf-8-sig"), newline="")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"line {line}: expected text in UTF-8") from None
     table = csv.DictReader(text, skipinitialspace=True)
     rows: list[list[float]] = []
+    lines: list[int] = []
     try:
-        if len(table.fieldnames or ()) > COLUMNS_MAX:
+        table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
+        if len(header) > COLUMNS_MAX:
             raise ValueError(f"line 1: expected at most {COLUMNS_MAX} columns")
-        if any(name not in (table.fieldnames or ()) for name in names):
-            raise ValueError(f"line 1: expected the columns {', '.join(names)}")
-        rows += (_numbers([row[name] for name in names], table.line_num) for row in table)
+        if any(name not in header for name in names):
+            got = ", ".join(map(repr, header))[:80] or "nothing"
+            raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
+        for row in table:
+            rows.append(_numbers([row[name] for name in names], table.line_num))
+            lines.append(table.line_num)
     except csv.Error as error:
         raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    found = np.array(rows).reshape(-1, len(names))
-    if not np.isfinite(found).all():
-        raise ValueError("expected at least two lines of finite numbers")
-    return found
+    return np.array(rows).reshape(-1, len(names)), np.array(lines, np.int64)
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:
-    """The numbers of one line of a table."""
-    try:
-        return [float(word) for word in words]  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise ValueError(f"line {line}: expected {len(words)} numbers") from None
+    """Finite numbers of one line of a table."""
+    with suppress(TypeError, ValueError):
+        numbers = [float(word) for word in words]  # type: ignore[arg-type]
+        if all(map(isfinite, numbers)):
+            return numbers
+    got = ", ".join(word or "nothing" for word in words)[:80]
+    raise ValueError(f"line {line}: expected {len(words)} finite numbers, got {got}")

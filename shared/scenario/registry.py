@@ -1,14 +1,14 @@
-"""Tables of what a scenario can name: from a name to what makes it, ours and plug-ins' alike.
+"""Tables of the entries that a scenario can name: policies, shapes, schemes, vehicles and so on.
 
     @trigger
     def slip(now: Situation, mps: Annotated[float, Meta(ge=0)]) -> Flags:
         '''Sends where the velocity is off its plan by more than so many m/s.'''
 
-A table is the decorator of its entries. Name, bounds and the sentence of help are those of the
-function or class itself. The program gives it a fixed number of arguments (here `now`); those
-behind are what a scenario writes in parentheses, as in `slip(0.3)` (`grammar.py`): numbers, and for
-impairments and zones words and names of files, too. Nothing is imported here: `shell.plugins`
-imports plug-ins, before a scenario is read.
+A table is used as the decorator of its entries, built-in or from a plug-in. The entry's name,
+bounds and help come from the decorated function or class. The program passes a fixed number of
+arguments (here `now`); the others are written in the scenario, as in `slip(0.3)` (`grammar.py`):
+numbers, and for impairments and zones also words and file names. `shell.plugins` imports plug-ins
+before a scenario is read.
 """
 
 import inspect
@@ -16,9 +16,10 @@ import keyword
 import math
 import re
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 
 import msgspec
@@ -39,27 +40,38 @@ FURTHER = {
     "min_length": "of a length from",
     "max_length": "of a length up to",
 }
-"""All other bounds, by their names in msgspec.Meta, as a message has them."""
+"""Other bounds, by their names in msgspec.Meta, and their words in messages."""
+
+UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {
+        "bytes_per_s": {"kbit": (1e3, 8.0), "mbit": (1e6, 8.0), "gbit": (1e9, 8.0)},
+        "per_s": {},
+        "_s": {"us": (1.0, 1e6), "ms": (1.0, 1e3), "s": (1.0, 1.0)},
+        "": {"%": (1.0, 100.0)},
+    }
+)
+"""Units that may stand behind a number, by the end of the parameter's name: multiplier, divisor."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
+_WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
 
 
 class File(NamedTuple):
-    """File that a scenario names: annotation and value of a parameter."""
+    """File that a scenario names, with its content: type of a parameter."""
 
     name: str
     content: bytes
 
 
 Files = tuple[File, ...]
-"""Files that a scenario names, as they were when it was read."""
+"""Files that a scenario names, with their contents."""
 
 
 def content(files: Files, name: str) -> bytes:
     """Content of a file that a scenario names.
 
     Raises:
-        ConfigError: it has not been read with the scenario.
+        ConfigError: the file was not read with the scenario.
     """
     for file in files:
         if file.name == name:
@@ -69,28 +81,36 @@ def content(files: Files, name: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number that an entry takes, or one of some words, or the name of a file."""
+    """Parameter of an entry: a number, one of several words, or a file name."""
 
     name: str
     type: Any = float
-    """Type as msgspec converts to it, with bounds: of a number, of words (Literal), or of a text
-    that names a file."""
+    """Type for msgspec, with bounds: number, Literal of words, or str for a file name."""
     default: Value | None = None
-    """Value where none is written; None: one must be."""
+    """Default value; None if the argument is required."""
     is_rest: bool = False
-    """Whether it stands for any number of arguments: all that are left."""
+    """Whether it takes all remaining arguments, as *args."""
 
     def takes(self, value: Any) -> bool:
-        """Whether the parameter may have this value."""
+        """Whether a value is valid for this parameter."""
         try:
             msgspec.convert(value, self.type)
         except msgspec.ValidationError:
             return False
         return isinstance(value, str) or math.isfinite(value)
 
+    def without_unit(self, value: Value | None) -> Value | None:
+        """A number in the parameter's own unit, of one such as 50ms, 10% or 1mbit."""
+        found = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
+        units = next(units for end, units in UNITS.items() if self.name.endswith(end))
+        if found is None or found[2].lower() not in units:
+            return value
+        multiplier, divisor = units[found[2].lower()]
+        return float(found[1]) * multiplier / divisor
+
     @property
     def file(self) -> bool:
-        """Whether the value is the name of a file."""
+        """Whether the parameter is a file name."""
         return _bounds(self.type)[0] is str
 
     def __str__(self) -> str:
@@ -105,14 +125,14 @@ class Parameter:
 
 
 def _bounds(hint: Any) -> tuple[Any, dict[str, Any]]:
-    """Type without its bounds, and the bounds by their names in msgspec.Meta."""
+    """Type without bounds, and the bounds by their names in msgspec.Meta."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     pairs = [(key, getattr(mark, key)) for mark in marks for key in (*LOW, *HIGH, *FURTHER)]
     return kind, {key: bound for key, bound in pairs if bound is not None}
 
 
 def _further(bounds: dict[str, Any]) -> list[str]:
-    """Bounds that are no interval, in words."""
+    """Bounds other than those of an interval, in words."""
     return [f"({FURTHER[key]} {bounds[key]})" for key in FURTHER if key in bounds]
 
 
@@ -121,18 +141,18 @@ class Entry:
     """Entry of a table: a policy, shape or impairment that a scenario can name."""
 
     make: Callable[..., Any]
-    """Function or class that makes it, of what its table gives and of its numbers."""
+    """Function or class; called with the program's arguments, then those of the scenario."""
     parameters: tuple[Parameter, ...]
     about: str
     """First paragraph of its docstring."""
     needs: str = ""
-    """What a scheme must compute for it (`schemes.SchemeProperties.computes`); empty: nothing."""
+    """Figure that a scheme must compute for it (`schemes.SchemeProperties.computes`), or empty."""
     version: str = ""
-    """Digest of a plug-in's file, or name and version of its package; empty for ours."""
+    """Digest of a plug-in's file, or name and version of its package; empty for built-in ones."""
 
     @property
     def source(self) -> str:
-        """Name of the module it is from; of a plug-in that is a file, its path."""
+        """Name of its module; for a plug-in that is a file, the path."""
         return self.make.__module__
 
     @property
@@ -141,28 +161,29 @@ class Entry:
         return self.source.startswith("skytether.")
 
     def bound(self, call: Call) -> tuple[Value, ...] | None:
-        """An argument for each parameter, as written or by default; None where they do not fit."""
-        given: dict[str, Value] = {}
+        """Value for each parameter, from the call or by default; None if a value does not fit."""
+        named: dict[str, Value] = {}
         rest: list[Value] = []
         names = [parameter.name for parameter in self.parameters if not parameter.is_rest]
         for key, value in zip(call.keys or [""] * len(call.values), call.values, strict=True):
-            name = key or next((each for each in names if each not in given), "")
-            if name in names and name not in given:
-                given[name] = value
+            name = key or next((each for each in names if each not in named), "")
+            if name in names and name not in named:
+                named[name] = value
             elif not name and self.parameters and self.parameters[-1].is_rest:
                 rest.append(value)
             else:
                 return None
         values = [
-            *((each, given.get(each.name, each.default)) for each in self.parameters[: len(names)]),
+            *((each, named.get(each.name, each.default)) for each in self.parameters[: len(names)]),
             *((self.parameters[-1], value) for value in rest),
         ]
+        values = [(parameter, parameter.without_unit(value)) for parameter, value in values]
         if not all(value is not None and parameter.takes(value) for parameter, value in values):
             return None
         return tuple(msgspec.convert(value, parameter.type) for parameter, value in values)
 
     def form(self, name: str) -> str:
-        """Grammar of an entry with this name."""
+        """How a scenario writes the entry, with its parameters and bounds, for messages."""
         if not self.parameters:
             return name
         shown = ", ".join(
@@ -179,10 +200,11 @@ class PluginTable(dict[str, Entry]):
     """Entries of one kind by name, and the decorator that adds one.
 
     Args:
-        kind: the noun for an entry, in messages.
-        form: what an entry may look like in a scenario, in messages.
-        given: number of arguments that the program gives to a function; a class is given `class_`.
-        texts: whether entries take words and names of files beside numbers.
+        kind: noun for an entry, for messages.
+        form: example of a text with entries, for messages.
+        given: number of arguments that the program passes to a function.
+        class_: number of arguments that the program passes to a class.
+        texts: whether entries may take words and file names besides numbers.
     """
 
     def __init__(
@@ -194,10 +216,10 @@ class PluginTable(dict[str, Entry]):
         self._given, self._class, self._texts = given, class_, texts
 
     def parse(self, text: str) -> Expression:
-        """Entries combined with & and |, each with an argument for each of its parameters.
+        """Parse entries combined with & and |, and bind their arguments to parameters.
 
         Raises:
-            GrammarError: with the part of the text that is wrong.
+            GrammarError: a part of the text is invalid.
         """
 
         def bound(expression: Expression) -> Expression:
@@ -210,19 +232,19 @@ class PluginTable(dict[str, Entry]):
         return bound(grammar.parse(text, self.form))
 
     def one(self, text: str) -> Call:
-        """The one entry that a text names.
+        """Parse a text that names a single entry.
 
         Raises:
             GrammarError: see `parse`.
         """
-        found = grammar.parse(text, self.form)
-        # Without arguments it is its name alone, which code compares with names.
-        if not isinstance(found, Call) or not (found.keys or text == found.name):
+        call = grammar.parse(text, self.form)
+        # Without arguments, no spaces or parentheses: other code compares the text with names.
+        if not isinstance(call, Call) or not (call.keys or text == call.name):
             raise GrammarError(text, self.form)
-        return self._bound(found)
+        return self._bound(call)
 
     def calls(self, text: str) -> list[Call]:
-        """Entries joined by & alone; none of an empty text.
+        """Parse entries joined by & only; an empty text has none.
 
         Raises:
             GrammarError: see `parse`.
@@ -230,23 +252,23 @@ class PluginTable(dict[str, Entry]):
         return [self._bound(each) for each in grammar.calls(text, self.form)]
 
     def files(self, text: str) -> list[str]:
-        """Files that entries joined by & name.
+        """Names of files in a text of entries joined by &.
 
         Raises:
             GrammarError: see `parse`.
         """
         return [str(value) for call in self.calls(text) for value, file in self._args(call) if file]
 
-    def made(self, call: Call, files: Files = (), *given: object) -> Any:
-        """Make what a bound call describes.
+    def make(self, call: Call, files: Files = (), *given: object) -> Any:
+        """Call the entry's function or class.
 
         Args:
-            call: the call.
+            call: a bound call.
             files: files of the scenario.
-            given: what the program gives.
+            given: arguments from the program, which come first.
 
         Raises:
-            ConfigError: a file of the call has not been read.
+            ConfigError: a file of the call was not read with the scenario.
         """
         args = [
             File(str(value), content(files, str(value))) if file else value
@@ -255,7 +277,7 @@ class PluginTable(dict[str, Entry]):
         return self[call.name].make(*given, *args)
 
     def with_files(self, text: str, change: Callable[[str], str]) -> str:
-        """Entries joined by &, with other names of their files.
+        """Text of entries joined by &, with each file name replaced by `change(name)`.
 
         Raises:
             GrammarError: see `parse`.
@@ -267,39 +289,39 @@ class PluginTable(dict[str, Entry]):
         return text
 
     def with_argument(self, text: str, at: str, value: object) -> str:
-        """A text in which an entry has another argument.
+        """Text with one argument of an entry changed.
 
         Args:
             text: entries combined with & and |.
-            at: name of the entry, and behind a point that of the parameter, or else the first.
-            value: the argument.
+            at: `entry.parameter`, or `entry` for its first parameter.
+            value: new value.
 
         Raises:
             KeyError: there is no such entry, or it has no such parameter.
-            GrammarError: the text does not name the entry, or is wrong itself.
+            GrammarError: the text does not name the entry, or is invalid.
         """
-        found, index = self._argument(text, at)
-        for call in reversed(found):
+        calls, index = self._argument(text, at)
+        for call in reversed(calls):
             values: list[Any] = list(call.values)
             values[index] = value
             text = self._with(text, call, values)
         return text
 
     def argument(self, text: str, at: str) -> Value:
-        """Argument of the first such entry in a text; see `with_argument`."""
-        found, index = self._argument(text, at)
-        return found[0].values[index]
+        """Value of an argument, of the first such entry in a text; see `with_argument`."""
+        calls, index = self._argument(text, at)
+        return calls[0].values[index]
 
     def _argument(self, text: str, at: str) -> tuple[list[Call], int]:
-        """Calls of the entry of an argument in a text, and the index of its parameter."""
+        """All calls of an entry in a text, and the index of the parameter."""
         name, _, key = at.partition(".")
         names = [parameter.name for parameter in self[name].parameters]
         if not names or (key and key not in names):
             raise KeyError(at)
-        found = [each for each in grammar.leaves(self.parse(text)) if each.name == name]
-        if not found:
+        calls = [each for each in grammar.leaves(self.parse(text)) if each.name == name]
+        if not calls:
             raise GrammarError(text, f"{name} in it")
-        return found, names.index(key) if key else 0
+        return calls, names.index(key) if key else 0
 
     def _bound(self, call: Call) -> Call:
         entry = self.get(call.name)
@@ -312,13 +334,13 @@ class PluginTable(dict[str, Entry]):
         return replace(call, values=values, keys=())
 
     def _args(self, call: Call) -> list[tuple[Value, bool]]:
-        """Arguments of a bound call, and whether each is the name of a file."""
+        """Arguments of a bound call, and whether each is a file name."""
         parameters = self[call.name].parameters
         last = len(parameters) - 1
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
 
     def _with(self, text: str, call: Call, values: Sequence[Any]) -> str:
-        """A text with other arguments of a call, every one written out."""
+        """Text in which a call has these values, all of them written out."""
         files = [file for _, file in self._args(call)]
         shown = [
             f'"{value}"' if file else value if isinstance(value, str) else repr(value)
@@ -338,10 +360,10 @@ class PluginTable(dict[str, Entry]):
     def __call__(
         self, make: F | None = None, *, name: str = "", needs: str = ""
     ) -> F | Callable[[F], F]:
-        """Add an entry: `@table`, or `@table(...)` with a name that is not the function's own.
+        """Decorate an entry: `@table`, or `@table(name=..., needs=...)`.
 
         Raises:
-            ConfigError: name or parameters are impossible, or somebody else's entry has the name.
+            ConfigError: name or parameters are invalid, or another module has an entry of the name.
         """
 
         def add(make: F) -> F:
@@ -351,7 +373,7 @@ class PluginTable(dict[str, Entry]):
         return add(make) if make else add
 
     def add(self, make: Callable[..., Any], name: str, needs: str = "") -> None:
-        """Add an entry; that of the same module with this name gives way to it.
+        """Add an entry; it replaces one with the same name from the same module.
 
         Raises:
             ConfigError: see `__call__`.
@@ -359,9 +381,9 @@ class PluginTable(dict[str, Entry]):
         what = f"{self.kind} {name}"
         if not _NAME.fullmatch(name) or keyword.iskeyword(name):
             raise ConfigError(f"{what}: expected a name of letters, digits and _")
-        there = self.get(name)
-        if there and there.source != make.__module__:
-            raise ConfigError(f"{what}: expected another name, {there.source} has one of this name")
+        other = self.get(name)
+        if other and other.source != make.__module__:
+            raise ConfigError(f"{what}: expected another name, {other.source} has one of this name")
         if lacking := sorted(getattr(make, "__abstractmethods__", ())):
             raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
         given = self._class if isinstance(make, type) else self._given
@@ -373,10 +395,10 @@ class PluginTable(dict[str, Entry]):
 def _parameters(
     what: str, make: Callable[..., Any], given: int, *, texts: bool
 ) -> tuple[Parameter, ...]:
-    """Parameters that a function or class takes behind what it is given.
+    """Parameters that a function or class takes after the `given` first ones.
 
     Raises:
-        ConfigError: it takes something else, or not even what it is given.
+        ConfigError: a parameter has an unusable type, or there are fewer than `given`.
     """
     function = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
@@ -395,7 +417,7 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     """Parameter of an entry, with the bounds in its annotation.
 
     Raises:
-        ConfigError: nothing that a scenario writes can be given for it.
+        ConfigError: its type, bounds or default are unusable.
     """
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     default = None if taken.default is taken.empty else taken.default
@@ -406,9 +428,9 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     if not one or not (written or (texts and kind is File)):
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
     for mark in marks:
-        if not isinstance(mark, Meta | str):  # a bound that nobody would check
-            given = f"got {mark!r} with {taken.name}"
-            raise ConfigError(f"{what}: {given}, expected bounds as in msgspec.Meta(ge=0)")
+        if not isinstance(mark, Meta | str):  # a bound of another kind would not be checked
+            got = f"got {mark!r} with {taken.name}"
+            raise ConfigError(f"{what}: {got}, expected bounds as in msgspec.Meta(ge=0)")
     bounds = [mark for mark in marks if isinstance(mark, Meta)]
     bounded: Any = str if kind is File else kind
     if bounds:
@@ -417,8 +439,8 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
         with suppress(msgspec.ValidationError):
             msgspec.convert(0, bounded)
     except TypeError as error:
-        said = str(error).partition(" - ")[0]
-        raise ConfigError(f"{what}: bounds of {taken.name}: {said}") from None
+        reason = str(error).partition(" - ")[0]
+        raise ConfigError(f"{what}: bounds of {taken.name}: {reason}") from None
     parameter = Parameter(taken.name, bounded, default, is_rest)
     if default is not None and not parameter.takes(default):
         raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {parameter}")
@@ -431,26 +453,28 @@ PERIOD_MAX = 1_000_000
 TRIGGERS = PluginTable(
     "policy", "policies such as 'state_gap & budget(5, 2) | silence(1)'", given=1, class_=2
 )
-"""Policies of `control.trigger`. A function is given a `triggers.Situation` at each step; a class
-the control section and the largest number of vehicles, once. See `shared.scenario.triggers`."""
+"""Policies of `control.trigger`. A function is called with a `triggers.Situation` at each step; a
+class once, with the control section and the largest number of vehicles. See
+`shared.scenario.triggers`."""
 REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'", given=1, class_=1)
-"""Policies of `vehicle.report`, given an `observing.Unreported` at each step. See
-`shared.scenario.observing`; no plug-in adds to them."""
+"""Policies of `vehicle.report`, called with an `observing.Unreported` at each step. See
+`shared.scenario.observing`; plug-ins cannot add any."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
-"""Shapes of `reference.shape`, given the `Scenario`. See `shared.scenario.trajectories`."""
+"""Shapes of `reference.shape`, called with the `Scenario`. See `shared.scenario.trajectories`."""
 SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'", given=0, class_=1)
-"""Schemes of `control.scheme`: of ours a function that says its properties, of a plug-in the class
-itself, given a `server.common.scheme.Fleet`. See `shared.scenario.schemes`."""
+"""Schemes of `control.scheme`. A built-in one is a function that returns its properties; a
+plug-in's is the class itself, called with a `server.common.scheme.Fleet`. See
+`shared.scenario.schemes`."""
 VEHICLES = PluginTable(
     "vehicle", "a vehicle such as 'simulated', or 'name(1.5)'", given=2, class_=2
 )
-"""Vehicles of `vehicle.kind`, given the `Scenario` and the vehicle's number. See
+"""Vehicles of `vehicle.kind`, called with the `Scenario` and the vehicle's number. See
 `client.vehicles`."""
 ZONES = PluginTable(
     "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
 )
-"""Zones of a mission, each a function that gives a list of them. See `shared.scenario.zones`; no
-plug-in adds to them."""
+"""Zones of `mission.zones`: functions that return a list of zones. See `shared.scenario.zones`;
+plug-ins cannot add any."""
 IMPAIRMENTS = PluginTable(
     "impairment",
     "impairments such as 'constant(0.05) & loss(0.1)'",
@@ -460,4 +484,4 @@ IMPAIRMENTS = PluginTable(
 )
 """Impairments of a direction of the network: classes. See `shared.scenario.air`."""
 TABLES = (SCHEMES, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
-"""All tables that plug-ins add to."""
+"""Tables to which plug-ins can add entries."""

@@ -1,12 +1,12 @@
 """Keys of a scenario: everything about a flight, typed and frozen.
 
-A key is written in one place, here: its name, its owner (`owners.py`) and type with bounds, its
-default, and a sentence with its unit in brackets. The sentence is the flag's in `--help`, and the
-key's in docs/keys.md, which `make keys` writes. A `Term` belongs to both ends: it has a field in
-`shared/law/terms.py: Terms`, and is put there by `Scenario.terms`.
+A key is defined here alone: name, owner (`owners.py`), type with bounds, default, and a description
+with its unit in brackets. The description appears in `--help` and in docs/keys.md, which
+`make keys` writes. A `Term` is used by both ends: it has a field in `shared/law/terms.py: Terms`,
+which `Scenario.terms` fills in.
 
-`reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are
-right one by one and impossible together.
+`reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are each
+valid, but not together.
 """
 
 import hashlib
@@ -55,38 +55,38 @@ from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
-# Bounds of numbers lie far beyond any vehicle, and near enough that no time overflows its 63 bits
-# of nanoseconds, and no product of some of them a float.
+# Bounds of numbers lie far beyond any vehicle, and low enough that no time overflows 63 bits of
+# nanoseconds and no product of several values overflows a float.
 Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
-"""Property of a vehicle, from a thousandth of its unit to a thousand."""
+"""Positive property of a vehicle, from 0.001 to 1000 of its unit."""
 Factors = Factor | tuple[Factor, ...]
-"""Property of a vehicle on each axis: one for all axes, or one each."""
+"""Property of a vehicle: one number for all axes, or one each."""
 DeadTime = Annotated[float, Meta(ge=0, le=2)]
-"""Dead time that both ends reckon with [s]."""
+"""Dead time of the model [s]."""
 TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
-"""Dead time that a vehicle has [s]."""
+"""True dead time of a vehicle [s]."""
 Strength = Annotated[float, Meta(ge=0, le=1e3)]
-"""Property that may be missing: from nothing to a thousand of its unit."""
+"""Property that may be 0, up to 1000 of its unit."""
 Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
-"""Speed either way along an axis [m/s]."""
+"""Signed speed along an axis [m/s]."""
 Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
 """Coordinate [m]."""
 Amount = Annotated[float, Meta(ge=0, le=1e9)]
 """Weight, cost or tolerance of any unit."""
 Duration = Annotated[float, Meta(ge=0, le=3600)]
-"""Time from nothing to an hour [s]."""
+"""Time from 0 to an hour [s]."""
 Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
 """Time from a millisecond to an hour [s]."""
 MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
 """Mean of a random time [s]."""
 Text = Annotated[str, Meta(max_length=TEXT_MAX)]
-"""Text that names what is in a table of `registry.py`."""
+"""Text of entries in a table of `registry.py`."""
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
-"""Text of a direction's impairments."""
+"""Text of the impairments in one direction."""
 
 
-SHAPE_TOLD = 15
-"""Number of characters of a plug-in's shape that the other end is told, beside a digest."""
+SHAPE_CHARS = 15
+"""Number of characters of a plug-in's shape in the terms, before its digest."""
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -117,29 +117,29 @@ class ControlConfig(Section, frozen=True):
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
     scheme: Term[Text] = "trajectory"
-    """Delay compensation, see `skytether schemes`. With `trajectory` the vehicle follows what is
-    sent by itself, with the regulator that the weights in its own scenario ask for."""
+    """Delay compensation, see `skytether schemes`. With `trajectory` the vehicle follows the sent
+    trajectory by a regulator aboard, made from the weights in the vehicle's own scenario."""
     feedback: Term[bool] = True
-    """Whether a horizon carries the state that it starts from and a feedback gain, with which the
-    vehicle comes back to the predicted states. A vehicle that can only play inputs back needs
+    """Whether a horizon carries its initial state and a feedback gain, with which the vehicle
+    corrects deviations from the predicted states. A vehicle that can only play back inputs needs
     false, and an `input_weight` of 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
     """Longest time from making a horizon to flying it [s]; auto: as measured in flight."""
     observer_s: OfServer[Duration] = 4.0
-    """Time constant of the disturbance observer, which learns steady wind and a wrong gain [s]; it
-    is longer where observations are old. 0, and the scheme "none": no observer."""
+    """Time constant of the disturbance observer, which estimates steady wind and a wrong gain [s];
+    longer if observations are old. 0, and always with the scheme "none": no observer."""
     trigger: OfTrigger[Text] = "expected_gap | heartbeat"
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
     argument of one is also a key: `control.trigger.expected_gap = 0.1`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
-    """Bytes a second that the server sends to all its vehicles together, headers of IP and UDP
-    included; of the horizons that the trigger asks for, those expected to gain most a byte go
-    first [B/s]. auto: as many as go without queueing; 0: no bound."""
+    """Largest data rate of the server to all its vehicles together, IP and UDP headers included
+    [B/s]. Of the horizons that the trigger asks for, those that are expected to gain most per byte
+    are sent first. auto: the largest rate without queueing, as measured; 0: no limit."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
-    """Largest distance of a spline from the desired trajectory that the server sees [m], as far as
-    16 knots reach, with the scheme "trajectory"."""
+    """Largest distance of a spline from the trajectory it approximates, unless 16 knots are too few
+    [m]; with the scheme "trajectory"."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
@@ -154,16 +154,16 @@ class ControlConfig(Section, frozen=True):
 
     @property
     def properties(self) -> SchemeProperties:
-        """What the scheme says of itself.
+        """Properties of the scheme.
 
         Raises:
-            GrammarError: there is none such.
+            GrammarError: there is no such scheme.
         """
         return schemes.properties(self.scheme)
 
 
 MISSIONS = ("swap", "sphere", "mission")
-"""Shapes of the desired trajectory that are goals of several vehicles, which keep apart."""
+"""Shapes that are missions: goals of several vehicles, which keep apart."""
 TABLES = ("csv", "mission")
 """Shapes that are read from `reference.file`."""
 
@@ -175,13 +175,13 @@ class ReferenceConfig(Section, frozen=True):
     """Shape of the desired trajectory, see `skytether references`; target: a random walk that only
     the server knows; live: a point that is moved in flight."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
-    """Time for which the server knows the desired trajectory ahead [s]; it predicts what lies
-    beyond, and always predicts a live point."""
+    """Time for which the server knows the desired trajectory ahead [s]. It extrapolates after that,
+    and always extrapolates a live point."""
     agility: OfServer[Strength] = 0.3
     """Strength of the white acceleration that moves a target [m/s per √s]."""
     turn_every_s: OfServer[Duration] = 0.0
-    """Mean time between turns of a target [s]. Its velocity changes at turns alone, by as much as
-    `agility` would have changed it in that time; 0: it changes all the time."""
+    """Mean time between turns of a target [s]. Its velocity changes at turns only, by as much as
+    `agility` would have changed it since the last turn; 0: it changes all the time."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of circle, figure-eight, square, swap and sphere, and of the area of a target
     [m]."""
@@ -195,27 +195,27 @@ class ReferenceConfig(Section, frozen=True):
     """Waypoints [m], at least two; the one point to hover at; the first position of a live
     point."""
     velocity_mps: Annotated[tuple[Speed, ...], Key(Owner.SERVER, InFlight.POINT)] = ()
-    """Velocity of a live point [m/s]; left out: estimated from its moves."""
+    """Velocity of a live point [m/s]; default: estimated from its moves."""
     speed_mps: Term[Factor] = 1.0
     """Speed between waypoints, and the largest of a target along an axis [m/s]."""
     loop: Term[bool] = False
     """Whether the vehicle returns from the last waypoint to the first and goes round again."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """CSV file with the columns t, x, y (and z), of a mission also vehicle, relative to the
-    scenario's own folder."""
+    """CSV file with the columns t, x, y (and z), for a mission also vehicle; its path is relative
+    to the scenario's folder."""
 
 
 class VehicleConfig(Section, frozen=True):
-    """The UAV, as far as it is simulated, and its failsafe without fresh horizons."""
+    """The UAV: its simulation, what it reports, and its failsafe."""
 
     kind: OfVehicle[Text] = "simulated"
     """Vehicle that flies, see `skytether vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
-    """Line to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
+    """Connection to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""
     memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
-    """Folder in which its client keeps what it needs to go on after a restart; auto: the state
-    folder of its service or user, for a vehicle with an autopilot; none: it keeps nothing."""
+    """Folder in which the client saves what it needs to continue after a restart; auto: the state
+    folder of its service or user, for a vehicle with an autopilot; none: nothing is saved."""
     report: OfVehicle[Text] = "deviation(0.05) | silence(1)"
     """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
@@ -228,31 +228,31 @@ class VehicleConfig(Section, frozen=True):
     land_after_s: Term[Duration] = 10.0
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     on_loss: OfVehicle[Literal["land", "return"]] = "land"
-    """What it does `land_after_s` after it has begun to hover with a silent server: it lands where
-    it is, or its autopilot flies it home and lands it there."""
+    """Action after hovering for `land_after_s` with a silent server: land in place, or return:
+    the autopilot flies home and lands there."""
     after_leap: Annotated[
         Literal["ask", "old", "new", "stay"], Key(Owner.VEHICLE, InFlight.LEAP)
     ] = "ask"
-    """Choice after a leap of the position, given in flight alone: old (the leap is subtracted, the
-    fence stays where it was), new (it counts, and the fence moves with it), or stay (it hovers on).
-    Without one the vehicle lands after `land_after_s`; see docs/failsafe.md."""
+    """Choice after a leap of the position, made in flight only: old (subtract the leap; the fence
+    stays), new (accept the leap; the fence moves with it), or stay (hover on). Without a choice the
+    vehicle lands after `land_after_s`; see docs/failsafe.md."""
     tau_s: OfVehicle[tuple[Factor, ...]] = ()
-    """True time constant [s], one for all axes, or one each; left out: the model's."""
+    """True time constant [s]: one for all axes, or one each; default: the model's."""
     gain: OfVehicle[Factors] = ()
-    """True gain of the velocity loop, one for all axes, or one each; left out: the model's."""
+    """True gain of the velocity loop: one for all axes, or one each; default: the model's."""
     dead_time_s: OfVehicle[TrueDeadTime | tuple[TrueDeadTime, ...]] = ()
-    """True dead time before an input takes effect [s], one for all axes, or one each; left out: the
+    """True dead time before an input takes effect [s]: one for all axes, or one each; default: the
     model's."""
     start_m: OfVehicle[tuple[Position, ...]] = ()
-    """Position at the start, at rest [m]; left out: that of the reference."""
+    """Position at the start, at rest [m]; default: that of the reference."""
     wind: OfWind[Strength] = 0.0
     """Strength of random wind, a white acceleration [m/s per √s]."""
     steady_wind_mps: OfWind[tuple[Speed, ...]] = ()
-    """Velocity that steady wind adds in the long run, for each axis [m/s]; left out: none. For a
-    quadrotor, the wind's own velocity."""
+    """Steady-state velocity that constant wind adds, for each axis [m/s]; default: none. For a
+    quadrotor, the velocity of the wind itself."""
     turbulence_mps: OfWind[Strength] = 0.0
-    """Wind speed 6 m above ground whose turbulence a quadrotor flies in, by Dryden's model [m/s];
-    0: none."""
+    """Wind speed 6 m above ground, for the Dryden turbulence of a quadrotor [m/s]; 0: no
+    turbulence."""
     gust_mps2: OfWind[Strength] = 0.0
     """Acceleration by a gust [m/s²]; 0: no gusts."""
     gust_every_s: OfWind[MeanTime] = 10.0
@@ -260,38 +260,40 @@ class VehicleConfig(Section, frozen=True):
     gust_s: OfWind[MeanTime] = 1.0
     """Mean length of a gust [s]."""
     frame: OfVehicle[Literal["auto", "crazyflie", "1.5kg", "sih"]] = "auto"
-    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, and of an autopilot the one that
-    its own simulator flies."""
+    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, and with an autopilot the frame of
+    its own simulator."""
     battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
-    """Charge of a quadrotor's battery at the start, from 0 to 1; endless: it stays full."""
+    """Charge of a quadrotor's battery at the start, from 0 to 1; endless: always full."""
 
 
 class FenceConfig(Section, frozen=True):
-    """Fence: where the vehicle never goes, whatever it is told.
+    """Fence that the vehicle does not leave, whatever inputs it receives.
 
-    The vehicle goes by its own file; a server whose file has a fence refuses what leads over it.
+    The vehicle uses the fence in its own scenario. A server whose scenario has a fence refuses
+    desired trajectories that cross it.
     """
 
     low_m: OfEach[tuple[Position, ...]] = ()
-    """Lowest position on each axis [m]; left out: no bound. In space the third is the altitude."""
+    """Lowest position on each axis [m]; default: no bound. With three axes the third is
+    altitude."""
     high_m: OfEach[tuple[Position, ...]] = ()
-    """Highest position on each axis [m]; left out: no bound."""
+    """Highest position on each axis [m]; default: no bound."""
     radius_m: OfEach[Strength] = 0.0
     """Largest distance from where it started [m]; 0: no bound."""
     speed_mps: OfEach[Strength] = 0.0
     """Largest desired speed, over all axes [m/s]; 0: no bound but `model.u_max`."""
     wind_mps: OfEach[Annotated[float, Meta(ge=0, le=100)]] = 1.0
-    """Velocity that wind, or an error of the gain, adds at most while the fence holds [m/s]: the
-    stronger, the further inside the vehicle is kept."""
+    """Largest velocity that wind or an error of the gain may add without carrying the vehicle over
+    the fence [m/s]: the larger, the wider the margin inside the fence."""
 
     @property
     def is_there(self) -> bool:
-        """Whether anything is fenced in."""
+        """Whether the fence has any bound."""
         return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
 
 
 class MissionConfig(Section, frozen=True):
-    """Vehicles with goals of their own, which keep apart whichever packets are lost.
+    """Mission: several vehicles with goals, which keep apart whichever packets are lost.
 
     See docs/together.md.
     """
@@ -299,26 +301,27 @@ class MissionConfig(Section, frozen=True):
     separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance of two that are one above the other [m], for downwash: 0, for the same, or
-    at least `separation_m`."""
+    """Smallest distance between two vehicles, one above the other, for downwash [m]: at least
+    `separation_m`, or 0 for the same value."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
-    """Largest distance of a vehicle from the motion that it flies [m]: wind, tracking."""
+    """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
     speed_mps: OfServer[Strength] = 0.0
     """Largest speed of a motion, over all axes [m/s]; 0: no bound but `model.u_max`."""
     acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
     """Largest acceleration of a motion on an axis [m/s²]."""
     allocate: OfServer[bool] = False
-    """Whether goals of one time go to the vehicles that are nearest to them; all have one then."""
+    """Whether the goals of each time are assigned to the nearest vehicles; every vehicle then needs
+    a goal at each time."""
     goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.GOALS)] = ""
-    """Goals of vehicles in place of those of the mission, as they are given in flight:
-    goal(vehicle, x, y), or with z in space, combined with &."""
+    """Goals that replace those of the mission, also in flight: goal(vehicle, x, y), with three axes
+    goal(vehicle, x, y, z), combined with &."""
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
-    """Places to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
+    """Zones to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
     radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
 
     @property
     def height_scale(self) -> float:
-        """Factor of distances along the third axis before they count for `separation_m`."""
+        """Factor on distances along the third axis, before comparison with `separation_m`."""
         return self.separation_m / self.height_m if self.height_m else 1.0
 
 
@@ -326,65 +329,64 @@ class SensorConfig(Section, frozen=True):
     """Sensors of the vehicle, and the filter of their measurements."""
 
     filter: OfVehicle[Literal["kalman", "none"]] = "kalman"
-    """Filter between sensors and flight: a Kalman filter, or none, where each measurement is taken
-    as it is. With perfect measurements both are the same."""
+    """Filter of the measurements: a Kalman filter, or none. With perfect measurements at every step
+    both give the same state."""
     position_noise_m: OfVehicle[Strength] = 0.0
     """Standard deviation of the noise of a position [m]."""
     velocity_noise_mps: OfVehicle[Strength] = 0.0
     """Standard deviation of the noise of a velocity [m/s]."""
     position_bias_m: OfVehicle[tuple[Position, ...]] = ()
-    """Constant error of each position, for each axis [m]; left out: none."""
+    """Constant error of the positions, for each axis [m]; default: none."""
     velocity_bias_mps: OfVehicle[tuple[Speed, ...]] = ()
-    """Constant error of each velocity, for each axis [m/s]; left out: none."""
+    """Constant error of the velocities, for each axis [m/s]; default: none."""
     position_every_s: OfVehicle[Duration] = 0.0
-    """Time from one measured position to the next [s]; 0: one at every step."""
+    """Time between two measured positions [s]; 0: one at every step."""
     velocity_every_s: OfVehicle[Duration | Literal["never"]] = 0.0
-    """Time from one measured velocity to the next [s]; 0: one at every step; never: positions
-    alone are measured."""
+    """Time between two measured velocities [s]; 0: one at every step; never: only positions are
+    measured."""
     delay_s: OfVehicle[Annotated[float, Meta(ge=0, le=2)]] = 0.0
-    """Time from measuring to having the measurement [s]."""
+    """Delay of the measurements [s]."""
     process_noise: OfVehicle[Factor] = 0.1
-    """Strength of the white acceleration that the filter assumes [m/s per √s]: for wind, and for
-    all differences between vehicle and model."""
+    """Strength of the white acceleration that the filter assumes, for wind and model errors
+    [m/s per √s]."""
 
 
 class MavlinkConfig(Section, frozen=True):
     """Autopilot that speaks MAVLink, of a vehicle of the kind `mavlink`."""
 
     system: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 245
-    """Number of our own system in MAVLink; ArduPilot's ground-station failsafe must listen to
+    """MAVLink system number of the client; ArduPilot's ground-station failsafe must listen to
     it."""
     component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
-    """Number of our own component in MAVLink; 191 is that of an onboard computer."""
+    """MAVLink component number of the client; 191 is an onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
-    """Number of the autopilot's system; 0: the first that is heard."""
+    """MAVLink system number of the autopilot; 0: the first that sends a heartbeat."""
     positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
-    """Number of positions a second that the autopilot is asked for."""
+    """Rate of positions that the client requests from the autopilot [Hz]."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
-    """Time without a position of the autopilot after which the vehicle brakes [s]."""
+    """Time without a position from the autopilot after which the vehicle brakes [s]."""
     battery_min: OfVehicle[Annotated[float, Meta(ge=0, le=1)]] = 0.2
     """Charge of the battery below which the vehicle lands, from 0 to 1."""
     battery_min_v: OfVehicle[Annotated[float, Meta(ge=0, le=100)]] = 0.0
-    """Voltage of the battery below which the vehicle lands [V]; 0: at none."""
+    """Voltage of the battery below which the vehicle lands [V]; 0: no limit."""
     takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
-    """Altitude to take off to [m]; auto: that at which the desired trajectory begins, and 3 m in
-    the plane."""
+    """Take-off altitude [m]; auto: that of the start of the desired trajectory, or 3 m with two
+    axes."""
     origin: Annotated[
         Literal["takeoff", "autopilot"] | tuple[Position, ...],
         Key(Owner.VEHICLE, InFlight.ORIGIN),
     ] = "takeoff"
-    """Origin of the flight: the point where we arm the vehicle, the autopilot's own local origin,
-    or a place in the autopilot's local frame: north, east (and up) [m]. On a mission a vehicle is
-    armed where it begins: that point is its first goal, on the ground. With `takeoff` a client that
-    begins while the vehicle is in the air knows its origin from `vehicle.memory`; else the vehicle
-    hovers until this key is set."""
+    """Origin of the scenario: `takeoff`, the point where the vehicle is armed; `autopilot`, the
+    autopilot's local origin; or a point in the autopilot's local frame: north, east (and up) [m].
+    On a mission the point of arming is the vehicle's first goal, on the ground. With `takeoff`, a
+    client that starts while the vehicle is in the air reads the origin from `vehicle.memory`; if
+    that has none, the vehicle hovers until this key is set."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
-    """Answer to somebody else who commands the autopilot, or to a vehicle that does not do what it
-    is told: it brakes, and lands if that goes on; or it yields, as to a pilot, until that is
-    over."""
+    """Reaction if somebody else commands the autopilot, or if the vehicle does not follow its
+    commands: brake, and land if that goes on; or yield, as to a pilot, until it is over."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
-    """Time that the autopilot may take until it is heard, and for each step on its way into the
-    air [s]."""
+    """Longest wait for the autopilot's first message, and for each step of arming and take-off
+    [s]."""
 
 
 class NetworkConfig(Section, frozen=True):
@@ -396,7 +398,7 @@ class NetworkConfig(Section, frozen=True):
     downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
     """Impairments from vehicle to server, in the same way."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
-    """Longest UDP payload that passes [B]: 1472 fill an Ethernet frame."""
+    """Largest UDP payload that passes [B]; 1472 fills an Ethernet frame."""
 
 
 class LinkConfig(Section, frozen=True):
@@ -404,38 +406,38 @@ class LinkConfig(Section, frozen=True):
 
     heartbeat_s: OfEach[Interval | Literal["auto"]] = "auto"
     """Longest time between two packets that this end asks of the other [s]; auto: from its
-    `timeout_s` and the share of packets that are lost on the way to it."""
+    `timeout_s` and the measured loss rate towards it."""
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
-    """Largest age of the observation behind an input [s]; beyond it the vehicle brakes and hovers,
-    or holds its last input where `vehicle.exhausted` says so."""
+    """Largest age of the observation behind an input [s]; after that the vehicle brakes and hovers,
+    or holds its last input with `vehicle.exhausted = "hold"`."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Time after its first knot up to which the vehicle takes a trajectory [s]; 0: at any time. It
-    tells the server for certain which one is flown."""
+    """Time after a trajectory's first knot during which the vehicle accepts it [s]; 0: always. With
+    a limit the server knows for certain which trajectory is flown."""
     asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Largest difference of the smallest delays to a vehicle and from it over 20 s [s]; 0: not
-    known. It bounds the error of the vehicle's clock; the server watches whether it holds."""
+    """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
+    unknown. It bounds the error of the vehicle's clock; the server checks whether it holds."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission: the host's clock, to within the error that its kernel
-    tells, as chrony sets it; where both ends have one, the vehicle's clock is known by that."""
+    """Source of the time of day on a mission. host: the host's clock, with the error bound of its
+    kernel, as set by chrony. If both ends have it, the server knows the vehicle's clock from it."""
     timeout_s: OfEach[Interval] = 1.5
-    """Time of silence after which the vehicle takes the server for gone [s]: it brakes and says
-    HELLO again. After the same time, or twice that with heartbeats "auto", the server lets
-    another client have the vehicle's number."""
+    """Time of silence after which the vehicle takes the server as lost, brakes and sends HELLO
+    again [s]. After this time, or twice this time with heartbeats "auto", the server gives the
+    vehicle's number to another client that asks for it."""
     connect_s: OfVehicle[Interval] = 120.0
-    """Time for which the vehicle waits for its first session before it gives up [s]; a server that
-    starts for the first time compiles for up to a minute."""
+    """Longest wait of the vehicle for its first session [s]; a server that starts for the first
+    time compiles for up to a minute."""
 
     @property
     def fixed_ns(self) -> int | None:
-        """`heartbeat_s` [ns]; None where it follows the loss."""
+        """`heartbeat_s` [ns]; None with "auto"."""
         return None if self.heartbeat_s == "auto" else seconds_to_ns(self.heartbeat_s)
 
     @property
     def patience_ns(self) -> int:
-        """Time of silence after which the server takes a vehicle for gone [ns].
+        """Time of silence after which the server takes a vehicle as lost [ns].
 
-        A vehicle brakes when its server is silent. The server only keeps the vehicle's number from
-        another client, so it can wait longer, and then needs half as many heartbeats.
+        A vehicle brakes if its server is silent. The server only reserves the vehicle's number, so
+        it can wait longer, and then needs half as many heartbeats.
         """
         timeout_ns = seconds_to_ns(self.timeout_s)
         if self.fixed_ns is not None:
@@ -447,30 +449,30 @@ class SimulationConfig(Section, frozen=True):
     """Computing time and clocks in virtual time."""
 
     compute_s: OfVirtualTime[Duration] = 0.001
-    """Time that the server takes for a step [s]."""
+    """Computing time of the server for a step [s]."""
     clock_offset_s: OfVirtualTime[Annotated[float, Meta(ge=-1e9, le=1e9)]] = 0.0
     """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
-    """Drift: how much faster the vehicle's clock runs than the server's [ppm]."""
+    """Drift of the vehicle's clock, positive if it runs faster than the server's [ppm]."""
     time_error_s: OfVirtualTime[Duration] = 0.0
-    """Largest error of the time of day of each end of a mission [s]; 0: none knows it. It is as
-    wrong as it may be, at the server and at every second vehicle the other way."""
+    """Error of the time of day at each end of a mission [s]: positive at odd vehicles, negative at
+    the server and at even ones; 0: no end has a time of day."""
 
 
 class Scenario(Section, frozen=True):
     """Scenario: all keys of a flight."""
 
     title: OfEach[str] = ""
-    """Title: what the scenario shows, in a line."""
+    """Title of the scenario, in one line."""
     duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
     """Length of the flight [s]."""
     settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
-    """Time at the start that RMSE leaves out [s]; half of the duration where it is no shorter than
-    that."""
+    """Time at the start that RMSE leaves out [s]; if it is not shorter than the flight, half of the
+    flight."""
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
-    """Seed of everything random: delays, losses, wind."""
+    """Seed of all random numbers: delays, losses, wind."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True
-    """Whether plans may be flown; disarmed, the vehicle stays where it is."""
+    """Whether plans may be flown; disarmed, the vehicle brakes and stays."""
     model: ModelConfig = ModelConfig()
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
@@ -493,7 +495,7 @@ class Scenario(Section, frozen=True):
         """Content of `reference.file`, for a shape that is read from it; else empty.
 
         Raises:
-            ConfigError: the file has not been read with the scenario.
+            ConfigError: the file was not read with the scenario.
         """
         file = self.reference.file
         return content(self.files, file) if self.reference.shape in TABLES else b""
@@ -503,7 +505,7 @@ class Scenario(Section, frozen=True):
         """Impairments from server to vehicle.
 
         Raises:
-            GrammarError: there are none such.
+            GrammarError: the text is invalid.
         """
         return air.path(self.network.uplink, self.files)
 
@@ -524,7 +526,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def settled_s(self) -> float:
-        """Time of flight from which RMSE counts [s]."""
+        """Time at which RMSE begins [s]."""
         return self.settle if self.settle < self.duration else self.duration / 2.0
 
     @property
@@ -555,8 +557,8 @@ class Scenario(Section, frozen=True):
     @property
     def true_dead_time_s(self) -> Array:
         """The vehicle's dead times [s]; shape (axes,)."""
-        given = self.vehicle.dead_time_s
-        return self._per_axis(self.model.dead_time_s if given == () else given)
+        own = self.vehicle.dead_time_s
+        return self._per_axis(self.model.dead_time_s if own == () else own)
 
     def _per_axis(self, values: float | tuple[float, ...]) -> Array:
         return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
@@ -590,35 +592,35 @@ class Scenario(Section, frozen=True):
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """The desired trajectory of a vehicle, by its number; each has a target of its own."""
-        made = self.given_reference(vehicle)
-        if isinstance(made, Mission) and self.mission.allocate:
-            return made.allocated().of(vehicle)
-        return made
+        """Desired trajectory of a vehicle, by its number; with the shape "target" each differs."""
+        reference = self.unallocated_reference(vehicle)
+        if isinstance(reference, Mission) and self.mission.allocate:
+            return reference.allocated().of(vehicle)
+        return reference
 
-    def given_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """The desired trajectory of a vehicle; on a mission, before goals are allocated."""
-        shape, flown = REFERENCES.one(self.reference.shape), self
+    def unallocated_reference(self, vehicle: int = 1) -> shapes.Reference:
+        """Desired trajectory of a vehicle; on a mission, before goals are allocated."""
+        shape, scenario = REFERENCES.one(self.reference.shape), self
         if shape.name == "target" and vehicle != 1:
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
-            flown = msgspec.structs.replace(self, seed=seed)
-        made: shapes.Reference = REFERENCES[shape.name].make(flown, *shape.values)
-        return made.of(vehicle) if isinstance(made, Mission) else made
+            scenario = msgspec.structs.replace(self, seed=seed)
+        reference: shapes.Reference = REFERENCES[shape.name].make(scenario, *shape.values)
+        return reference.of(vehicle) if isinstance(reference, Mission) else reference
 
     def start_m(self, vehicle: int = 1) -> Array:
-        """Position where a vehicle begins [m]; shape (axes,)."""
+        """Position of a vehicle at the start [m]; shape (axes,)."""
         if self.vehicle.start_m:
             return np.array(self.vehicle.start_m)
-        return self.given_reference(vehicle)(np.zeros(()))[:, 0]
+        return self.unallocated_reference(vehicle)(np.zeros(()))[:, 0]
 
     @property
     def is_mission(self) -> bool:
-        """Whether vehicles have goals of their own, and keep apart."""
+        """Whether the flight is a mission: several vehicles with goals, which keep apart."""
         return self.reference.shape.partition("(")[0].strip() in MISSIONS
 
     @property
     def clearances(self) -> Clearances:
-        """Distances that motions of a mission keep."""
+        """Distances between motions of a mission, and from zones."""
         mission = self.mission
         most_mps2 = float(np.sqrt(self.model.axes)) * mission.acceleration_mps2
         return Clearances(
@@ -629,48 +631,49 @@ class Scenario(Section, frozen=True):
 
     @property
     def lands(self) -> bool:
-        """Whether vehicles of a mission in space land by themselves when they hear nothing."""
+        """Whether vehicles of a mission with three axes land if the server is silent."""
         return self.is_mission and self.model.axes > 2 and self.vehicle.land_after_s > 0.0
 
     @property
     def rest_scale(self) -> float:
-        """Factor of distances along the third axis where vehicles rest: 0 if they may land."""
+        """Factor on distances along the third axis between vehicles at rest: 0 if they may land."""
         return 0.0 if self.lands else self.mission.height_scale
 
     @property
     def zones(self) -> Zones:
-        """Zones of a mission; nobody who may land is above one.
+        """Zones of a mission; without an upper end if vehicles may land, which keeps them from
+        landing in one.
 
         Raises:
-            GrammarError: there are none such.
+            GrammarError: the text is invalid.
         """
-        found = zones.parse(self.mission.zones, self.model.axes, self.files)
-        return found.to_the_sky() if self.lands else found
+        parsed = zones.parse(self.mission.zones, self.model.axes, self.files)
+        return parsed.to_the_sky() if self.lands else parsed
 
     def entries(self) -> Iterator[Entry]:
-        """Scheme, policies and shape that the scenario names."""
+        """Entries of the scheme, the policies of the trigger, the shape and the vehicle."""
         yield SCHEMES[schemes.call(self.control.scheme).name]
         for policy in leaves(TRIGGERS.parse(self.control.trigger)):
             yield TRIGGERS[policy.name]
         yield REFERENCES[REFERENCES.one(self.reference.shape).name]
         flies = self.vehicle.kind.partition("(")[0].strip()
-        if flies in VEHICLES:  # ours are there once there is a client
+        if flies in VEHICLES:  # built-in ones are registered by the client, which may be missing
             yield VEHICLES[flies]
 
     def _shape(self) -> str:
-        """Shape as both ends compare it: its name, or for a plug-in its text and a digest."""
+        """Shape as a term: its name; for a plug-in, its text and a digest of its states."""
         shape = REFERENCES.one(self.reference.shape)
         if REFERENCES[shape.name].is_ours:
             return shape.name
-        given = shapes.sampled(self.given_reference(), self.model.axes)
-        return f"{str(shape)[:SHAPE_TOLD]} {_digest(f'{shape}'.encode() + given)}"
+        states = shapes.sampled(self.unallocated_reference(), self.model.axes)
+        return f"{str(shape)[:SHAPE_CHARS]} {_digest(f'{shape}'.encode() + states)}"
 
 
 class WithFiles(Scenario, frozen=True):
-    """Scenario that names files, as `reading.py` has read it."""
+    """Scenario with the files that it names, made by `reading.py`."""
 
     contents: Files = ()
-    """The files that it names."""
+    """Files that the scenario names."""
 
     @property
     def files(self) -> Files:
@@ -679,5 +682,5 @@ class WithFiles(Scenario, frozen=True):
 
 
 def _digest(content: bytes) -> str:
-    """A short text that differs where the content does, "none" of nothing."""
+    """Digest of some content as 16 hex digits; "none" if it is empty."""
     return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"

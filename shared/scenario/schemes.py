@@ -1,7 +1,7 @@
-"""Table of the schemes of delay compensation, with the properties of each.
+"""Table of the schemes of delay compensation, with their properties.
 
-One of ours has its code in the module of its name in `server.schemes`. One of a plug-in is a class
-of `skytether.plugin_scheme` with `properties`.
+The code of a built-in scheme is the module of its name in `server.schemes`. A plug-in's scheme is a
+class that extends one of `skytether.plugin_scheme` and has `properties`.
 """
 
 from typing import NamedTuple
@@ -14,24 +14,25 @@ scheme = SCHEMES
 """Decorator of a scheme."""
 
 HELD = "held"
-"""Need of a trigger that reads the inputs which the vehicle flies if nothing is sent."""
+"""Need of a trigger that reads the inputs that the vehicle flies if nothing is sent."""
 FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
-"""Figures of a plan that a scheme may compute, and the columns of the record that have them."""
+"""Figures of a plan that a scheme may compute; also names of columns in the record."""
 
 
 class SchemeProperties(NamedTuple):
     """Properties of a scheme that other modules depend on."""
 
     flown_as: str = "predictive"
-    """How a vehicle flies its messages, one of `shared.law.terms.FLOWN_AS`."""
+    """Built-in scheme as which the vehicle flies its messages, one of
+    `shared.law.terms.FLOWN_AS`."""
     figures: tuple[str, ...] = ()
-    """Figures of a plan that it computes, some of FIGURES."""
+    """Figures of a plan that the scheme computes, from FIGURES."""
     feedback: bool | None = None
-    """The one value of `control.feedback` that it can be flown with; None: either."""
+    """Value of `control.feedback` that the scheme needs; None if both are possible."""
     observes: bool = False
-    """Whether it estimates a disturbance, with the time constant `control.observer_s`."""
+    """Whether the scheme estimates a disturbance, with the time constant `control.observer_s`."""
     missions: bool = False
-    """Whether a mission may name it: the motions of a mission are sent and flown likewise."""
+    """Whether the scheme can fly missions, whose motions are sent as splines."""
 
     @property
     def indexed(self) -> bool:
@@ -50,68 +51,68 @@ class SchemeProperties(NamedTuple):
 
     @property
     def computes(self) -> tuple[str, ...]:
-        """Needs of triggers that it meets: its figures, and HELD."""
+        """Figures that the scheme provides to triggers, and HELD if it knows those inputs."""
         return (*self.figures, HELD) if self.commits else self.figures
 
 
 @scheme
 def committed() -> SchemeProperties:
-    """Plans of inputs that begin with the committed ones, which the vehicle already flies."""
+    """Horizons of inputs, the first of which are committed: fixed by horizons sent before."""
     return SchemeProperties("committed", FIGURES, observes=True)
 
 
 @scheme
 def predictive() -> SchemeProperties:
-    """The paper's: plans of inputs from a state predicted with the inputs of all plans."""
+    """The paper's scheme: horizons of inputs, planned from the predicted present state."""
     return SchemeProperties("predictive", ("state_gap",), observes=True)
 
 
 @scheme
 def trajectory() -> SchemeProperties:
-    """Desired trajectory as a spline, along which the vehicle regulates itself."""
+    """Desired trajectory as a spline, which a regulator aboard follows."""
     return SchemeProperties("trajectory", FIGURES[1:], feedback=True, missions=True)
 
 
 @scheme
 def none() -> SchemeProperties:
-    """Plans of inputs from the newest observation, without compensation of any delay."""
+    """Horizons of inputs, planned from the newest observation without delay compensation."""
     return SchemeProperties("none", ("state_gap",), feedback=False)
 
 
 def call(text: str) -> Call:
-    """The scheme that `control.scheme` names, with its arguments.
+    """Name and arguments of the scheme in `control.scheme`.
 
     Raises:
-        GrammarError: there is none such, or what a plug-in's says of itself cannot be.
+        GrammarError: there is no such scheme, or a plug-in's properties are invalid.
     """
-    found = SCHEMES.get(text.partition("(")[0].strip())
-    if found is None:
+    entry = SCHEMES.get(text.partition("(")[0].strip())
+    if entry is None:
         raise GrammarError(text, " or ".join(map(repr, SCHEMES)))
-    _said(found)
+    _properties_of(entry)
     return SCHEMES.one(text)
 
 
 def properties(text: str) -> SchemeProperties:
-    """Properties of the scheme that `control.scheme` names.
+    """Properties of the scheme in `control.scheme`.
 
     Raises:
         GrammarError: see `call`.
     """
-    return _said(SCHEMES[call(text).name])
+    return _properties_of(SCHEMES[call(text).name])
 
 
 def that_compute(need: str) -> list[str]:
-    """Names of the schemes that compute what a trigger needs."""
-    return [name for name, each in SCHEMES.items() if need in _said(each).computes]
+    """Names of the schemes that compute the figure a trigger needs."""
+    return [name for name, each in SCHEMES.items() if need in _properties_of(each).computes]
 
 
-def _said(entry: Entry) -> SchemeProperties:
+def _properties_of(entry: Entry) -> SchemeProperties:
     if entry.is_ours:
         return entry.make()
-    name, said = entry.make.__name__, getattr(entry.make, "properties", None)
-    if not isinstance(said, SchemeProperties):
-        raise GrammarError(name, "a class of skytether.plugin_scheme")
-    if said.flown_as not in FLOWN_AS or not set(said.figures) <= set(FIGURES):
-        known = f"flown_as of {', '.join(FLOWN_AS)}, and figures of {', '.join(FIGURES)}"
-        raise GrammarError(f"{name}: {said}", known)
-    return said
+    name, properties = entry.make.__name__, getattr(entry.make, "properties", None)
+    if not isinstance(properties, SchemeProperties):
+        raise GrammarError(name, "a class that extends one of skytether.plugin_scheme")
+    if properties.flown_as not in FLOWN_AS or not set(properties.figures) <= set(FIGURES):
+        expected = f"flown_as from {', '.join(FLOWN_AS)}, and figures from {', '.join(FIGURES)}"
+        raise GrammarError(f"{name}: {properties}", expected)
+    return properties

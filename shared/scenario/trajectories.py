@@ -1,7 +1,7 @@
-"""Shapes of the desired trajectory that come with Skytether: entries of the table `REFERENCES`.
+"""Built-in shapes of the desired trajectory: entries of the table `REFERENCES`.
 
-Each makes its trajectory (`shared.scenario.reference`) of the scenario's keys. A plug-in's shape is
-an entry like these.
+Each makes a trajectory (`shared.scenario.reference`) from the keys of the scenario, as a plug-in's
+shape does.
 """
 
 from typing import Annotated
@@ -18,7 +18,8 @@ from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
 
 reference = REFERENCES
-"""Decorator of a shape: a function of the `Scenario` and its numbers that gives a `Reference`."""
+"""Decorator of a shape: a function of the `Scenario` and its own numbers, returning a
+`Reference`."""
 
 
 def _points(scenario: Scenario) -> Array:
@@ -29,34 +30,34 @@ def _points(scenario: Scenario) -> Array:
 @reference
 def circle(scenario: Scenario) -> Reference:
     """Circle of `radius_m` around the origin, counter-clockwise, one round in `period_s`."""
-    wanted, axes = scenario.reference, scenario.model.axes
-    return curves.circle(wanted.radius_m, wanted.period_s, axes, wanted.altitude_m)
+    config, axes = scenario.reference, scenario.model.axes
+    return curves.circle(config.radius_m, config.period_s, axes, config.altitude_m)
 
 
 @reference(name="figure-eight")
 def figure_eight(scenario: Scenario) -> Reference:
     """Lemniscate, 2 `radius_m` wide and 1 high, one round in `period_s`."""
-    wanted, axes = scenario.reference, scenario.model.axes
-    return curves.figure_eight(wanted.radius_m, wanted.period_s, axes, wanted.altitude_m)
+    config, axes = scenario.reference, scenario.model.axes
+    return curves.figure_eight(config.radius_m, config.period_s, axes, config.altitude_m)
 
 
 @reference
 def square(scenario: Scenario) -> Reference:
     """Square with corners at ±`radius_m`, one round in `period_s`."""
-    wanted, axes = scenario.reference, scenario.model.axes
-    return curves.square(wanted.radius_m, wanted.period_s, axes, wanted.altitude_m)
+    config, axes = scenario.reference, scenario.model.axes
+    return curves.square(config.radius_m, config.period_s, axes, config.altitude_m)
 
 
 @reference
 def waypoints(scenario: Scenario) -> Reference:
-    """Path through `points_m` at `speed_mps`, round and round with `loop`."""
-    wanted = scenario.reference
-    return curves.waypoints(_points(scenario), wanted.speed_mps, loop=wanted.loop)
+    """Path through `points_m` at `speed_mps`, repeated with `loop`."""
+    config = scenario.reference
+    return curves.waypoints(_points(scenario), config.speed_mps, loop=config.loop)
 
 
 @reference
 def hover(scenario: Scenario) -> Reference:
-    """Rest at the one point of `points_m`."""
+    """Rest at the point in `points_m`."""
     return curves.hover(_points(scenario)[0])
 
 
@@ -68,40 +69,40 @@ def csv(scenario: Scenario) -> Reference:
 
 @reference
 def target(scenario: Scenario) -> Reference:
-    """Random walk that only the server sees, of `agility`, within `speed_mps` and `radius_m`."""
-    wanted = scenario.reference
+    """Random walk known only to the server, of `agility`, within `speed_mps` and `radius_m`."""
+    config = scenario.reference
     return curves.target(
         stream(scenario.seed, "target"),
         scenario.model.axes,
-        agility=wanted.agility,
-        speed_mps=wanted.speed_mps,
-        radius_m=wanted.radius_m,
-        turn_every_s=wanted.turn_every_s,
+        agility=config.agility,
+        speed_mps=config.speed_mps,
+        radius_m=config.radius_m,
+        turn_every_s=config.turn_every_s,
     )
 
 
 @reference
 def live(scenario: Scenario) -> Reference:
-    """Point that is moved while it flies, from the one of `points_m` or the origin on."""
+    """Point that is moved in flight, starting at the point in `points_m` or the origin."""
     points = _points(scenario)
     return curves.hover(points[0] if len(points) else np.zeros(scenario.model.axes))
 
 
 @reference
 def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
-    """Mission: places on a circle of `radius_m`, of which each vehicle goes to the one opposite."""
-    wanted = scenario.reference
-    return missions.swap(vehicles, wanted.radius_m, scenario.model.axes, wanted.altitude_m)
+    """Mission: vehicles on a circle of `radius_m`, each of which goes to the opposite place."""
+    config = scenario.reference
+    return missions.swap(vehicles, config.radius_m, scenario.model.axes, config.altitude_m)
 
 
 @reference
 def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
-    """Mission: places on a sphere of `radius_m`; each vehicle goes to the one opposite."""
-    wanted = scenario.reference
-    return missions.sphere(vehicles, wanted.radius_m, wanted.altitude_m)
+    """Mission: vehicles on a sphere of `radius_m`, each of which goes to the opposite place."""
+    config = scenario.reference
+    return missions.sphere(vehicles, config.radius_m, config.altitude_m)
 
 
 @reference
 def mission(scenario: Scenario) -> Reference:
-    """Mission: goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
+    """Mission with goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
     return missions.mission(scenario.table, scenario.model.axes)

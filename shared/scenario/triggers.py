@@ -1,12 +1,11 @@
-"""Triggers: when a horizon is sent, by small policies that combine with & and |.
+"""Triggers, which decide when a horizon is sent: small policies combined with & and |.
 
-A scenario writes `cost_gap & budget(5, 2) | silence(1)`; `shared.scenario.grammar` has the
-grammar, docs/triggers.md says what each policy is good for, and how to write one. Those below are
-entries of the table `TRIGGERS` (`shared.scenario.registry`) like any plug-in's.
+A scenario writes `cost_gap & budget(5, 2) | silence(1)` (`shared.scenario.grammar`). The policies
+below are entries of the table `TRIGGERS` (`shared.scenario.registry`), as those of plug-ins are.
+docs/triggers.md says when to use each, and how to write one.
 
-A trigger is asked once a step, when the new plan is made and everything is known that a policy may
-look at. Vehicles at their first step, or after a gap that no plan reached over (`fresh`), have
-nothing to fly on with, and fire in every policy but `budget` (E18).
+The server evaluates the trigger once per step, after planning. A vehicle without a usable previous
+plan (`fresh`: first step, or a gap longer than H) fires in every policy but `budget` (E18).
 """
 
 import traceback
@@ -26,22 +25,22 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.schemes import HELD, that_compute
 
 trigger = TRIGGERS
-"""Decorator of a policy: a function of a `Situation` and its numbers, or a class like `Trigger`."""
+"""Decorator of a policy: a function of a `Situation` and its numbers, or a subclass of
+`Trigger`."""
 Amount = Annotated[float, Meta(ge=0)]
 """Threshold of any unit."""
 Figures = NDArray[np.void]
-"""Figures of plans, a record for each vehicle, see `server.common.scheme.FIGURES`;
-shape (n,)."""
+"""Figures of plans, one `server.common.scheme.PlanFigures` record for each vehicle; shape (n,)."""
 
 
-class KnownArrays(NamedTuple):
-    """Arrays of a block of vehicles, from which the `Situation` of a trigger takes its rows.
+class SituationArrays(NamedTuple):
+    """Arrays of a block of vehicles, whose first n rows belong to a `Situation`.
 
-    Those of the situation come first; `sent_step` has a row for each vehicle there may be.
+    Arrays with shape (capacity,) have one row for every vehicle of the server.
     """
 
     model: Model
-    """The vehicle as both ends know it."""
+    """Model of the vehicles."""
     dt_s: float
     """Length of a step [s]."""
     planned: int
@@ -49,92 +48,95 @@ class KnownArrays(NamedTuple):
     ahead: Indices
     """Delay bound d [steps]; shape (block,)."""
     horizons: NDArray[np.float32]
-    """Inputs from k on, d committed and then H planned [m/s]; shape (block, axes, most + H)."""
+    """Horizons from k on, d committed inputs, then H planned ones [m/s]; shape (block, axes,
+    largest d + H)."""
     held: Array | None
-    """Inputs from k+d on if nothing is sent [m/s]; shape (block, axes, H). None without committed
-    inputs, where they are not known."""
+    """Inputs that are flown from k+d on if nothing is sent [m/s]; shape (block, axes, H). None if
+    the scheme does not know them."""
     sent_step: Indices
-    """Step at which each vehicle was sent a horizon last, or -1; shape (capacity,)."""
+    """Step at which a horizon was last sent to each vehicle, or -1; shape (capacity,)."""
     heartbeat_due: Flags
-    """Whether each vehicle is sent a heartbeat at this step if nothing else; shape (capacity,)."""
+    """Whether a heartbeat to each vehicle is due at this step; shape (capacity,)."""
     desired: Callable[[Indices, Indices, Indices], Array]
-    """Desired states of some rows, at their steps k, from k+d on; see `Situation.desired`."""
+    """Function from rows, steps k and delay bounds d to desired states, see `Situation.desired`."""
 
 
 class Situation(NamedTuple):
-    """Situation that a policy judges: n vehicles at one step k of each.
+    """Input of a policy: n vehicles, each at its step k.
 
-    Planning starts at step k+d, where a new horizon can be in force; its plan goes on to k+d+H.
-    Nothing may be written into a situation, and it holds at this step alone.
+    Planning starts at step k+d, when a new horizon is in force at the latest; plans end at k+d+H.
+    The arrays must not be changed, and are reused at the next step.
     """
 
     rows: Indices
-    """Numbers of the vehicles' places in what a policy remembers; shape (n,)."""
+    """Row of each vehicle, for a policy that stores something per vehicle; shape (n,)."""
     figures: Figures
-    """Figures of their plans, a record each; docs/triggers.md has the fields; shape (n,)."""
+    """Figures of the new plans, one record each, see docs/triggers.md; shape (n,)."""
     estimate: Array
-    """Estimate x̂(k+d): position and velocity where planning starts [m, m/s]; shape (n, axes, 2)."""
+    """Estimate x̂(k+d): position and velocity where planning starts [m, m/s]; shape (n, axes,
+    2)."""
     planned: Array
-    """State x_p there according to the plan before [m, m/s]; shape (n, axes, 2)."""
-    known: KnownArrays
-    """Arrays of all vehicles, from which other fields are cut when they are read."""
+    """State x_p(k+d) according to the previous plan [m, m/s]; shape (n, axes, 2)."""
+    arrays: SituationArrays
+    """Arrays behind the properties below."""
 
     @property
     def plan(self) -> Array:
-        """New plan: the inputs from k+d on [m/s]; shape (n, axes, H), H = 1 without a plan."""
-        n, known = len(self.rows), self.known
-        stages = known.ahead[:n, None] + np.arange(known.planned)
-        inputs = np.take_along_axis(known.horizons[:n], stages[:, None], axis=2)
+        """New plan: inputs from k+d on [m/s]; shape (n, axes, H); H = 1 with a scheme that sends
+        trajectories.
+        """
+        n, arrays = len(self.rows), self.arrays
+        stages = arrays.ahead[:n, None] + np.arange(arrays.planned)
+        inputs = np.take_along_axis(arrays.horizons[:n], stages[:, None], axis=2)
         return inputs.astype(np.float64)
 
     @property
     def held(self) -> Array:
-        """Horizon held aboard: the inputs flown from k+d on if nothing is sent [m/s]; shape
-        (n, axes, H).
+        """Inputs that the vehicle flies from k+d on if nothing is sent [m/s]; shape (n, axes, H).
 
         Raises:
             ValueError: the scheme does not know them.
         """
-        if self.known.held is None:
+        if self.arrays.held is None:
             able = " or ".join(map(repr, that_compute(HELD)))
             raise ValueError(f"held: expected control.scheme = {able}")
-        return self.known.held[: len(self.rows)].copy()
+        return self.arrays.held[: len(self.rows)].copy()
 
     @property
     def desired(self) -> Array:
-        """Desired states at k+d … k+d+H as the server knows or predicts them [m, m/s]; shape
+        """Desired states at k+d … k+d+H, extrapolated where unknown [m, m/s]; shape
         (n, axes, H + 1, 2).
         """
         rows, step = np.array(self.rows), np.array(self.figures["step"])
-        return self.known.desired(rows, step, self.known.ahead)
+        return self.arrays.desired(rows, step, self.arrays.ahead)
 
     @property
     def since_sent_s(self) -> Array:
-        """Time since a horizon was sent [s], infinite where none was; shape (n,)."""
-        sent = self.known.sent_step[self.rows]
-        since: Array = np.where(sent < 0, np.inf, (self.figures["step"] - sent) * self.known.dt_s)
+        """Time since a horizon was last sent [s], infinite if never; shape (n,)."""
+        sent = self.arrays.sent_step[self.rows]
+        since: Array = np.where(sent < 0, np.inf, (self.figures["step"] - sent) * self.arrays.dt_s)
         return since
 
     @property
     def heartbeat_due(self) -> Flags:
-        """Whether a heartbeat is due, which a horizon would take the place of; shape (n,)."""
-        return self.known.heartbeat_due[self.rows]
+        """Whether a heartbeat is due, which a horizon would replace; shape (n,)."""
+        return self.arrays.heartbeat_due[self.rows]
 
     @property
     def model(self) -> Model:
-        """The vehicle as both ends know it; `model.step(x, u)` is its state a step later."""
-        return self.known.model
+        """Model of the vehicles; `model.step(x, u)` is the state one step later."""
+        return self.arrays.model
 
     @property
     def dt_s(self) -> float:
         """Length of a step [s]."""
-        return self.known.dt_s
+        return self.arrays.dt_s
 
 
 class Compared(IntEnum):
-    """Figure that a trigger compares with its threshold, by the column of the record that has it.
+    """Figure that a trigger compares with its threshold; its name is a column of the record.
 
-    `server.common.scheme.PlanFigures` says what each is.
+    `server.common.scheme.PlanFigures` defines the figures.
     """
 
     NOTHING = 0
@@ -143,7 +145,7 @@ class Compared(IntEnum):
     EXPECTED_GAP = 3
     DEVIATION_M = 4
     OWN = 5
-    """Figure of a plug-in's policy, in a unit that it knows itself."""
+    """A figure that a plug-in's policy computes, in its own unit."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -153,14 +155,14 @@ class Verdict(NamedTuple):
     """Verdict of a trigger on n vehicles."""
 
     event: Flags
-    """Whether it fires; shape (n,)."""
+    """Whether the trigger fires; shape (n,)."""
     figure: Array
-    """Figure of the leftmost policy that compares one; V(k) of eq. (16) where none does;
-    shape (n,)."""
+    """Figure of the leftmost policy that compares one, or V(k) of eq. (16) if none does; shape
+    (n,)."""
     threshold: Array
-    """Threshold of that figure; 0 where nothing is compared; shape (n,)."""
+    """Threshold of that figure, or 0 if nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
-    """Name of the figure that is compared with the threshold."""
+    """Which figure is compared with the threshold."""
 
     @property
     def compares(self) -> bool:
@@ -169,33 +171,33 @@ class Verdict(NamedTuple):
 
 
 class Trigger:
-    """Base of a policy that remembers something; it is made once, for all vehicles.
+    """Base class of a policy with memory; one instance serves all vehicles.
 
-    Args of a policy: the control section of the scenario; capacity, the number of rows that there
-    may be; then its numbers.
+    Its constructor is called with the control section of the scenario, the capacity (number of
+    rows), and then the numbers of the policy.
     """
 
     doubts = False
-    """Whether it looks at what becomes of the vehicle where packets in flight are lost."""
+    """Whether the policy uses `expected_gap`, for which loss cases must be computed."""
 
     def forget(self, row: int) -> None:
-        """Begin anew with a vehicle in this row."""
+        """Forget the vehicle in this row."""
 
     def test(self, situation: Situation) -> Verdict:
-        """The verdict on each vehicle."""
+        """Decide for each vehicle."""
         raise NotImplementedError
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """Take note of vehicles that are sent a horizon at this step: k_i ← k."""
+        """Note that a horizon is sent to these vehicles at this step: k_i ← k."""
 
 
 def above(situation: Situation, figure: Array | Compared, threshold: float) -> Verdict:
-    """The verdict of a policy that sends where a figure is above a threshold, and records both.
+    """Verdict of a policy that fires if a figure exceeds a threshold; both are recorded.
 
     Args:
-        situation: what it is shown.
-        figure: one of the figures of the plans, or one of its own of shape (n,).
-        threshold: what that is compared with.
+        situation: the vehicles.
+        figure: a figure of the plans, or the policy's own numbers; shape (n,).
+        threshold: threshold in the figure's unit.
     """
     compared = figure if isinstance(figure, Compared) else Compared.OWN
     values = situation.figures[str(figure)] if isinstance(figure, Compared) else figure
@@ -205,7 +207,7 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
 
 @lru_cache(maxsize=256)
 def _each(n: int, number: float) -> Array:
-    """Column with one number for each of n vehicles; read only, made once; shape (n,)."""
+    """Read-only array with the same number n times; shape (n,)."""
     column = np.full(n, number)
     column.flags.writeable = False
     return column
@@ -213,25 +215,26 @@ def _each(n: int, number: float) -> Array:
 
 @lru_cache(maxsize=256)
 def _all_of(n: int) -> Flags:
-    """Constant read-only array of n flags that are all True; shape (n,)."""
+    """Read-only array of n flags, all True; shape (n,)."""
     flags = np.ones(n, dtype=np.bool_)
     flags.flags.writeable = False
     return flags
 
 
 def _timed(event: Flags, figures: Figures) -> Verdict:
-    """The verdict of a policy that compares no figure."""
+    """Verdict of a policy that compares no figure."""
     return Verdict(event, figures["state_gap"], _each(len(event), 0.0), Compared.NOTHING)
 
 
 class _Stateless(Trigger):
-    """A policy that is a function.
+    """Policy made from a function.
 
-    Where it says yes or no, a vehicle that is `fresh` or was never sent to is sent to in any case.
+    If the function returns flags, vehicles that are `fresh`, or that were never sent a horizon,
+    fire in any case.
 
     Args:
-        function: gives a verdict, or which vehicles to send to.
-        values: its numbers.
+        function: returns a verdict, or flags of shape (n,).
+        values: its numbers, passed after the `Situation`.
     """
 
     def __init__(self, function: Callable[..., Verdict | Flags], values: Sequence[Value]) -> None:
@@ -239,12 +242,11 @@ class _Stateless(Trigger):
 
     def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        said = self._function(situation, *self._values)
-        if isinstance(said, Verdict):
-            return said
-        # A vehicle that holds nothing is sent its first horizon, whatever the policy says.
-        new = situation.figures["fresh"] | (situation.known.sent_step[situation.rows] < 0)
-        return _timed(new | said, situation.figures)
+        verdict = self._function(situation, *self._values)
+        if isinstance(verdict, Verdict):
+            return verdict
+        new = situation.figures["fresh"] | (situation.arrays.sent_step[situation.rows] < 0)
+        return _timed(new | verdict, situation.figures)
 
 
 @trigger
@@ -255,7 +257,7 @@ def always(situation: Situation) -> Verdict:
 
 @trigger
 def heartbeat(situation: Situation) -> Flags:
-    """Sends where a heartbeat is due, in its place: as many packets, and each says something."""
+    """Sends if a heartbeat is due, and replaces it: the same number of packets, each useful."""
     return situation.heartbeat_due
 
 
@@ -280,7 +282,7 @@ class Periodic(Trigger):
         """See `Trigger`."""
         rows, figures = situation.rows, situation.figures
         due = figures["step"] - self._sent_step[rows] >= self._period
-        # What is due at a fresh step stays due until it is sent.
+        # A horizon that is due at a fresh step stays due until it is sent.
         fresh = figures["fresh"]
         if fresh.any():
             self._sent_step[rows[fresh]] = figures["step"][fresh] - self._period
@@ -293,7 +295,7 @@ class Periodic(Trigger):
 
 @trigger(name="state_gap", needs="state_gap")
 class StateGap(Trigger):
-    """Sends where the estimate is off the plan by more than eq. (16) allows, V(k) > S(k).
+    """Sends if the estimate deviates from the plan by more than eq. (16) allows, V(k) > S(k).
 
     V(k) = ‖x̂(k) - x_p(k|k-1)‖²_P, S(k) = V(k_i) exp(-λ Δt (k - k_i)) + ε. k_i is the last event; λ
     is per second (E5).
@@ -324,7 +326,7 @@ class StateGap(Trigger):
         if fresh.any():  # V(k_0) = 0
             self._event_step[rows[fresh]], self._event_gap[rows[fresh]] = step[fresh], 0.0
         since = step - self._event_step[rows]
-        # λ is per second and not per step (E5): per step, 1.5 would be gone within three steps.
+        # λ is per second, not per step (E5): per step, λ = 1.5 would decay within three steps.
         threshold = self._event_gap[rows] * np.exp(-self._decay * since) + self._epsilon
         return Verdict(fresh | (gap > threshold), gap, threshold, Compared.STATE_GAP)
 
@@ -335,13 +337,13 @@ class StateGap(Trigger):
 
 @trigger(needs="cost_gap")
 def cost_gap(situation: Situation, c: Amount = 0.05) -> Verdict:
-    """Sends where flying on with what was sent costs more than c above the new optimum."""
+    """Sends if flying on with the inputs already sent costs over c more than the new plan."""
     return above(situation, Compared.COST_GAP, c)
 
 
 @trigger(name="expected_gap", needs="expected_gap")
 class ExpectedGap(Trigger):
-    """Sends where flying on is expected to cost more than c, as packets in flight may be lost."""
+    """Sends if the expected extra cost of flying on is above c; packets in flight may be lost."""
 
     doubts = True
 
@@ -360,16 +362,18 @@ class ExpectedGap(Trigger):
 
 @trigger(needs="deviation_m")
 def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
-    """Sends where flying on with what was sent leads further than so many metres from the plan."""
+    """Sends if flying on with the inputs already sent leads more than so many metres off the
+    plan.
+    """
     return above(situation, Compared.DEVIATION_M, metres)
 
 
 @trigger(name="silence")
 class Silence(Periodic):
-    """Sends after so many seconds without a packet, or half a horizon where that is shorter.
+    """Sends after so many seconds without a packet, or after half a horizon if that is shorter.
 
-    It sends at most at every step. A horizon of which half is left is replaced in time even if the
-    first that follows is lost. A trajectory has no inputs that could end.
+    A horizon that is replaced at its half does not run out, even if the first replacement is lost.
+    Trajectories do not run out, so only the seconds count for them.
     """
 
     def __init__(
@@ -378,9 +382,8 @@ class Silence(Periodic):
         capacity: int,
         seconds: Annotated[float, Meta(ge=0.001, le=3600)],
     ) -> None:
-        steps = int(
-            seconds / control.dt + 1e-9
-        )  # as much as floating point may take from 0.35 / 0.05
+        # 1e-9: the quotient 0.35 / 0.05 is slightly below 7 in floating point.
+        steps = int(seconds / control.dt + 1e-9)
         if not control.properties.splines:
             steps = min(steps, control.horizon // 2)
         super().__init__(control, capacity, steps)
@@ -388,11 +391,11 @@ class Silence(Periodic):
 
 @trigger(name="budget")
 class Budget(Trigger):
-    """Sends while it has a token: a hard cap behind a &.
+    """Sends while it has a token: combined by &, a hard limit on the rate of packets.
 
-    A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet. Without b ≥ 1
-    there is none: a window of T seconds has at most burst + packets_per_s · T. A packet for which
-    another policy, behind a |, asked without a token takes what there is.
+    A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet, and no packet if
+    b < 1. So T seconds have at most burst + packets_per_s · T packets. A packet that another policy
+    sends by a | without a token empties the bucket.
     """
 
     def __init__(
@@ -405,7 +408,7 @@ class Budget(Trigger):
         self._gain = packets_per_s * control.dt
         self._burst = burst
         self._tokens = np.full(capacity, burst, dtype=np.float64)
-        """Tokens b right after step `_step`; shape (capacity,)."""
+        """Tokens b after step `_step`; shape (capacity,)."""
         self._step = np.zeros(capacity, dtype=np.int64)
 
     def forget(self, row: int) -> None:
@@ -419,19 +422,19 @@ class Budget(Trigger):
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         """See `Trigger`."""
-        # Never below 0: a packet without a token, asked for by a policy behind a |, leaves no debt.
+        # Not below 0: a packet without a token, sent by another policy, leaves no debt.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 
     def _filled(self, rows: Indices, figures: Figures) -> Array:
         """Tokens b at these steps; shape (n,)."""
         gained = self._gain * (figures["step"] - self._step[rows])
-        # Computed from the steps that have passed, so that a missed tick fills the bucket as well.
+        # Computed from the number of steps passed, so that missed ticks fill the bucket too.
         return np.minimum(self._tokens[rows] + gained, self._burst)
 
 
 class Combined(Trigger):
-    """Two triggers, of which both (`np.logical_and`) or either (`np.logical_or`) must fire."""
+    """Two triggers joined by & (`np.logical_and`) or | (`np.logical_or`)."""
 
     def __init__(
         self, combine: Callable[[Flags, Flags], Flags], left: Trigger, right: Trigger
@@ -460,21 +463,21 @@ class Combined(Trigger):
 
 
 class Guarded(Trigger):
-    """A plug-in's policy, whose mistakes end no flight: where it fails, it sends.
+    """A plug-in's policy with its errors caught: if it fails, it fires.
 
-    A packet too many costs bytes, a packet too few the flight. `budget` behind a & caps it as
-    ever. What it is shown it cannot write into.
+    A needless packet costs bytes; a missing one may end the flight. A `budget` joined by & still
+    limits the rate. The policy gets read-only arrays.
 
     Args:
-        name: its name, for the message.
+        name: name of the policy, for messages.
         inner: the policy.
-        tell: told the traceback of its first mistake.
+        tell: called with the traceback of its first error.
     """
 
     def __init__(self, name: str, inner: Trigger, tell: Callable[[str], None]) -> None:
         self.doubts = inner.doubts
         self._name, self._inner, self._tell = name, inner, tell
-        self._told = False
+        self._has_failed = False
 
     def forget(self, row: int) -> None:
         """See `Trigger`."""
@@ -485,12 +488,11 @@ class Guarded(Trigger):
 
     def test(self, situation: Situation) -> Verdict:
         """See `Trigger`."""
-        rows, figures, estimate, planned, known = situation
-        # Views that cannot be written into: a policy's mistake must not change what is sent.
-        seen = map(_sealed, (rows, figures, estimate, planned))
-        shown = Situation._make((*seen, known))
+        rows, figures, estimate, planned, arrays = situation
+        # Read-only views: an error in a policy must not change what is sent.
+        views = map(_read_only, (rows, figures, estimate, planned))
         try:
-            verdict = self._inner.test(shown)
+            verdict = self._inner.test(Situation._make((*views, arrays)))
             return Verdict(
                 _column(verdict.event, np.bool_, len(rows)),
                 _column(verdict.figure, np.float64, len(rows)),
@@ -509,41 +511,42 @@ class Guarded(Trigger):
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        if not self._told:
-            self._told = True
+        if not self._has_failed:
+            self._has_failed = True
             what = f"the trigger {self._name}: {type(error).__name__}: {error}"
             trace = "".join(traceback.format_exception(error))
-            self._tell(f"{trace}{what}; where it fails, it sends")
+            self._tell(f"{trace}{what}; when it fails, a horizon is sent")
 
 
-def _sealed(array: NDArray[Any]) -> NDArray[Any]:
-    """View of an array into which nothing can be written."""
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def _column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
-    """Values of n vehicles.
+    """Values of n vehicles as an array of a type; shape (n,).
 
     Raises:
-        ValueError: they are of another shape or kind.
+        ValueError: they have another shape, or cannot be cast to the type.
     """
     column = np.asarray(values)
     if column.shape != (n,) or not np.can_cast(column.dtype, kind):
         got = f"{column.dtype.name} of shape {column.shape}"
         raise ValueError(f"got {got}, expected {np.dtype(kind).name} of shape ({n},)")
-    # As kernels read it, which do not look at types once they are called: float64, side by side.
+    # Kernels do not check types at each call: they need this type, contiguous.
     return np.ascontiguousarray(column, dtype=kind)
 
 
 def make_trigger(
     control: ControlConfig, capacity: int, tell: Callable[[str], None] = lambda _: None
 ) -> Trigger:
-    """The trigger that a scenario describes, for up to `capacity` vehicles.
+    """Make the trigger of a scenario.
 
     Args:
-        tell: told the traceback of each plug-in's first mistake, while it flies.
+        control: `trigger`, and the numbers that policies need.
+        capacity: largest number of vehicles.
+        tell: called with the traceback of each plug-in's first error in flight.
     """
 
     def make(expression: Expression) -> Trigger:

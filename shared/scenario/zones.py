@@ -4,10 +4,10 @@
     fence(x0, x1, y0, y1) & fence(x, y, x, y, x, y, …) & corridor(width, x, y, x, y, …)
     geojson(file)
 
-Metres, joined by & (`shared.scenario.grammar`). `box` and `cylinder` take two heights more, the
-lowest and the highest; without them they reach from the ground to the sky. A vehicle keeps out of
-`box`, `cylinder` and `polygon`, and stays within every `fence` and `corridor`. Every zone is a
-polygon between two heights; a cylinder is one of 24 corners around it.
+Numbers are metres; zones are joined by & (`shared.scenario.grammar`). `box` and `cylinder` may end
+with two more numbers, the lowest and the highest altitude; otherwise they have no vertical limits.
+Vehicles keep out of `box`, `cylinder` and `polygon`, and stay within every `fence` and `corridor`.
+Every zone is a polygon between two altitudes; a cylinder becomes a polygon of 24 corners around it.
 """
 
 import json
@@ -23,17 +23,18 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import ZONES, File, Files
 
 ROUND = 24
-"""Corners of a cylinder."""
+"""Number of corners of the polygon around a cylinder."""
 CORNERS_MAX = 1000
-"""Largest number of corners of all zones."""
+"""Largest number of corners of all zones together."""
 EARTH_M = 6_378_137.0
 """Radius of the earth at the equator, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
-"""Largest coordinate [m] of a file in metres, and of one in degrees, where the earth is round."""
+"""Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
+latter is less because degrees are projected onto a plane."""
 NORTH_MAX = 85.0
 """Largest latitude [degrees]."""
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
-"""Value of the member `crs` with which coordinates are those of RFC 7946."""
+"""The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
 Frame = Callable[[Any], Array]
 """Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
 _NOWHERE: Array = np.zeros((0, 2))
@@ -43,34 +44,32 @@ class Zone(NamedTuple):
     """A polygon between two heights."""
 
     name: str
-    """The zone as it is written."""
+    """Text of the zone in the scenario, or file and name of a feature."""
     corners: Array
-    """Corners in a row [m]; shape (n, 2)."""
+    """Corners in order along the border [m]; shape (n, 2)."""
     low_m: float = -math.inf
+    """Lowest altitude [m]."""
     high_m: float = math.inf
+    """Highest altitude [m]."""
     is_fence: bool = False
-    """Whether vehicles stay within it, and do not keep out of it."""
+    """True if vehicles stay within the zone, False if they keep out of it."""
 
 
 class Planes(NamedTuple):
     """Half-planes that keep points out of zones: normal · x ≥ normal · border + distance."""
 
     at: Indices
-    """Index of the point of each; shape (n,)."""
+    """Index of the point that each half-plane is for; shape (n,)."""
     normal: Array
     """Unit vector from the zone's border to the point; shape (n, axes)."""
     border: Array
     """Nearest point of the border [m]; shape (n, axes)."""
     away_m: Array
-    """Distance of the point from there [m]; shape (n,)."""
+    """Distance of the point from the border [m]; shape (n,)."""
 
 
 class Zones:
-    """All zones of a mission, for points in the plane or in space.
-
-    Args:
-        zones: may be none.
-    """
+    """All zones of a mission, for points with two or three axes."""
 
     def __init__(self, zones: Sequence[Zone] = ()) -> None:
         self.zones = tuple(zones)
@@ -78,31 +77,31 @@ class Zones:
         self._starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(np.int64)
         nothing = np.zeros((0, 2))
         self._begin = np.concatenate([nothing, *(zone.corners for zone in zones)])
-        """Begin of each edge [m]; shape (edges, 2)."""
+        """First corner of each edge [m]; shape (edges, 2)."""
         ends = [np.roll(zone.corners, -1, axis=0) for zone in zones]
         self._along = np.concatenate([nothing, *ends]) - self._begin
         self._square = np.maximum((self._along**2).sum(axis=1), 1e-18)
         self._sign = np.array([1.0 if zone.is_fence else -1.0 for zone in zones])
-        """Sign of the distance from the border of a point inside."""
+        """Sign of the clearance inside each zone: 1 for a fence, -1 otherwise; shape (zones,)."""
         self._low = np.array([zone.low_m for zone in zones])
         self._high = np.array([zone.high_m for zone in zones])
         self.outlines = _outlines(zones)
-        """Outlines of all zones, with which straight pieces of ways are compared."""
+        """Outlines of all zones, for comparison with straight line segments."""
 
     def __bool__(self) -> bool:
         return bool(self.zones)
 
     def to_the_sky(self) -> "Zones":
-        """Zones alike, but nobody is above those to keep out of: these have no upper end."""
+        """Zones in which those to keep out of have no upper limit."""
         high = [math.inf if not zone.is_fence else zone.high_m for zone in self.zones]
         raised = zip(self.zones, high, strict=True)
         return Zones([zone._replace(high_m=high_m) for zone, high_m in raised])
 
     def clearance(self, points: Array) -> Array:
-        """Distance of points from what is forbidden, negative within it [m].
+        """Distance of points from the forbidden side of each zone, negative on that side [m].
 
         Args:
-            points: shape (n, axes).
+            points: positions [m]; shape (n, axes).
 
         Returns:
             shape (n, zones).
@@ -114,7 +113,9 @@ class Zones:
         return self._with_height(signed, points[:, 2:])
 
     def in_the_way(self, points: Array, room_m: float) -> str:
-        """Name of a zone that a way through points is nearer to than room_m; empty of none."""
+        """Name of the first zone nearer than `room_m` to a path through points; empty if none
+        is.
+        """
         places = [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
         pieces = list(zip(places, [*places[1:], places[-1]], strict=True))
         for i, zone in enumerate(self.zones):
@@ -125,30 +126,30 @@ class Zones:
         return ""
 
     def planes(self, points: Array, reach_m: Array) -> Planes:
-        """Half-planes between points and the zones that are near them.
+        """Half-planes between points and the zones near them.
 
         Args:
-            points: outside of what is forbidden; shape (n, axes).
-            reach_m: distance from each point up to which zones matter [m]; shape (n,).
+            points: positions with positive clearance [m]; shape (n, axes).
+            reach_m: distance up to which each point considers zones [m]; shape (n,).
         """
         axes, each = points.shape[1], np.arange(len(points))
         if not self.zones:
             return _facing(points[:0], points[:0], each[:0])
-        found = []
+        parts = []
         nearest, away = self._nearest(points[:, :2])
         inside = self._inside(points[:, :2])
         for i, zone in enumerate(self.zones):
             own = slice(self._starts[i], self._starts[i] + len(zone.corners))
-            if zone.is_fence:  # each of its edges by itself
+            if zone.is_fence:  # a half-plane for each edge
                 n, edge = np.nonzero(away[:, own] < reach_m[:, None])
                 places = points[n]
                 places[:, :2] = nearest[n, edge + self._starts[i]]
-                found.append(_facing(points[n], places, n))
+                parts.append(_facing(points[n], places, n))
                 for bound in (zone.low_m, zone.high_m) if axes > 2 else ():
                     n = np.flatnonzero(np.abs(points[:, 2] - bound) < reach_m)
                     places = points[n]
                     places[:, 2] = bound
-                    found.append(_facing(points[n], places, n))
+                    parts.append(_facing(points[n], places, n))
                 continue
             edge = away[:, own].argmin(axis=1) + self._starts[i]
             places = points.copy()
@@ -156,47 +157,47 @@ class Zones:
             if axes > 2:
                 places[:, 2] = np.clip(points[:, 2], zone.low_m, zone.high_m)
             n = np.flatnonzero(np.linalg.norm(points - places, axis=1) < reach_m)
-            found.append(_facing(points[n], places[n], n))
+            parts.append(_facing(points[n], places[n], n))
         return Planes(
-            np.concatenate([part.at for part in found]),
-            np.concatenate([part.normal for part in found]),
-            np.concatenate([part.border for part in found]),
-            np.concatenate([part.away_m for part in found]),
+            np.concatenate([part.at for part in parts]),
+            np.concatenate([part.normal for part in parts]),
+            np.concatenate([part.border for part in parts]),
+            np.concatenate([part.away_m for part in parts]),
         )
 
     def _nearest(self, points: Array) -> tuple[Array, Array]:
-        """Nearest point of each edge, and the distance; shapes (n, edges, 2), (n, edges)."""
+        """Nearest point of each edge and its distance [m]; shapes (n, edges, 2), (n, edges)."""
         off = points[:, None] - self._begin[None]
         t = np.clip(np.einsum("ijk,jk->ij", off, self._along) / self._square, 0.0, 1.0)
         nearest = self._begin + t[:, :, None] * self._along
         return nearest, np.linalg.norm(points[:, None] - nearest, axis=2)
 
     def _inside(self, points: Array) -> Flags:
-        """Whether points are within each polygon, by the even-odd rule; shape (n, zones)."""
+        """Whether points are inside each polygon, by the even-odd rule; shape (n, zones)."""
         x, y = points[:, :1], points[:, 1:2]
         begin, end = self._begin, self._begin + self._along
         spans = (begin[:, 1] > y) != (end[:, 1] > y)
         rise = np.where(self._along[:, 1] == 0.0, 1.0, self._along[:, 1])
         left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
         crossed = np.add.reduceat((spans & left).astype(np.int64), self._starts, axis=1)
-        found: Flags = crossed % 2 == 1
-        return found
+        inside: Flags = crossed % 2 == 1
+        return inside
 
     def _signed(self, points: Array, away: Array) -> Array:
         least = np.minimum.reduceat(away, self._starts, axis=1)
         return least * np.where(self._inside(points), self._sign, -self._sign)
 
     def _with_height(self, signed: Array, height: Array) -> Array:
-        """Distances of points in space, by those in the plane and their heights; (n, zones)."""
+        """Clearances with three axes, from those in the plane and altitudes; shape (n, zones)."""
         off = np.maximum(self._low - height, height - self._high)
         apart = np.where(off > 0.0, np.hypot(off, np.maximum(signed, 0.0)), np.maximum(signed, off))
-        # Within a fence: as far as from its nearest side, its floor and its ceiling.
+        # Within a fence: distance from the nearest of its sides, floor and ceiling.
         within = np.minimum(signed, np.minimum(height - self._low, self._high - height))
         return np.where(self._sign > 0.0, within, apart)
 
 
 def _outlines(zones: Sequence[Zone]) -> Outlines:
-    """Outlines of zones; those with fewer edges are filled up with ones that do not count."""
+    """Outlines of zones; arrays of zones with fewer edges are padded with zeros."""
     counts = np.array([len(zone.corners) for zone in zones], dtype=np.float64)
     edges, boxes = np.zeros((len(zones), int(counts.max(initial=0)), 4)), np.zeros((len(zones), 6))
     for i, zone in enumerate(zones):
@@ -208,36 +209,36 @@ def _outlines(zones: Sequence[Zone]) -> Outlines:
 
 
 def _facing(points: Array, places: Array, at: Indices) -> Planes:
-    """Half-planes from places to points, of those that are not the same."""
+    """Half-planes from border places to points; pairs that coincide are left out."""
     off = points - places
     away: Array = np.linalg.norm(off, axis=1)
-    there = away > 1e-9
-    return Planes(at[there], off[there] / away[there, None], places[there], away[there])
+    apart = away > 1e-9
+    return Planes(at[apart], off[apart] / away[apart, None], places[apart], away[apart])
 
 
-# -- as a scenario writes them -----------------------------------------------------------------
+# -- texts and files of zones ------------------------------------------------------------------
 
 
 def parse(text: str, axes: int, files: Files = ()) -> Zones:
-    """Zones that a text names; none of an empty one.
+    """Parse a text of zones; an empty text has none.
 
     Args:
         text: zones joined by &.
-        axes: number of axes of a flight.
+        axes: number of axes of the flight.
         files: files that the text names, with their contents.
 
     Raises:
-        GrammarError: with the part of the text that is wrong.
+        GrammarError: a part of the text is invalid.
     """
     zones: list[Zone] = []
     for call in ZONES.calls(text):
         try:
             if any(not isinstance(each, str) and abs(each) > METRES_MAX for each in call.values):
                 raise ValueError(f"numbers of at most {METRES_MAX:g} m")
-            made: list[Zone] = ZONES.made(call, files)
+            parsed: list[Zone] = ZONES.make(call, files)
         except ValueError as error:
             raise GrammarError(call.text, str(error)) from None
-        zones += [zone if zone.name else zone._replace(name=call.text) for zone in made]
+        zones += [zone if zone.name else zone._replace(name=call.text) for zone in parsed]
     if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
         raise GrammarError(f"{text[:40]}…", f"at most {CORNERS_MAX} corners of all zones")
     for zone in zones:
@@ -248,7 +249,7 @@ def parse(text: str, axes: int, files: Files = ()) -> Zones:
 
 @ZONES
 def box(x0: float, x1: float, y0: float, y1: float, *heights: float) -> list[Zone]:
-    """Box to keep out of, from the ground to the sky or between two heights."""
+    """Box to keep out of, without vertical limits or between two altitudes."""
     if not (x0 < x1 and y0 < y1):
         raise ValueError("box(x0, x1, y0, y1), or with z0, z1: from less to more")
     return [_between(_corners(x0, x1, y0, y1), heights)]
@@ -256,7 +257,7 @@ def box(x0: float, x1: float, y0: float, y1: float, *heights: float) -> list[Zon
 
 @ZONES
 def cylinder(x: float, y: float, radius: float, *heights: float) -> list[Zone]:
-    """Cylinder to keep out of, from the ground to the sky or between two heights."""
+    """Cylinder to keep out of, without vertical limits or between two altitudes."""
     if radius <= 0.0:
         raise ValueError("cylinder(x, y, radius) with a radius above 0")
     return [_between(_around(x, y, radius), heights)]
@@ -264,7 +265,7 @@ def cylinder(x: float, y: float, radius: float, *heights: float) -> list[Zone]:
 
 def _between(corners: Array, heights: Sequence[float]) -> Zone:
     if len(heights) not in (0, 2) or not all(map(float.__lt__, heights[::2], heights[1::2])):
-        raise ValueError("two heights behind all else, from less to more, or none")
+        raise ValueError("two heights at the end, from less to more, or none")
     low, high = heights or (-math.inf, math.inf)
     return Zone("", corners, low, high)
 
@@ -288,14 +289,14 @@ def fence(*corners: float) -> list[Zone]:
 
 @ZONES
 def corridor(width: float, *middle: float) -> list[Zone]:
-    """Corridor to stay within: its width, and x, y of each point of its middle."""
+    """Corridor to stay within: its width, and x, y of each point of its centre line."""
     points = _points(middle, 2, "corridor")
     way = np.diff(points, axis=0)
     long = np.linalg.norm(way, axis=1, keepdims=True)
     if width <= 0.0 or (long < 1e-6).any():
         raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
     across = np.stack([-way[:, 1], way[:, 0]], axis=1) / long
-    # The sides meet where two pieces do, on the line that halves their angle.
+    # Mitre joints: the sides of two segments meet on the bisector of their angle.
     ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])
     square = (ends**2).sum(axis=1, keepdims=True)
     if (square[1:-1] < 0.1).any():
@@ -307,70 +308,68 @@ def corridor(width: float, *middle: float) -> list[Zone]:
 
 @ZONES
 def geojson(file: File) -> list[Zone]:
-    """Features of a GeoJSON file, see docs/together.md."""
+    """Zones in a GeoJSON file, see docs/together.md."""
     try:
         collection = json.loads(file.content)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"a GeoJSON file ({error})") from None
-    found: list[Zone] = []
+    zones: list[Zone] = []
     corners = 0
     for zone in _features(file.name.rpartition("/")[2], collection):
-        found.append(zone)
+        zones.append(zone)
         corners += len(zone.corners)
-        if corners > CORNERS_MAX:  # each ring takes a time in the square of its corners
+        if corners > CORNERS_MAX:  # checking a ring takes quadratic time in its corners
             raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
-    if not found:
+    if not zones:
         raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
-    return found
+    return zones
 
 
-def _features(file: str, told: Any) -> Iterator[Zone]:
+def _features(file: str, collection: Any) -> Iterator[Zone]:
     """Zones of a FeatureCollection.
 
-    Coordinates are degrees, as RFC 7946 has it, and the member `origin` of the collection is the
-    longitude and latitude of the scenario's origin. In place of it, the member `"units": "m"` says
-    that coordinates are metres. A feature's properties may be `kind` ("keep_out" or "fence"),
-    `low_m`, `high_m`, and `radius_m` of a Point.
+    Coordinates are degrees as in RFC 7946, and the collection's member `origin` has longitude and
+    latitude of the scenario's origin. Instead, a member `"units": "m"` makes coordinates metres.
+    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and
+    `radius_m` for a Point.
 
     Raises:
-        ValueError: with what is wrong.
+        ValueError: the collection is invalid, or too large.
+        GrammarError: a feature is invalid; says which and what was expected.
     """
-    whole = isinstance(told, dict) and told.get("type") == "FeatureCollection"
-    if not (whole and isinstance(told.get("features"), list)):
+    whole = isinstance(collection, dict) and collection.get("type") == "FeatureCollection"
+    if not (whole and isinstance(collection.get("features"), list)):
         raise ValueError("a GeoJSON file with a FeatureCollection")
-    placed, corners = _frame(told), 0
-    for i, feature in enumerate(told["features"]):
-        name = f"{file}: feature {i + 1}"
+    placed, corners = _frame(collection), 0
+    for i, feature in enumerate(collection["features"]):
         try:
             for zone in _feature(file, i, feature, placed):
                 yield zone
                 corners += len(zone.corners)
                 if corners > CORNERS_MAX:
-                    return  # as `parse` says
-        except (KeyError, TypeError, AttributeError, IndexError) as error:
-            raise ValueError(
-                f"{name} as RFC 7946 has it, {type(error).__name__}: {error}"
-            ) from None
-        except ValueError as error:
-            raise ValueError(f"{name} with {error}") from None
+                    return  # `geojson` raises
+        except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+            said = isinstance(error, ValueError)
+            expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
+            raise GrammarError(f"{file}: feature {i + 1}", expected) from None
 
 
-def _frame(told: dict[str, Any]) -> Frame:
+def _frame(collection: dict[str, Any]) -> Frame:
     """Function from coordinates to metres east and north of the scenario's origin.
 
     Raises:
-        ValueError: the collection does not say what its coordinates are.
+        ValueError: the unit or the origin of the coordinates is missing or invalid.
     """
-    crs, units, origin = told.get("crs"), told.get("units"), told.get("origin")
+    crs, units, origin = collection.get("crs"), collection.get("units"), collection.get("origin")
     if crs not in (None, CRS84):
         raise ValueError(f"no crs, for RFC 7946 has degrees of WGS 84, got {str(crs)[:80]}")
     if units not in (None, "m"):
         raise ValueError(f'"units": "m" or none, got {str(units)[:80]!r}')
     if (units is None) == (origin is None):
-        given = "neither" if origin is None else "both"
+        got = "neither" if origin is None else "both"
         raise ValueError(
-            'a member "origin" with the longitude and latitude of the scenario\'s origin, for '
-            f'coordinates are degrees, or "units": "m" where they are metres; got {given}'
+            'a member "origin" with the longitude and latitude of the scenario\'s origin, if '
+            f'coordinates are degrees, or "units": "m" if they are metres; got {got}'
         )
     if origin is None:
         return lambda points: _near(_places(points), METRES_MAX)
@@ -386,22 +385,28 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     """Zones of the feature with index i.
 
     Raises:
-        ValueError: with what is wrong.
-        KeyError, TypeError, AttributeError, IndexError: it is no feature.
+        ValueError: a value is invalid.
+        KeyError, TypeError, AttributeError, IndexError: it has not the structure of a feature.
     """
     properties, geometry = feature.get("properties") or {}, feature["geometry"]
     kind = None if geometry is None else geometry["type"]
     if kind not in ("Polygon", "MultiPolygon", "Point"):
-        raise ValueError(f"a Polygon, a MultiPolygon or a Point, got {kind}")
+        raise ValueError(f"a Polygon, a MultiPolygon or a Point with radius_m, not a {kind}")
     low = _number(properties.get("low_m", -math.inf), "low_m")
     high = _number(properties.get("high_m", math.inf), "high_m")
     if not low < high:
         raise ValueError(f"low_m below high_m, got {low:g} and {high:g}")
-    is_fence = {"keep_out": False, "fence": True}[properties.get("kind", "keep_out")]
+    role = properties.get("kind", "keep_out")
+    if role not in ("keep_out", "fence"):
+        raise ValueError(f"the property kind to be keep_out or fence, got {str(role)[:80]!r}")
+    is_fence = role == "fence"
     zone = Zone(f"{file}: {properties.get('name', f'feature {i + 1}')}", _NOWHERE, low, high)
     coordinates = geometry["coordinates"]
     if kind == "Point":
         ((x, y),) = placed([coordinates]).tolist()
+        if "radius_m" not in properties:
+            known = ", ".join(map(str, properties))[:80] or "no properties"
+            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
         radius = _number(properties["radius_m"], "radius_m")
         if not 0.0 < radius <= METRES_MAX:
             raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")
@@ -409,21 +414,25 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
         return
     parts = [coordinates] if kind == "Polygon" else coordinates
     if is_fence and len(parts) > 1:
-        raise ValueError("one polygon, for nobody can stay within several fences beside each other")
+        raise ValueError("one polygon: no vehicle can stay within several separate fences")
     if not (isinstance(parts, list) and parts and all(parts)):
         raise ValueError("coordinates, got none")
     for rings in parts:
-        # A hole in a fence is kept out of; in what is kept out of it changes nothing.
+        # A hole in a fence is a zone to keep out of. Other holes are ignored: they cannot be
+        # entered.
+        if len(rings) > 1 and not is_fence:
+            zone = zone._replace(name=f"{zone.name}, with its holes")
         for number, points in enumerate(rings if is_fence else rings[:1]):
             corners = _ring(placed(points))
-            yield zone._replace(corners=corners, is_fence=is_fence and number == 0)
+            name = f"{zone.name}, hole {number}" if number else zone.name
+            yield zone._replace(name=name, corners=corners, is_fence=is_fence and number == 0)
 
 
 def _ring(places: Array) -> Array:
-    """Corners of a polygon's ring, whose last point repeats the first; of either winding.
+    """Corners of a polygon's ring, without a last point that repeats the first; of either winding.
 
     Raises:
-        ValueError: it encloses nothing, or what it encloses is not clear.
+        ValueError: there are fewer than 3 corners, or the border crosses itself.
     """
     if len(places) > 3 and (places[0] == places[-1]).all():
         places = places[:-1]
@@ -449,10 +458,10 @@ def _crosses_itself(corners: Array) -> bool:
 
 
 def _number(given: Any, key: str = "origin") -> float:
-    """A number, and not a text, a truth value or NaN.
+    """Value of a member as a number.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is a text, a truth value, NaN or something else.
     """
     if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
         raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
@@ -460,7 +469,7 @@ def _number(given: Any, key: str = "origin") -> float:
 
 
 def _places(points: Any) -> Array:
-    """Coordinates as they are written; shape (n, 2).
+    """Coordinates as in the file; shape (n, 2).
 
     Raises:
         ValueError: they are no coordinates, or have heights.
@@ -476,14 +485,17 @@ def _places(points: Any) -> Array:
 
 
 def _local(degrees: Array, east: float, north: float) -> Array:
-    """Metres east and north of the origin, of places by longitude and latitude; shape (n, 2).
+    """Metres east and north of the origin, from longitude and latitude [degrees]; shape (n, 2).
 
-    Degrees are as long as at the mean of the two latitudes, as ArduPilot reckons.
+    A degree of longitude has its length at the mean of the two latitudes, as in ArduPilot.
+
+    Raises:
+        ValueError: a coordinate is out of range.
     """
     longitude, latitude = degrees.T
     if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
         raise ValueError("coordinates of longitude and latitude")
-    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # the shorter way over the antimeridian
+    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # works across the antimeridian
     degree = math.radians(1.0) * EARTH_M
     scale = np.cos(np.radians((latitude + north) / 2.0))
     return _near(

@@ -14,6 +14,7 @@ import msgspec
 class DirectionCounts(msgspec.Struct, frozen=True):
     """Packets that netem did not forward in one direction, see `netem.link.Counts`."""
 
+    undelivered: int = 0
     lost: int = 0
     oversized: int = 0
     overflowed: int = 0
@@ -31,6 +32,8 @@ class ProcessCounts(msgspec.Struct, frozen=True):
 
     dropped: dict[str, int] = {}
     by_vehicle: dict[str, VehicleCounts] = {}
+    others_dropped: dict[str, int] = {}
+    """A client's, of the vehicles that `by_vehicle` leaves out."""
     uplink: DirectionCounts = DirectionCounts()
     downlink: DirectionCounts = DirectionCounts()
     refused: int | dict[str, int] = 0
@@ -47,22 +50,26 @@ def counted(figures: Mapping[str, Any]) -> ProcessCounts:
     return msgspec.convert(figures, ProcessCounts)
 
 
-def drops(figures: Mapping[str, Mapping[str, Any]], vehicle: int) -> dict[str, dict[str, int]]:
+def drops(
+    figures: Mapping[str, Mapping[str, Any]], vehicle: int | None = None
+) -> dict[str, dict[str, int]]:
     """Number of packets that each process dropped, by reason; only reasons that occurred.
 
     Args:
         figures: of each process, by its name; those of a server's workers are added up.
-        vehicle: number of the vehicle, of all that a client flies.
+        vehicle: number of the vehicle, of all that a client flies; None: all of them.
     """
     totals: dict[str, Counter[str]] = {}
     for name, each in figures.items():
         process = counted(each)
         total = totals.setdefault(name.partition(".")[0], Counter())
         total.update(process.dropped)
-        total.update(process.by_vehicle.get(str(vehicle), VehicleCounts()).dropped)
+        for number, counts in process.by_vehicle.items():
+            total.update(counts.dropped if vehicle in (None, int(number)) else {})
+        total.update(process.others_dropped if vehicle is None else {})
         for direction in ("uplink", "downlink"):
-            counts = msgspec.structs.asdict(getattr(process, direction))
-            total.update({f"{direction} {reason}": count for reason, count in counts.items()})
+            lost = msgspec.structs.asdict(getattr(process, direction))
+            total.update({f"{direction} {reason}": count for reason, count in lost.items()})
         if isinstance(process.refused, int):
             total["refused"] += process.refused
         total["kernel"] += process.kernel_drops

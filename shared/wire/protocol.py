@@ -60,11 +60,11 @@ KNOTS_MAX = 16
 STAMPS = 2**32
 """Modulus of time stamps [µs]: 71 minutes."""
 
-LED_P = 0
+REFERENCE_P = 0
 """Column of `Horizon.feedback`: position of x̄ at the horizon's step [m]."""
-LED_V = 1
+REFERENCE_V = 1
 """Column of `Horizon.feedback`: velocity of x̄ at that step [m/s]."""
-LED = [LED_P, LED_V]
+REFERENCE = [REFERENCE_P, REFERENCE_V]
 """Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
 """Column of `Horizon.feedback`: disturbance ŵ that the inputs compensate [m/s]."""
@@ -207,8 +207,8 @@ class Horizon(NamedTuple):
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
-    """Parameters of the feedback aboard, in the columns LED_P … GAIN_V; shape (axes, FEEDBACK), or
-    (axes, 0) without feedback."""
+    """Parameters of the feedback aboard, in the columns REFERENCE_P … GAIN_V; shape (axes,
+    FEEDBACK), or (axes, 0) without feedback."""
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0

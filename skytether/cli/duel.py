@@ -1,4 +1,4 @@
-"""`skytether duel`: two scenarios on the same network and seed, side by side on one page."""
+"""`skytether duel`: scenarios on the same network and seed, side by side on one page."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,59 +32,59 @@ from skytether.view.frames import of_flight
 class DuelOptions:
     """Options of `skytether duel`."""
 
-    one: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
-    other: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
-    """Second scenario: a name or a .toml file; it takes the network, duration and seed of the
-    first."""
+    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
+    """Two or more names of scenarios (see `skytether scenarios`) or .toml files; the others take
+    the network, duration and seed of the first."""
     duration: float | None = None
-    """Length of both flights [s]; the first scenario's unless given."""
+    """Length of the flights [s]; the first scenario's unless given."""
     seed: int | None = None
-    """Seed of both flights; the first scenario's unless given."""
+    """Seed of the flights; the first scenario's unless given."""
     virtual: bool = False
-    """Fly in virtual time; the page shows both flights afterwards, until Ctrl-C."""
+    """Fly in virtual time; the page shows the flights afterwards, until Ctrl-C."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; where that is taken, the next free port."""
     plugin: command.Plugins = ()
 
 
 def duel(argv: Sequence[str]) -> None:
-    """Fly two scenarios side by side, and show both on one page.
+    """Fly scenarios side by side, and show them on one page.
 
-    Both meet the same network, wind and seed; what is changed on the page changes for both. Ctrl-C
-    ends both.
+    All meet the same network, wind and seed; what is changed on the page changes for all. Ctrl-C
+    ends them.
     """
-    missing = DuelOptions(tyro.MISSING, tyro.MISSING)
-    options = read(missing, argv, "skytether duel", duel.__doc__)
+    options = read(DuelOptions(tyro.MISSING), argv, "skytether duel", duel.__doc__)
     at = command.address("--page", options.page)
-    one, other = both(options)
-    names = titles(options.one, options.other)
+    scenarios = together(options)
+    names = titles(options.scenarios)
     terminal.prepare(kernel.missing())
     if options.virtual:
-        flown = [flight.fly(each) for each in (one, other)]
         frames = [
-            list(of_flight(scenario, name, each))
-            for scenario, name, each in zip((one, other), names, flown, strict=True)
+            list(of_flight(scenario, name, flight.fly(scenario)))
+            for scenario, name in zip(scenarios, names, strict=True)
         ]
         flights = [PageFlight(name) for name in names]
         with closing(Player(flights, frames)) as player:
             until_told(at, flights, now_ns=player.now_ns, more=player.controls)
         return
-    _really((one, other), names, options.page)
+    _really(scenarios, names, options.page)
 
 
-def both(options: DuelOptions) -> tuple[Scenario, Scenario]:
-    """The two scenarios, with the same network, duration and seed.
+def together(options: DuelOptions) -> list[Scenario]:
+    """The scenarios, with the same network, duration and seed.
 
     Raises:
+        CommandError: there are fewer than two.
         ConfigError: a scenario cannot be flown.
     """
+    if len(options.scenarios) < 2:
+        said = f"got {len(options.scenarios)} scenario, expected two or more"
+        raise CommandError(said, command.CONFIGURATION)
     given = {"duration": options.duration, "seed": options.seed}
     asked = {key: value for key, value in given.items() if value is not None}
-    one = msgspec.structs.replace(reading.load_base(options.one), **asked)
-    same = {key: getattr(one, key) for key in ("duration", "seed", "settle", "network")}
-    other = msgspec.structs.replace(reading.load_base(options.other), **same)
-    return checked(one, options.one), checked(other, options.other)
+    first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **asked)
+    same = {key: getattr(first, key) for key in ("duration", "seed", "settle", "network")}
+    laid = (msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios)
+    return [checked(each, name) for each, name in zip(laid, options.scenarios, strict=True)]
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
@@ -96,14 +96,16 @@ def checked(scenario: Scenario, name: str) -> Scenario:
     return reading.check(reading.to_table(scenario), name)
 
 
-def titles(one: str, other: str) -> tuple[str, str]:
-    """Short names of two scenarios, made different where both have the same name."""
-    names = Path(one).stem, Path(other).stem
-    return names if names[0] != names[1] else (f"{names[0]} 1", f"{names[1]} 2")
+def titles(names: Sequence[str]) -> list[str]:
+    """Short names of scenarios, numbered where two have the same name."""
+    short = [Path(name).stem for name in names]
+    return [
+        name if short.count(name) == 1 else f"{name} {place}" for place, name in enumerate(short, 1)
+    ]
 
 
 def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> None:
-    """Fly both scenarios over UDP at once, each with its own processes."""
+    """Fly the scenarios over UDP at once, each with its own processes."""
 
     def fly(scenario: Scenario, sockets: Path) -> Record:
         run = partial(processes.run, on_second=on_second, interrupted=interrupted, sockets=sockets)

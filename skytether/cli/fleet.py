@@ -27,6 +27,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, plugins, terminal
@@ -101,6 +102,8 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Packets that the network lost, both ways."""
     dropped: int
     """Packets that the kernels' and netem's full queues dropped, which no scenario asks for."""
+    drops: dict[str, dict[str, int]]
+    """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     tick_ms_p50: float
     """Median time that a server's tick took, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
@@ -140,9 +143,8 @@ def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over a network of its own.
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
-    process. The cost of the server's work is shown per vehicle and step. Every key of the scenario
-    is a flag, as in `--control.trigger always`. Ctrl-C ends the flight and still shows what was
-    flown.
+    process. The cost of the server's work is shown per vehicle and step. Ctrl-C ends the flight and
+    still shows what was flown.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -306,7 +308,7 @@ def _vehicles(options: FleetOptions) -> int:
     """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
-    mission = options.config.given_reference()
+    mission = options.config.unallocated_reference()
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (None, count):
@@ -371,6 +373,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
         + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
+        drops=drops(counted),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
@@ -405,6 +408,7 @@ def _show(summary: FleetSummary, title: str) -> None:
             ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),
         ),
         ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        *terminal.drops(s.drops),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
         ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
         (

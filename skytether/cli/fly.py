@@ -2,11 +2,12 @@
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -33,6 +34,7 @@ from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command, temporary, terminal
 from skytether.shell.command import CommandError, ScenarioOptions
+from skytether.shell.options import Argument
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
@@ -78,15 +80,15 @@ class FlyOptions(ScenarioOptions):
     """File for a recording of the flight (.mcap): all rows and events of its processes, written
     during the flight. See `skytether report`, `replay` and `export`; Foxglove and Lichtblick can
     show the file."""
-    beside: str | None = None
-    """Second scenario to compare with, flown in virtual time with the same duration and seed."""
+    beside: Annotated[tuple[str, ...], Argument(metavar="SCENARIO", append=True)] = ()
+    """Scenario to compare with, flown in virtual time with the same duration and seed; may come
+    several times."""
 
 
 def fly(argv: Sequence[str]) -> None:
     """Fly a scenario: server, netem and client as processes on loopback, or in virtual time.
 
-    Every key of the scenario is a flag, as in `--control.trigger always`. Ctrl-C ends the flight
-    and still shows what was flown.
+    Ctrl-C ends the flight and still shows what was flown.
     """
     options = command.parse(FlyOptions(), argv, "skytether fly", fly.__doc__)
     scenario = options.config
@@ -107,8 +109,8 @@ def fly(argv: Sequence[str]) -> None:
     vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
     page = None if options.virtual or options.no_page else options.page
     with page_process.paged(page, options.control) as sockets:
-        both = [scenario, beside] if beside else [scenario]
-        terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, both))))
+        together = [scenario, *beside.values()]
+        terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, together))))
         with (
             command.interruptible() as interrupted,
             terminal.progress(f"flying {title}", scenario.duration) as on_second,
@@ -129,7 +131,7 @@ def _show(
     title: str,
     flown: Record,
     unrecorded: str | None,
-    beside: Scenario | None,
+    beside: Mapping[str, Scenario],
 ) -> None:
     """Print the flight's summary, and write its picture.
 
@@ -146,11 +148,10 @@ def _show(
         code = command.RUN if missing else command.INTERRUPTED
         raise CommandError(missing or "interrupted before the first step", code)
     flights = {title: (scenario, flown)}
-    if beside:
-        other = flight.fly(beside)
-        other_title = f"{options.beside}, in virtual time, seed {beside.seed}"
-        flights[other_title] = beside, other
-        terminal.finish(_summarise(beside, str(options.beside), other), other_title)
+    for name, other in beside.items():
+        other_title = f"{name}, in virtual time, seed {other.seed}"
+        flights[other_title] = other, flight.fly(other)
+        terminal.finish(_summarise(other, name, flights[other_title][1]), other_title)
     summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
     terminal.finish(summary, title, options.json)
     if options.figure:
@@ -177,13 +178,15 @@ def _make_folder(folder: Path, *, virtual: bool) -> None:
         raise CommandError(said, command.CONFIGURATION) from None
 
 
-def _beside(options: FlyOptions) -> Scenario | None:
-    if options.beside is None:
-        return None
+def _beside(options: FlyOptions) -> dict[str, Scenario]:
+    """Scenarios to compare with, by their names."""
     same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
     try:
-        laid = msgspec.structs.replace(reading.load_base(options.beside), **same)
-        return reading.check(reading.to_table(laid), options.beside)
+        laid = {
+            name: msgspec.structs.replace(reading.load_base(name), **same)
+            for name in options.beside
+        }
+        return {name: reading.check(reading.to_table(each), name) for name, each in laid.items()}
     except ConfigError as error:
         raise CommandError(str(error), command.CONFIGURATION) from None
 

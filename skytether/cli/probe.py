@@ -7,20 +7,33 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from skytether.client.link import ClientLink, PlainLink
+from skytether.probe import recorded
+from skytether.probe.analysis import Delays
 from skytether.probe.listener import Listener
-from skytether.probe.outcome import DirectionFigures, ProbeOutcome, outcome, rows, trace
-from skytether.probe.prober import BYTES_MIN, PROBES_MAX, Prober
+from skytether.probe.outcome import (
+    DirectionFigures,
+    PathFigures,
+    ProbeOutcome,
+    outcome,
+    rows,
+    trace,
+)
+from skytether.probe.prober import BYTES_MIN, PROBES_MAX, MeasuredPath, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Counted, Event, Listening
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.air.recorded import recorded_in
+from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
@@ -48,6 +61,9 @@ class ProbeOptions:
     """Address of the other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """Run as the listening end: answer probes at this address until Ctrl-C."""
+    files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
+    """Measure nothing, and read a log instead: of ping, fping or irtt, or a table. Or two captures
+    of one UDP flow (pcap), that of the vehicle's end first: --from NEAR --from FAR."""
     seconds: float = 60.0
     """Length of the measurement [s]."""
     rate: float = 20.0
@@ -78,16 +94,19 @@ def probe(argv: Sequence[str]) -> None:
     One end listens; the other sends numbered packets, which are answered, and prints the results.
     Run it where the vehicle will be, and the listener where the server will be: then its packets
     take the downlink, and the answers the uplink. Ctrl-C ends the measurement and prints what was
-    measured.
+    measured. With --from it does the same with what another program has recorded.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
-    if bool(options.target) == (options.listen is not None):
-        given = "both" if options.target else "neither"
+    given = bool(options.target) + (options.listen is not None) + bool(options.files)
+    if given != 1:
         said = (
-            f"got {given}, expected either HOST:PORT to measure the way to, or --listen HOST:PORT"
+            f"got {'both' if given else 'neither'}, expected either HOST:PORT to measure the way "
+            "to, or --listen HOST:PORT, or --from FILE"
         )
         raise CommandError(said, CONFIGURATION)
-    if options.listen is not None:
+    if options.files:
+        _read(options)
+    elif options.listen is not None:
         _listen(options, command.address("--listen", options.listen))
     else:
         _probe(options, command.address("HOST:PORT", options.target))
@@ -178,15 +197,64 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         found = outcome(measured, options.target, secure=link.secure)
     except ValueError as error:
         raise CommandError(f"too little was measured: {error}") from None
-    _write(options, found)
-    if options.record:
-        _record(options.record, rows(measured, found.clocks))
-    _tell(options, found)
+    _conclude(options, measured, found)
     if not prober.finished:
         seconds = found.told.seconds
         raise CommandError(
             f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
         )
+
+
+def _conclude(options: ProbeOptions, measured: MeasuredPath, found: ProbeOutcome) -> None:
+    """Write and print the results."""
+    _write(options, found)
+    if options.record:
+        _record(options.record, rows(measured, found.clocks))
+    _tell(options, found)
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def _read(options: ProbeOptions) -> None:
+    """Read a log or two captures, and print and write the results."""
+    _check(options)
+    read = [File(str(path), _content(path)) for path in options.files]
+    captures = sum(recorded.is_capture(file.content) for file in read)
+    names = " and ".join(file.name for file in read)
+    if (len(read), captures) not in ((1, 0), (2, 2)):
+        said = f"got {len(read)} files, of which {captures} are captures"
+        expected = "one log, or two captures of one flow, that of the vehicle's end first"
+        raise CommandError(f"--from: {said}, expected {expected}", CONFIGURATION)
+    try:
+        if captures:
+            log: Literal["", "round trips", "one way"] = ""
+            measured = recorded.of_captures(read[0].content, read[1].content)
+        else:
+            path = recorded_in(read[0])
+            log = "round trips" if path.halved else "one way"
+            measured = recorded.of_log(path)
+        found = outcome(measured, names, secure=False, log=log)
+    except ValueError as error:
+        where = f"{names}: " if captures else ""
+        raise CommandError(f"--from: {where}{error}", CONFIGURATION) from None
+    _conclude(options, measured, found)
+
+
+def _content(path: Path) -> bytes:
+    """Content of a file.
+
+    Raises:
+        CommandError: it cannot be read.
+    """
+    try:
+        return files.read(path, reading.FILES["network.uplink"][1])
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise CommandError(f"--from: {path}: cannot be read: {reason}", CONFIGURATION) from None
+
+
+# -- what is checked, written and printed ---------------------------------------------------------
 
 
 def _say(event: Event) -> None:
@@ -258,26 +326,57 @@ def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
     """Print tables of both directions, doubts about them, and the network text to fly."""
     told = found.told
     ways = {"downlink": told.downlink, "uplink": told.uplink}
-    terminal.show(_table(ways))
-    terminal.show(_models(ways))
-    doubt = f"{told.drift_doubt_ppm:.1f} ppm"
-    drift = f"no significant drift (standard error {doubt})"
-    if told.drift_ppm:
-        drift = f"the other end's gains {told.drift_ppm:+.1f} ± {doubt}"
-    print(
-        f"Clocks: {drift}. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms "
-        f"and {1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
-        f"least is taken for each way, so one-way delays may be wrong by up to "
-        f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
-    )
+    shown = {"each way": told.downlink} if told.log else ways
+    terminal.show(_table(shown))
+    terminal.show(_models(shown))
+    print(_of_log(told) if told.log else _of_clocks(told))
+    if told.log and not told.uplink.bursts and (missing := _missing(found.delays["uplink"])):
+        print(
+            f"The file has no row for {missing} packets between even ones {told.every_s:.3g} s "
+            "apart. If they were lost, give each a row with its time and no delay."
+        )
     if told.unreported:
-        print(f"{told.unreported} arrivals were forgotten by the other end, and are left out.")
+        print(f"{told.unreported} packets are left out: forgotten by the other end, or not unique.")
     print("To fly over the models, or over what was measured:")
     texts = [f'--network.{name} "{way.text}"' for name, way in ways.items() if way.text]
     if texts:
         print(f"skytether fly demo --virtual {' '.join(texts)}")
     traces = [f'--network.{name} "trace({options.out / name}.csv)"' for name in ways]
     print(f"skytether fly demo --virtual {' '.join(traces)}")
+
+
+def _missing(delays: Delays) -> int:
+    """Number of packets that are missing between packets that were sent at an even rate."""
+    if len(delays.time_s) < 3:
+        return 0
+    apart_s = np.diff(delays.time_s)
+    return int(np.maximum(np.rint(apart_s / max(np.median(apart_s), 1e-9)) - 1.0, 0.0).sum())
+
+
+def _of_log(told: PathFigures) -> str:
+    """What a log does not know, and what is taken for it."""
+    if told.log == "one way":
+        return "Clocks: unknown. The file has the delays of one way, which both ways are given."
+    return (
+        f"The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms and "
+        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean. Each way is given half of it, and all "
+        "losses: which way a packet took long or was lost on is not in the file. So the way that "
+        "is slow may take up to twice as long, and with both ways up to twice as many are lost."
+    )
+
+
+def _of_clocks(told: PathFigures) -> str:
+    """What is known of the two clocks, and how far one-way delays may be wrong."""
+    doubt = f"{told.drift_doubt_ppm:.1f} ppm"
+    drift = f"no significant drift (standard error {doubt})"
+    if told.drift_ppm:
+        drift = f"the other end's gains {told.drift_ppm:+.1f} ± {doubt}"
+    return (
+        f"Clocks: {drift}. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms "
+        f"and {1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
+        f"least is taken for each way, so one-way delays may be wrong by up to "
+        f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
+    )
 
 
 def _figures(way: DirectionFigures) -> dict[str, str]:

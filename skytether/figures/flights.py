@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.figures.page import blank
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import Record, Rows
-from skytether.shared.telemetry.summary import desired, position_error
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
+from skytether.shared.telemetry.summary import desired, position_error, summarise
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,34 +58,63 @@ def save(figure: "Figure", path: Path, *, dpi: int) -> None:
 
 
 def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
-    """Flights side by side: the path over the reference, and below it the times of uplink packets.
+    """Flights side by side: the path over the reference, and below it the packets in each second.
 
     Args:
         flown: scenario and record of each flight, by title.
     """
-    figure = blank(5.2 * len(flown), 5.6)
+    figure = blank(4.1 * len(flown) + 1.0, 5.4)
     grid = figure.subplots(
-        2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(6, 1)
+        2, len(flown), squeeze=False, sharex="row", sharey="row", height_ratios=(5, 2)
     )
-    for (title, (scenario, flight)), (plane, events) in zip(flown.items(), grid.T, strict=True):
-        dt = scenario.control.dt
-        position = flight.client["state"][..., 0]
-        draw_reference(plane, scenario, flight.client, flight.server)
-        plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
-        plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
-        plane.set_title(title, fontsize=10)
-        plane.set_xlabel("x [m]")
-        plane.set_aspect("equal", adjustable="box")
-        plane.grid(alpha=0.3)
-        sent = flight.server["event"]
-        ratio = float(np.mean(sent)) if len(sent) else 0.0
-        events.vlines(flight.server["step"][sent] * dt, 0.0, 1.0, color="k", linewidth=0.6)
-        events.set_xlabel(f"time [s]; sent at {ratio:.0%} of the steps")
-        events.set_yticks([])
-    grid[0, 0].set_ylabel("y [m]")
+    for (title, (scenario, flight)), (plane, packets) in zip(flown.items(), grid.T, strict=True):
+        summary = summarise(scenario, title, flight.client, flight.server, flight.netem)
+        off = "" if summary.rmse_xy is None else f"\n{summary.rmse_xy:.3f} m off (RMSE)"
+        draw_path(plane, scenario, flight)
+        plane.set_title(f"{title}{off}", fontsize=10)
+        arrived_s = flight.netem["arrived_ns"] / SECOND_NS
+        arrived_s -= arrived_s.min(initial=np.inf)
+        draw_packets(packets, scenario, flight.netem["direction"], arrived_s)
+        sent = (
+            "" if summary.event_ratio is None else f"; sent at {summary.event_ratio:.0%} of steps"
+        )
+        packets.set_xlabel(f"time from the first packet [s]{sent}")
+        packets.grid(alpha=0.3)
+    for plane in grid[0, 1:]:
+        plane.set_ylabel("")
     grid[0, 0].legend(loc="upper right", fontsize=8)
-    grid[1, 0].set_ylabel("sent")
+    grid[1, 0].set_ylabel("packets per s")
+    grid[1, -1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     return figure
+
+
+def draw_path(plane: "Axes", scenario: Scenario, flight: Record) -> None:
+    """Draw a flight's path over its reference."""
+    position = flight.client["state"][..., 0]
+    draw_reference(plane, scenario, flight.client, flight.server)
+    plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
+    plane.plot(position[0, 0], position[0, 1], "ko", markersize=4, label="start")
+    plane.set_xlabel("x [m]")
+    plane.set_ylabel("y [m]")
+    plane.set_aspect("equal", adjustable="box")
+    plane.grid(alpha=0.3)
+
+
+def draw_packets(
+    axes: "Axes", scenario: Scenario, direction: NDArray[np.uint8], arrived_s: Array
+) -> None:
+    """Draw how many packets entered the network in each second, up and down.
+
+    Args:
+        direction: UPLINK or DOWNLINK of each packet; shape (n,).
+        arrived_s: time at which each entered the network, 0 at the left end [s]; shape (n,).
+    """
+    seconds = np.arange(int(arrived_s.max(initial=0.0)) + 2)
+    axes.axhline(1.0 / scenario.control.dt, color="r", linestyle="--", zorder=0, label="every step")
+    for way, name, color, width in ((UPLINK, "up", "k", 2.0), (DOWNLINK, "down", "#3fa7e0", 1.0)):
+        counts, _ = np.histogram(arrived_s[direction == way], seconds)
+        axes.stairs(counts, seconds, color=color, label=name, linewidth=width)
+    axes.set_ylim(bottom=0.0)
 
 
 def draw_reference(

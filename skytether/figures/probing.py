@@ -6,6 +6,7 @@ import numpy as np
 
 from skytether.figures.page import blank
 from skytether.probe.outcome import ProbeOutcome
+from skytether.probe.prober import TRAIN, TRAIN_SLOTS
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.scenario.air.delays import Delay
 from skytether.shared.scenario.air.path import path
@@ -32,8 +33,14 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
         over_time.plot(time_s[came], delay_ms[came], ".", markersize=2, color="tab:blue")
         lost_s = time_s[~came]
         over_time.plot(lost_s, np.zeros(len(lost_s)), "|", markersize=8, color="tab:red")
+        ends = np.flatnonzero(np.diff(delays.time_s) > TRAIN_SLOTS / 2 * outcome.told.every_s)
+        for end in ends.tolist():
+            over_time.axvspan(*delays.time_s[end : end + 2], color="0.9", linewidth=0)
         over_time.set_title(
-            f"{name}: {told.sent} packets, {told.loss:.2%} lost (red)", fontsize=10, loc="left"
+            f"{name}: {told.sent} packets, {told.loss:.2%} lost (red)"
+            f"{f'; grey: {TRAIN} at once, to measure the rate' if len(ends) else ''}",
+            fontsize=10,
+            loc="left",
         )
         over_time.set_ylabel("delay [ms]")
         sorted_ms = np.sort(1e3 * delays.delay_s[delays.came])

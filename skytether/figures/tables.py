@@ -14,8 +14,8 @@ FORMULA = ("=", "+", "-", "@")
 def _plain(value: Any) -> Any:
     """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe in front; a number does
-    not. A terminal that shows the table obeys nothing in it.
+    A text that a spreadsheet would take as a formula gets an apostrophe in front. Control
+    characters are escaped by `printable`, so that they cannot affect a terminal.
     """
     if isinstance(value, bool):
         return str(value).lower()
@@ -34,7 +34,7 @@ def _is_number(text: str) -> bool:
 
 
 def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Table as CSV text, from rows with equal keys; empty where there are none."""
+    """CSV text of rows with equal keys; empty without rows."""
     return to_csv(list(rows[0]), [list(row.values()) for row in rows]) if rows else ""
 
 

@@ -1,1 +1,1 @@
-"""Laboratory: figures, comparisons and searches made from many flights."""
+"""Laboratory: studies, comparisons and searches made of many flights, and their figures."""

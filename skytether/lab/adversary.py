@@ -1,13 +1,11 @@
-"""Adversary: chooses what network, server and operator do, to bring two vehicles together.
+"""Adversary: a search for events in a mission that bring two vehicles together, in virtual time.
 
-    clients ── air ── server          on a mission, in virtual time
-
-A flight follows from its scenario and the adversary's moves: delays, losses, cuts and copies of
-packets, restarts of the server and of clients, goals and zones that are set in flight. The search
-climbs: it changes the best moves so far, keeps the change where it brings two vehicles nearer to
-each other, or one nearer to a zone, and begins anew where changes no longer help. Some changes aim
-at single packets of the nearest two, shortly before they are nearest. Moves are data: flown again,
-they give the same distance to the last bit.
+A flight is determined by its scenario and the adversary's moves: delays, losses, cuts and copies of
+packets, restarts of the server and of clients, and goals and zones set in flight. The search is a
+hill climb with restarts: it changes the best moves so far, and keeps a change that brings two
+vehicles nearer to each other, or one nearer to a zone. Some changes target single packets of the
+nearest two vehicles, shortly before they are nearest. A flight with the same moves gives the same
+distances, bit for bit.
 """
 
 import math
@@ -40,78 +38,78 @@ BASE_NS = 50 * MILLISECOND_NS
 ARRIVED_M, RESTS_MPS = 0.3, 0.1
 """Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
 AIMED_NS = 10 * SECOND_NS
-"""Time before two vehicles are nearest that changes aim at [ns]."""
+"""Length of the time before the nearest approach that targeted changes are in [ns]."""
 ONE_NS = MILLISECOND_NS
 """Length of a move against a single packet [ns]."""
 MOVES_MAX = 64
-"""Largest number of moves by default."""
+"""Default of the largest number of moves."""
 DRAWN = 10
-"""Tries drawn at random, with the best of which a climb begins."""
+"""Number of random tries; the climb starts from the best."""
 PATIENCE = 40
-"""Tries without gain after which the search begins anew."""
+"""Number of tries without improvement after which the search restarts."""
 CLIMB = 100
-"""Most tries of one climb."""
+"""Largest number of tries of one climb."""
 
 
-class Kind(StrEnum):
+class MoveKind(StrEnum):
     """Kind of a move."""
 
     DELAYS = "delays"
-    """Packets take longer: by the first amount at the begin, by the second at the end [s]."""
+    """Extra delay of packets, changing linearly from the first amount to the second [s]."""
     LOSSES = "losses"
-    """A share of the packets is lost."""
+    """Loss of a share of the packets."""
     CUTS = "cuts"
-    """All packets are lost."""
+    """Loss of all packets."""
     COPIES = "copies"
-    """Each packet comes once more, later by the amount [s]."""
+    """A copy of each packet arrives later by the amount [s]."""
     SERVER = "server"
-    """The server is down, and begins anew with nothing but what the operator has set."""
+    """The server is down, and restarts with only the keys that the operator has set."""
     CLIENT = "client"
-    """The client of a vehicle is down, and begins anew with what it has kept; with
-    `vehicle.memory = "none"` that is nothing."""
+    """The client of a vehicle is down, and restarts with its saved state; with
+    `vehicle.memory = "none"` it has none."""
     GOALS = "goals"
-    """The vehicle is sent to the place of the amounts [m], and at the end to its own goal again."""
+    """The vehicle's goal is the place in the amounts [m]; after the move, its own goal again."""
     ZONES = "zones"
-    """There is a cylinder more, of x, y and a radius [m]."""
+    """An additional cylinder to keep out of: x, y and radius in the amounts [m]."""
 
 
-NETWORK = (Kind.DELAYS, Kind.LOSSES, Kind.CUTS, Kind.COPIES)
-OPERATOR = (Kind.GOALS, Kind.ZONES)
+NETWORK = (MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES)
+OPERATOR = (MoveKind.GOALS, MoveKind.ZONES)
 LENGTHS_S = {
-    Kind.CUTS: (0.2, 40.0),
-    Kind.SERVER: (0.2, 20.0),
-    Kind.CLIENT: (0.2, 3.0),
+    MoveKind.CUTS: (0.2, 40.0),
+    MoveKind.SERVER: (0.2, 20.0),
+    MoveKind.CLIENT: (0.2, 3.0),
 }
 """Shortest and longest move of a kind [s]."""
 LENGTH_S = (1.0, 60.0)
 """Shortest and longest move of other kinds [s]."""
 AMOUNTS = {
-    Kind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
-    Kind.LOSSES: ((0.1, 1.0),),
-    Kind.COPIES: ((0.0, 1.5),),
+    MoveKind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
+    MoveKind.LOSSES: ((0.1, 1.0),),
+    MoveKind.COPIES: ((0.0, 1.5),),
 }
-"""Least and greatest of each amount of a kind; places are anywhere on the mission."""
+"""Smallest and largest value of each amount of a kind. Places are anywhere in the mission's box."""
 SLOW = ("uplink", "downlink", "")
-"""Ways in which a vehicle may be slow at first."""
+"""Directions in which a vehicle may have a long delay at first."""
 RADIUS_M = (0.4, 1.5)
-"""Least and greatest radius of a zone [m]."""
+"""Smallest and largest radius of a zone [m]."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """Move of the adversary, for a while."""
+    """Move of the adversary, with a start and a length."""
 
-    kind: Kind
+    kind: MoveKind
     vehicle: Annotated[int, msgspec.Meta(ge=0)]
     """Number of the vehicle; 0 for all of them."""
     way: str
-    """`uplink` or `downlink` of packets; empty for both ways, and for other kinds."""
+    """`uplink` or `downlink` for packets; empty for both directions, and for other kinds."""
     start_ns: Annotated[int, msgspec.Meta(ge=0)]
     """Time of the world at which it begins [ns]."""
     length_ns: Annotated[int, msgspec.Meta(ge=1)]
     """Duration [ns]."""
     amounts: tuple[float, ...] = ()
-    """Amounts, see `Kind`."""
+    """Amounts, see `MoveKind`."""
 
     @property
     def end_ns(self) -> int:
@@ -119,7 +117,7 @@ class Move:
         return self.start_ns + self.length_ns
 
     def is_on(self, now_ns: int) -> bool:
-        """Whether it is done at a time of the world."""
+        """Whether the move is active at a time of the world."""
         return self.start_ns <= now_ns < self.end_ns
 
 
@@ -127,7 +125,7 @@ Moves = tuple[Move, ...]
 
 
 class Packet(NamedTuple):
-    """A packet that entered the air."""
+    """A packet that entered the adversary's network."""
 
     time_ns: int
     way: str
@@ -138,15 +136,15 @@ class Near(msgspec.Struct, frozen=True):
     """Smallest distance in a flight."""
 
     distance_m: float | None = None
-    """None where there is none."""
+    """Distance [m]; None if there was nothing to measure."""
     at_s: float = 0.0
     """Time of the world [s]."""
     vehicles: tuple[int, ...] = ()
-    """Numbers of those that were so near."""
+    """Numbers of the nearest vehicles."""
 
     @property
     def away_m(self) -> float:
-        """Distance, infinite where there is none [m]."""
+        """Distance, infinite if there was nothing to measure [m]."""
         return math.inf if self.distance_m is None else self.distance_m
 
 
@@ -158,37 +156,37 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
 
     moves: Moves
     apart: Near
-    """Distance of two vehicles from each other."""
+    """Smallest distance between two vehicles."""
     clear: Near
-    """Distance of a vehicle from a zone that the operator has set; negative inside."""
+    """Smallest distance of a vehicle from a zone; negative inside."""
     left: int
-    """Observations outside a tube, as far as the server that lives at the end knows."""
+    """Number of observations outside a tube, since the last restart of the server."""
 
 
-class Air(Endpoint):
-    """Network that does what the adversary wants.
+class AdversaryNetwork(Endpoint):
+    """Network between clients and server, controlled by the adversary's moves.
 
     Args:
-        moves: what the adversary does.
-        seed: seed of losses.
+        moves: moves of the adversary.
+        seed: seed of the losses.
     """
 
     def __init__(self, moves: Moves, seed: int) -> None:
         super().__init__()
         self._moves = [move for move in moves if move.kind in NETWORK]
         self._seed, self._chance = seed, dict[tuple[str, int], np.random.Generator]()
-        self._held: list[tuple[int, int, Datagram]] = []
-        """Heap of the packets under way: time of arrival, order, and packet."""
+        self._in_flight: list[tuple[int, int, Datagram]] = []
+        """Heap of the packets in flight: time of arrival, order, and packet."""
         self.packets: list[Packet] = []
         """All packets that have entered."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Decide on a packet; vehicle n is socket n to the server."""
+        """Delay, lose or copy a packet; vehicle n uses socket n towards the server."""
         payload, (host, _), socket = datagram
         way, vehicle = ("uplink", socket) if socket else ("downlink", int(host.split()[1]))
         onward = Datagram(payload, (f"client {vehicle}", 0) if socket else SERVER, vehicle - socket)
         self.packets.append(Packet(now_ns, way, vehicle))
-        # Drawn for every packet, so that a packet's luck does not depend on other moves.
+        # Drawn for every packet, so that the number does not depend on other moves.
         drawn = self._draw(way, vehicle)
         late_s, copies_s = 0.0, []
         for move in self._moves:
@@ -197,64 +195,68 @@ class Air(Endpoint):
             if not move.is_on(now_ns):
                 continue
             match move.kind:
-                case Kind.DELAYS:
+                case MoveKind.DELAYS:
                     at = (now_ns - move.start_ns) / move.length_ns
                     late_s += move.amounts[0] + at * (move.amounts[1] - move.amounts[0])
-                case Kind.COPIES:
+                case MoveKind.COPIES:
                     copies_s.append(move.amounts[0])
-                case Kind.CUTS:
+                case MoveKind.CUTS:
                     return
-                case Kind.LOSSES if drawn < move.amounts[0]:
+                case MoveKind.LOSSES if drawn < move.amounts[0]:
                     return
         for each_s in (0.0, *copies_s):
             due_ns = now_ns + BASE_NS + seconds_to_ns(late_s + each_s)
-            heappush(self._held, (due_ns, len(self.packets), onward))
+            heappush(self._in_flight, (due_ns, len(self.packets), onward))
 
     def _draw(self, way: str, vehicle: int) -> float:
-        """Random number of the next packet of a vehicle."""
+        """Random number below 1 for the next packet of a vehicle."""
         if (way, vehicle) not in self._chance:
             self._chance[way, vehicle] = stream(self._seed, "adversary", way, vehicle)
         return float(self._chance[way, vehicle].random())
 
     def wake(self, *, now_ns: int) -> None:
         """Send the packets that are due."""
-        while self._held and self._held[0][0] <= now_ns:
-            self._out.append(heappop(self._held)[2])
+        while self._in_flight and self._in_flight[0][0] <= now_ns:
+            self._out.append(heappop(self._in_flight)[2])
 
     def next_wake_ns(self) -> int | None:
         """Time at which the next packet is due."""
-        return self._held[0][0] if self._held else None
+        return self._in_flight[0][0] if self._in_flight else None
 
 
 class Raid:
-    """Flight of a mission against the adversary.
+    """Flight of a mission with the adversary's moves.
 
     Args:
-        scenario: what is flown; the network is the adversary's.
-        moves: what the adversary does.
+        scenario: the mission; its network is not used.
+        moves: moves of the adversary.
     """
 
     def __init__(self, scenario: Scenario, moves: Moves) -> None:
-        self._scenario, self._moves, self._air = scenario, moves, Air(moves, scenario.seed)
-        mortal = {move.vehicle for move in moves if move.kind is Kind.CLIENT}
+        self._scenario, self._moves, self._air = (
+            scenario,
+            moves,
+            AdversaryNetwork(moves, scenario.seed),
+        )
+        mortal = {move.vehicle for move in moves if move.kind is MoveKind.CLIENT}
         self._lives = Lives(scenario, self._air, None if 0 in mortal else mortal)
         self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
         self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
-        """Zones that the operator has set, and since when [s; the hosts' clocks]."""
+        """Zones set by the operator, and the time of each change [s; the hosts' clocks]."""
         for move in moves:
             if move.kind not in NETWORK:
                 self._plan(move)
 
     def _plan(self, move: Move) -> None:
-        """Schedule a move that is not of the network."""
+        """Schedule a move that does not concern the network."""
         lives = self._lives
         hit = [number for number in self._vehicles if move.vehicle in (0, number)]
         begin: list[Callable[[], None]] = [self._set]
         end: list[Callable[[], None]] = [self._set]
         match move.kind:
-            case Kind.SERVER:
+            case MoveKind.SERVER:
                 begin, end = [lives.stop_server], [partial(lives.start_server, {})]
-            case Kind.CLIENT:
+            case MoveKind.CLIENT:
                 begin = [partial(lives.stop_client, number) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]
         for time_ns, actions in ((move.start_ns, begin), (move.end_ns, end)):
@@ -262,20 +264,22 @@ class Raid:
                 self._world.at(time_ns, action)
 
     def _set(self) -> None:
-        """Set goals and zones as the moves of now say; the server may refuse them."""
-        lives, now_ns, given = self._lives, self._world.now_ns, self._scenario.mission
+        """Set goals and zones of the active moves; the server may refuse them."""
+        lives, now_ns, own = self._lives, self._world.now_ns, self._scenario.mission
         if lives.running is None:
             return
         now = [move for move in self._moves if move.is_on(now_ns)]
-        goals = {move.vehicle: np.array(move.amounts) for move in now if move.kind is Kind.GOALS}
+        goals = {
+            move.vehicle: np.array(move.amounts) for move in now if move.kind is MoveKind.GOALS
+        }
         more = [
             f"cylinder({', '.join(map(str, move.amounts))})"
             for move in now
-            if move.kind is Kind.ZONES
+            if move.kind is MoveKind.ZONES
         ]
         texts = {
-            "mission.goals": " & ".join(filter(None, [given.goals, mission.written(goals)])),
-            "mission.zones": " & ".join(filter(None, [given.zones, *more])),
+            "mission.goals": " & ".join(filter(None, [own.goals, mission.format_goals(goals)])),
+            "mission.zones": " & ".join(filter(None, [own.zones, *more])),
         }
         for key, text in texts.items():
             lives.set({key: text})
@@ -284,7 +288,7 @@ class Raid:
     # -- what is flown -----------------------------------------------------------------------------
 
     def run(self) -> Approach:
-        """Fly until all have arrived and only the network may still change, or to the end."""
+        """Fly to the end, or until all vehicles have arrived and no other moves are left."""
         scenario, later = self._scenario, [m for m in self._moves if m.kind not in NETWORK]
         look_ns = max((move.end_ns for move in later), default=0)
 
@@ -331,7 +335,7 @@ class Raid:
         return Near(float(apart_m[least]), world_s(times[least]), pair)
 
     def _clear(self, tracks: Mapping[int, Track]) -> Near:
-        """Smallest distance of a vehicle from a zone, while there was that zone."""
+        """Smallest distance of a vehicle from a zone, while the zone existed."""
         scale, found = self._scenario.mission.height_scale, NOWHERE
         ends = [since for since, _ in self._zones[1:]] + [math.inf]
         for (since, zones), end in zip(self._zones, ends, strict=True):
@@ -354,22 +358,24 @@ class Climb:
     """A climb of the search."""
 
     scenario: Scenario
-    kinds: tuple[Kind, ...]
-    """Kinds of moves that the adversary may do."""
+    kinds: tuple[MoveKind, ...]
+    """Kinds of moves that the adversary may make."""
     number: int
-    """Number of the climb, from which all its chance follows."""
+    """Number of the climb, the seed of its random numbers."""
     tries: int
     """Number of flights."""
     moves: int = MOVES_MAX
     """Largest number of moves."""
     patience: int = PATIENCE
-    """Tries without gain after which it begins anew; 0: all moves are drawn at random."""
+    """Tries without improvement after which the search restarts; 0: all moves are random."""
 
     @property
     def seeks_zones(self) -> bool:
-        """Whether it brings vehicles near to zones: every other one, where there are any."""
-        may = bool(self.scenario.zones) or Kind.ZONES in self.kinds
-        return may and bool(self.number % 2)
+        """Whether the climb minimises the distance from zones: every second one, if there are
+        any.
+        """
+        has_zones = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
+        return has_zones and bool(self.number % 2)
 
 
 class Climbed(NamedTuple):
@@ -381,19 +387,19 @@ class Climbed(NamedTuple):
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:
-    """Fly a mission against the adversary."""
+    """Fly a mission with the adversary's moves."""
     return Raid(scenario, moves).run()
 
 
 def spare_m(scenario: Scenario, found: Approach) -> float:
-    """Distance beyond what is asked for, between vehicles or from zones [m]; negative: not kept."""
+    """Smallest distance minus the required one, between vehicles or from zones [m]."""
     return min(found.apart.away_m - scenario.mission.separation_m, found.clear.away_m)
 
 
 def climb(task: Climb) -> Climbed:
-    """Search for the moves that bring vehicles nearest."""
+    """Search for the moves that bring two vehicles, or a vehicle and a zone, nearest."""
     scenario, rng = task.scenario, stream(task.scenario.seed, "climb", task.number)
-    draws, spares_m = Draws(task, rng), list[float]()
+    draws, spares_m = MoveSampler(task, rng), list[float]()
     best: Approach | None = None
     here: Approach | None = None
     drawn, since, packets = 0, 0, list[Packet]()
@@ -420,11 +426,11 @@ def climb(task: Climb) -> Climbed:
     return Climbed(best, spares_m)
 
 
-class Draws:
-    """Moves that are drawn at random.
+class MoveSampler:
+    """Random moves, and random changes of moves.
 
     Args:
-        task: climb that they are for.
+        task: the climb.
         rng: random generator.
     """
 
@@ -437,15 +443,15 @@ class Draws:
         self._last_ns = seconds_to_ns(task.scenario.duration)
 
     def some(self) -> Moves:
-        """Moves to begin with."""
+        """Random moves to start from."""
         rng, moves = self._rng, list[Move]()
-        kinds = [kind for kind in self._kinds if kind is not Kind.DELAYS]
-        if Kind.DELAYS in self._kinds:
-            # Most vehicles slow in one direction alone: that is what no round trip shows.
-            high_s = float(rng.uniform(*AMOUNTS[Kind.DELAYS][0]))
+        kinds = [kind for kind in self._kinds if kind is not MoveKind.DELAYS]
+        if MoveKind.DELAYS in self._kinds:
+            # Most vehicles have a long delay in one direction only, which round trips do not show.
+            high_s = float(rng.uniform(*AMOUNTS[MoveKind.DELAYS][0]))
             ways = rng.choice(4, len(self._vehicles), p=(0.4, 0.4, 0.1, 0.1))
             moves += [
-                Move(Kind.DELAYS, vehicle, SLOW[way], 0, self._last_ns, (high_s, high_s))
+                Move(MoveKind.DELAYS, vehicle, SLOW[way], 0, self._last_ns, (high_s, high_s))
                 for vehicle, way in zip(self._vehicles, ways.tolist(), strict=True)
                 if way < len(SLOW)
             ]
@@ -453,36 +459,36 @@ class Draws:
             moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
         return tuple(moves[-self._most :])
 
-    def _one(self, kinds: Sequence[Kind]) -> Move:
-        """One move of some kinds."""
+    def _one(self, kinds: Sequence[MoveKind]) -> Move:
+        """Random move of one of these kinds."""
         rng, kind = self._rng, kinds[int(self._rng.integers(len(kinds)))]
         low_s, high_s = LENGTHS_S.get(kind, LENGTH_S)
         length_ns = seconds_to_ns(low_s * (high_s / low_s) ** rng.random())
         start_ns = int(rng.integers(self._last_ns))
         vehicle, way = int(rng.choice(self._vehicles)), ""
-        if kind is Kind.SERVER or (kind in NETWORK and rng.random() < 0.2):
+        if kind is MoveKind.SERVER or (kind in NETWORK and rng.random() < 0.2):
             vehicle = 0
         if kind in NETWORK:
             way = ("uplink", "downlink", "")[rng.integers(3)]
         return Move(kind, vehicle, way, start_ns, length_ns, self._amounts(kind))
 
-    def _amounts(self, kind: Kind) -> tuple[float, ...]:
-        """Amounts of a move."""
+    def _amounts(self, kind: MoveKind) -> tuple[float, ...]:
+        """Random amounts of a move."""
         rng = self._rng
         if kind in OPERATOR:
             place = rng.uniform(self._low, self._high)
-            if kind is Kind.ZONES:
+            if kind is MoveKind.ZONES:
                 place = np.append(place[:2], rng.uniform(*RADIUS_M))
             return tuple(round(each, 3) for each in place.tolist())
         return tuple(float(rng.uniform(*each)) for each in AMOUNTS.get(kind, ()))
 
     def changed(self, moves: Moves, near: Near, packets: Sequence[Packet]) -> Moves:
-        """Moves with a change or two.
+        """Moves with one or more random changes.
 
         Args:
             moves: moves of the best flight so far.
-            near: what was nearest in it.
-            packets: packets of it.
+            near: its nearest approach.
+            packets: its packets.
         """
         rng, now = self._rng, list(moves)
         for _ in range(1 + rng.poisson(0.5)):
@@ -498,11 +504,11 @@ class Draws:
                     now.append(self._aimed(near, packets))
                 case _:
                     now.append(self._one(self._kinds))
-        # The newest stay: a change must change something.
+        # Keep the newest moves, so that the change has an effect.
         return tuple(now[-self._most :])
 
     def _tuned(self, move: Move) -> Move:
-        """A move a little earlier, later, longer, shorter, stronger or weaker."""
+        """Move with a small random change of its start, length or amounts."""
         rng = self._rng
         low_s, high_s = LENGTHS_S.get(move.kind, LENGTH_S)
         match rng.integers(3):
@@ -520,15 +526,15 @@ class Draws:
                 return replace(move, amounts=tuple(a + share * (b - a) for a, b in pairs))
 
     def _aimed(self, near: Near, packets: Sequence[Packet]) -> Move:
-        """A move shortly before what was nearest, against one of those that were."""
+        """Random move shortly before the nearest approach, for one of the nearest vehicles."""
         rng, at_ns = self._rng, seconds_to_ns(near.at_s)
-        move, those = self._one(self._kinds), near.vehicles or self._vehicles
+        move, candidates = self._one(self._kinds), near.vehicles or self._vehicles
         start_ns = max(at_ns - int(rng.integers(AIMED_NS)), 0)
-        vehicle = int(rng.choice(those)) if move.vehicle else 0
+        vehicle = int(rng.choice(candidates)) if move.vehicle else 0
         mine = [
             each
             for each in packets
-            if each.vehicle in those and at_ns - AIMED_NS <= each.time_ns <= at_ns
+            if each.vehicle in candidates and at_ns - AIMED_NS <= each.time_ns <= at_ns
         ]
         if move.kind in NETWORK and mine and rng.random() < 0.7:
             time_ns, way, vehicle = mine[int(rng.integers(len(mine)))]
@@ -537,7 +543,7 @@ class Draws:
 
 
 def shrunk(scenario: Scenario, found: Approach) -> Approach:
-    """The fewest and shortest moves with which a distance is still not kept."""
+    """Flight with fewer and shorter moves that still violates a required distance."""
     moves = shrink(found.moves, lambda moves: spare_m(scenario, fly(scenario, moves)) < 0.0)
     return fly(scenario, moves)
 

@@ -1,9 +1,9 @@
-"""Choice of what contenders fly within budgets of packets: thresholds and ways of reporting.
+"""Choice of thresholds and ways of reporting, for contenders within budgets of packets.
 
-With its weights (`lab.contenders`) a contender flies at several thresholds and with several ways of
-reporting, on the seeds of the search (scouting flights). Near each budget of packets, both ways,
-more thresholds are tried until the budget is almost used up. Then the best choice within each
-budget flies in the comparison.
+Each contender, with its weights (`lab.contenders`), first flies at several thresholds and with
+several ways of reporting, on the seeds of the search (scouting flights). Near each budget of
+packets more thresholds are tried, until the budget is almost used up. The best choice within each
+budget then flies in the comparison.
 """
 
 import math
@@ -26,17 +26,17 @@ from skytether.lab.contenders import (
 from skytether.lab.sweep import GridAxis, Results, Sweep
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay, value
+from skytether.shared.scenario.dotted import set_keys, value
 from skytether.shared.scenario.schema import Scenario
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
-"""Budgets: largest numbers of packets per second, both ways and including heartbeats."""
+"""Budgets: largest numbers of packets per second, of both directions and with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen and flown: BUDGETS, and a little less than 0.12 of what
-the paper's scheme takes at every step, for the ratios that are asked for (`comparison.CLAIMS`)."""
+"""Budgets for which points are chosen and flown: BUDGETS, and slightly less than 0.12 of the
+packets of the paper's scheme at every step, for the claimed ratios (`comparison.CLAIMS`)."""
 CLOSE = 1.05
-"""Ratio of two thresholds between which no other is tried."""
-EFFORT_ROOM = 1.05
+"""Ratio of two neighbouring thresholds below which none between them is tried."""
+EFFORT_RATIO_MAX = 1.05
 """Largest ratio of a chosen point's effort to the effort limit of its case."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
     "every step": {"vehicle.report": "always"},
@@ -74,7 +74,7 @@ class FlownContender:
         return self.contender.name, self.threshold, self.report
 
     def at(self, threshold: float) -> "FlownContender":
-        """Point of this contender and way of reporting, at another threshold."""
+        """Same contender and way of reporting, at another threshold."""
         keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
         return FlownContender(self.contender, threshold, self.report, False, keys)
 
@@ -161,7 +161,7 @@ class Plan:
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
         """Number of flights of each chosen point."""
         plant = reading.to_table(reading.load(case.plant))
-        lay(case.keys, plant)
+        set_keys(case.keys, plant)
         plant["duration"] = min(plant["duration"], scale.duration)
         self._scenario = reading.check(plant, case.title)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
@@ -182,7 +182,7 @@ class Plan:
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Take in the results of scouting flights.
+        """Store the results of scouting flights.
 
         Args:
             points: the points that were flown.
@@ -196,27 +196,27 @@ class Plan:
                 for figure in ("packets_per_s", "effort_mps")
             )
             errors = [math.inf if run.rmse_xy is None else run.rmse_xy for run in runs]
-            is_valid = effort <= EFFORT_ROOM * self.case.effort_mps
+            is_valid = effort <= EFFORT_RATIO_MAX * self.case.effort_mps
             self._scouted.append(Scouted(point, float(np.mean(errors)), packets, is_valid))
 
     def _best(self) -> dict[tuple[str, float], Scouted]:
         """Point with the least RMSE xy within each budget, by contender and budget."""
-        found: dict[tuple[str, float], Scouted] = {}
+        best: dict[tuple[str, float], Scouted] = {}
         for each in self._scouted:
             for budget in SOUGHT:
                 name = each.point.contender.name, budget
                 if each.is_within(budget) and (
-                    name not in found or each.rmse_xy_m < found[name].rmse_xy_m
+                    name not in best or each.rmse_xy_m < best[name].rmse_xy_m
                 ):
-                    found[name] = each
-        return found
+                    best[name] = each
+        return best
 
     def halfway(self) -> list[FlownContender]:
-        """Points to be scouted next: halfway between a threshold within a budget and one beyond it.
+        """Points to scout next: between a threshold that exceeds a budget and the next within it.
 
-        Where the one beyond it is no better than what is known within, none between them would be.
+        A pair is skipped if the point that exceeds the budget is no better than the best within it.
         """
-        best, found = self._best(), {}
+        best, points_between = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}
         for each in self._scouted:
             ways.setdefault((each.point.contender.name, each.point.report), []).append(each)
@@ -231,8 +231,8 @@ class Plan:
                     for budget in SOUGHT
                 ):
                     point = upper.point.at(value)
-                    found[point.name] = point
-        return list(found.values())
+                    points_between[point.name] = point
+        return list(points_between.values())
 
     def chosen(self) -> Chosen:
         """Point with the least RMSE xy within each budget, by contender and budget.

@@ -121,7 +121,7 @@ WEIGHTS = (
 )
 """Weights that are searched for; only their ratios matter, so the position's is fixed."""
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
-"""Weights that determine the regulator along a trajectory, and a nominal motion that is planned."""
+"""Weights that determine the regulator along a trajectory, and the nominal motion."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
 """Key of a trajectory that the server knows ahead."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
@@ -133,13 +133,12 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "expected_gap": (Free("control.trigger.expected_gap", 1e-6, 1e6),),
     "deviation": (Free("control.trigger.deviation", 1e-4, 1e1),),
 }
-"""Keys of each policy that looks at the state, which are searched for so that weights and policy
-together decide what is sent."""
+"""Keys of each policy that uses the state; they are searched for together with the weights."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 """Keys of the schemes that have a disturbance observer."""
 MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
 """Figures of a point that are averaged over the seeds."""
-HERE = "here"
+ONLY = "here"
 """Name of the single column of an objective without columns."""
 
 
@@ -155,7 +154,7 @@ class SearchLimits:
     """Limits within which the error is minimised."""
 
     packets: float = 1.0
-    """Largest share of steps that may send; it binds only triggers that look at the state."""
+    """Largest event ratio; only applied to triggers that use the state."""
     effort_mps: float = math.inf
     """Largest effort, the RMS change of the command from step to step [m/s]."""
     saturated: float = 1.0
@@ -175,9 +174,7 @@ class Rmse:
         return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
-        """Weights, and the keys of scheme and trigger; a key that is 0 means "off" and is not
-        searched for.
-        """
+        """Weights, and the keys of scheme and trigger; keys that are 0, for "off", are left out."""
         control, table = self.scenario.control, plain(self.scenario)
         observer = OBSERVER_KEYS if control.properties.observes else ()
         weights: Sequence[Free] = WEIGHTS
@@ -189,18 +186,18 @@ class Rmse:
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
         """Means over seeds, and the upper end of the event ratio's 95 % interval."""
-        runs = sweep.summaries(HERE, scenario, seeds)
-        found = {name: _mean(runs, name) for name in MEANS}
+        runs = sweep.summaries(ONLY, scenario, seeds)
+        means = {name: _mean(runs, name) for name in MEANS}
         _, half = sweep.estimate(runs, "event_ratio")
-        ratio = found["event_ratio"]
+        ratio = means["event_ratio"]
         most = None if ratio is None else ratio + (half or 0.0)
-        return {HERE: {**found, "event_ratio_most": most}}
+        return {ONLY: {**means, "event_ratio_most": most}}
 
     def score(self, values: Values) -> float:
         """RMSE xy [m], times the cube of the ratio by which each limit is exceeded."""
-        here = values[HERE]
-        rmse, most = here["rmse_xy"], here["event_ratio_most"]
-        effort, saturated = here["effort_mps"], here["saturated"]
+        means = values[ONLY]
+        rmse, most = means["rmse_xy"], means["event_ratio_most"]
+        effort, saturated = means["effort_mps"], means["saturated"]
         if rmse is None or most is None or effort is None or saturated is None:
             return UNFLYABLE
         over = [effort / self.limits.effort_mps, saturated / self.limits.saturated]

@@ -161,7 +161,7 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Claim, judged in a case."""
+    """Result of a claim in a case."""
 
     claim: Claim
     """Claim that is judged."""
@@ -175,7 +175,7 @@ class Judged:
     ratio: tuple[float, float, float] | None
     """Ratio of both mean RMSE xy, with its interval; None if too few flights succeeded."""
     sparse: bool
-    """Whether ours sends no more than the claim allows."""
+    """Whether our contender sends no more than the claim allows."""
 
     @property
     def medians(self) -> float | None:
@@ -203,9 +203,9 @@ def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
         return None
     most = claim.share * theirs[-1].mean(PACKETS)
     within = [each for each in ours if each.mean(PACKETS) <= most]
-    found = within[-1] if within else ours[0]
+    chosen = within[-1] if within else ours[0]
     return Judged(
-        claim, compared.case, found, theirs[-1], ratio(found, theirs[-1]), sparse=bool(within)
+        claim, compared.case, chosen, theirs[-1], ratio(chosen, theirs[-1]), sparse=bool(within)
     )
 
 
@@ -219,7 +219,7 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
     judged = [found for claim in CLAIMS for each in results if (found := judge(claim, each))]
     asked = [each.holds for each in judged if each.holds is not None]
     verdict = (
-        f"{sum(asked)} of the {len(asked)} ratios that are asked for hold with all of their 95 % "
+        f"{sum(asked)} of the {len(asked)} claimed ratios hold with the whole of their 95 % "
         "interval."
     )
     tables = [
@@ -235,11 +235,11 @@ TITLES = {each.name: each.title for each in CONTENDERS}
 CASE_TITLES = {each.name: each.title for each in CASES}
 TITLE = "Schemes and triggers compared"
 ABOUT = (
-    "What only the server knows is sent over the paper's network, in virtual time: all contenders "
-    "fly with the same seeds, each at the weights that were best for it, searched for by the same "
-    "optimiser with the same effort, on other seeds, and with the same limit on how much the "
-    "command may change. Packets and bytes count both ways, with heartbeats and 28 B of IP and UDP "
-    "a packet."
+    "Flights over the paper's network in virtual time; the reference is known to the server only. "
+    "All contenders fly with the same seeds, each with its own best weights, found by the same "
+    "optimiser with the same effort on other seeds, and with the same limit on changes of the "
+    "command. Packets and bytes are those of both directions, with heartbeats and 28 B of IP and "
+    "UDP headers a packet."
 )
 
 
@@ -265,17 +265,19 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
             lines.append((each.case.title, contender.title, *cells))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
-        "each contender flies at the threshold and with the way of reporting that left the least "
-        "error on other seeds; * marks the least mean and those that cannot be told from it: the "
-        "interval of their ratio on the same seeds contains 1. The CSV has bytes and all other "
+        "each contender flies at the threshold and with the way of reporting that had the smallest "
+        "error on other seeds; * marks the smallest mean, and those that cannot be told from it: "
+        "the interval of their ratio on the same seeds contains 1. The CSV has bytes and all other "
         "figures."
     )
     flown = {id(runs): runs for each in results for runs in each.bought.values()}.values()
     failed = sum(run.rmse_xy is None for each in flown for run in each.runs)
     if failed:
-        says += f" {failed} runs never got a session and count in no mean."
+        says += f" {failed} runs without a session are left out of the means."
     heading = ("case", "contender", *(f"≤ {budget:g}/s" for budget in BUDGETS))
-    return Table("budgets", "What a budget buys", says, rows_csv(rows), heading, lines)
+    return Table(
+        "budgets", "Error within each budget of packets", says, rows_csv(rows), heading, lines
+    )
 
 
 def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
@@ -314,8 +316,8 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
                 about = {"case": each.case.name, "budget": budget, "rmse_xy": ours.mean(RMSE)}
                 rows.append(about | other | _ratio_row(ratio(ours, others[0])))
     says = (
-        f"“{TITLES[OURS]}” over the best of the others within the same budget: ratio of mean RMSE "
-        "xy, with its 95 % interval."
+        f"Mean RMSE xy of “{TITLES[OURS]}” divided by that of the best other contender within the "
+        "same budget, with its 95 % interval."
     )
     shown: dict[str, Cell] = {
         "case": lambda row: CASE_TITLES[row["case"]],
@@ -371,9 +373,9 @@ def ratios_table(judged: Sequence[Judged]) -> Table:
         )
     says = (
         "Mean RMSE xy of ours over theirs, with 95 % intervals (jackknife over seeds), and the "
-        "ratio of medians. Theirs spends what it likes, ours at most a share of their packets; "
-        "packets and bytes are what it really spent, over theirs. A ratio holds where all of its "
-        "interval is below what is asked for."
+        "ratio of medians. Theirs has no limit on packets, ours at most a share of theirs; the "
+        "columns packets and bytes are the ratios of what was sent. A claim holds if the whole "
+        "interval is below the claimed ratio."
     )
     shown: dict[str, Cell] = {
         "case": lambda row: CASE_TITLES[row["case"]],
@@ -411,7 +413,7 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
     )
     lines = [(case.title, one.title, *row) for case, one, row in rows]
     heading = ("case", "contender", *(key.removeprefix("control.") for key in keys))
-    says = "Empty cells are those of the plant's own scenario."
+    says = "An empty cell has the value of the case's own scenario."
     return Table("weights", "Weights and thresholds", says, text, heading, lines)
 
 
@@ -451,18 +453,18 @@ def curves(compared: ComparedCase) -> Plate:
         for (name, budget), runs in compared.bought.items()
     ]
     says = (
-        "Below and to the left is better. A curve is a scheme with a trigger at its weights; each "
-        "of its points is what it flies within a budget of packets, with its median as a tick. "
-        "Bands are 95 % intervals of the mean."
+        "Lower and further left is better. A curve is a scheme with a trigger; each point is its "
+        "mean within a budget of packets, with the median as a tick. Bands are 95 % intervals of "
+        "the mean."
     )
 
-    title = f"What a packet buys: {case.title}"
+    title = f"Error over packets: {case.title}"
     floor = [(each.packets_per_s, each.rmse_m) for each in compared.floor if each.rmse_m > 0.0]
     if floor:
         says += (
-            " The dotted line is the floor, over packets up alone, which the ages of packets sent "
-            "by a clock leave to those without feedback aboard, and to all where the target is not "
-            "known ahead."
+            " The dotted line, over uplink packets only, is a lower bound of the error for packets "
+            "sent at fixed times: for schemes without feedback aboard, and for all schemes if the "
+            "target is not known ahead."
         )
     with lettered(plates.PAGE, 5.0, plates.LETTERS) as figure:
         panes = figure.subplots(1, 3, sharey=True)
@@ -474,7 +476,7 @@ def curves(compared: ComparedCase) -> Plate:
             plane.set_yscale("log")
             if spent != EFFORT:
                 plane.set_xscale("log")
-                plane.xaxis.set_minor_formatter("")  # such bands would overlap
+                plane.xaxis.set_minor_formatter("")  # minor tick labels would overlap
             plane.set_xlabel(label)
         panes[0].set_ylabel("RMSE xy [m]")
         handles, labels = panes[0].get_legend_handles_labels()

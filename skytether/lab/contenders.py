@@ -1,9 +1,9 @@
 """Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
 The best weights of a contender in a case are a table of that file, found by a search
-(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly. What flies
-with them within a budget of packets is chosen in `lab.budgets`.
-Some cases are flown with the weights of another case: they show how well the weights transfer.
+(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly.
+`lab.budgets` then chooses a threshold for each budget of packets. Some cases are flown with the
+weights of another case, to show how well the weights transfer.
 """
 
 import json
@@ -16,24 +16,24 @@ from typing import Any
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 
 SEARCH_SEED = 1001
-"""First seed of a search; the compared seeds begin at the plant's own."""
+"""First seed of a search; the seeds of the comparison begin at the scenario's own."""
 PACKETS = 0.1
-"""Largest share of steps that may send, for a contender whose trigger looks at the state."""
+"""Largest event ratio in a search, for a contender whose trigger uses the state."""
 SCOUTS = 16
 """Number of flights, on seeds of the search, by which points are chosen for the budgets."""
 ROUNDS = 4
 """Number of times that thresholds are tried halfway between those within and beyond a budget.
 
-With 1 packet/s after `target` an error falls by a fifth for 5 % more packets. So thresholds far
-apart made contenders look worse only because theirs left more of the budget unused."""
+Measured in the case `target` at 1 packet/s, 5 % more packets reduce the error by a fifth. So with
+thresholds far apart, contenders that left more of the budget unused looked worse than they are."""
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
-"""Factors of a threshold on a figure of the flight, each one point."""
+"""Factors on the threshold of a figure; each gives one point."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
-"""Factors of a period of ten steps, each one point."""
+"""Factors on a period of ten steps; each gives one point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ TRAJECTORY = {
     "input_weight": 0.1,
     "change_weight": 0.5,
 }
-"""Scheme that sends no inputs, but a trajectory, along which the vehicle regulates itself."""
+"""Scheme that sends a trajectory, which a regulator aboard follows."""
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic(10)"}
@@ -109,7 +109,7 @@ COST_GAP = {"trigger": "cost_gap(300.0)"}
 EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
 SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
 ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
-"""Triggers of a trajectory, whose gap is the cost of an instant, not of a horizon."""
+"""Triggers for trajectories. Their gap is smaller: the cost of one step, not of a horizon."""
 
 
 def _contenders() -> tuple[Contender, ...]:
@@ -156,7 +156,7 @@ ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Case: a scenario, part of which is hidden from the server."""
+    """Case: a scenario in which all contenders fly."""
 
     name: str
     """Short name, in tables, files and scenarios."""
@@ -316,7 +316,7 @@ class ComparisonSize:
         ]
 
 
-LOOKED_AT = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected")
+QUICK = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected")
 """Contenders of a first look."""
 
 
@@ -330,7 +330,7 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
         search_runs=2,
         search_duration=12.0,
         cases=few or scale.cases[:1],
-        contenders=[each for each in CONTENDERS if each.name in LOOKED_AT],
+        contenders=[each for each in CONTENDERS if each.name in QUICK],
         scouts=2,
         rounds=1,
         every=3,
@@ -344,11 +344,11 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
 def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Scenario:
     """Scenario from which the search for a contender's weights in a case begins."""
     table = reading.to_table(reading.load(case.plant))
-    lay({f"control.{key}": value for key, value in contender.control.items()}, table)
+    set_keys({f"control.{key}": value for key, value in contender.control.items()}, table)
     if contender.threshold in case.start:
-        lay({f"control.{contender.threshold}": case.start[contender.threshold]}, table)
-    lay(case.keys, table)
-    lay({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
+        set_keys({f"control.{contender.threshold}": case.start[contender.threshold]}, table)
+    set_keys(case.keys, table)
+    set_keys({"duration": scale.search_duration, "seed": SEARCH_SEED}, table)
     return reading.check(table, f"{contender.title}, {case.title}")
 
 
@@ -358,7 +358,7 @@ def entry(contender: Contender, case: Case) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class TunedWeights:
     """Result of the search for a contender's weights in a case."""
 
     contender: Contender
@@ -369,7 +369,7 @@ class Found:
     """Summary of the result on the seeds of the search, in a line."""
 
 
-def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
+def to_file(found: Sequence[TunedWeights], scale: ComparisonSize) -> str:
     """File of weights: one table per contender and case, with keys that differ from the plant.
 
     Args:
@@ -380,7 +380,7 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
         f"thresholds that `skytether compare --tune` has found for it in {scale.generations} "
         f"generations of {scale.population} points, each flown with {scale.search_runs} seeds from "
         f"{SEARCH_SEED} on for {scale.search_duration:g} s. At most {PACKETS:.0%} of the steps may "
-        "send, where the trigger has a say in that. The largest effort, the RMS change of the "
+        "send, if the trigger uses the state. The largest effort, the RMS change of the "
         "command from step to step, is"
     )
     efforts = {each.case.name: each.case.effort_mps for each in found}
@@ -388,7 +388,7 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
     lines += [f"# - {effort:g} m/s in the case {name}" for name, effort in efforts.items()]
     for each in found:
         sections: dict[str, Any] = {}
-        lay(_told(each), sections)
+        set_keys(_keys_of(each), sections)
         lines += [
             "",
             f"# {each.says}",
@@ -400,8 +400,8 @@ def to_file(found: Sequence[Found], scale: ComparisonSize) -> str:
     return "\n".join([*lines, ""])
 
 
-def _told(found: Found) -> dict[str, Any]:
-    """Keys for a result's file: the contender's, and those that differ from the plant."""
+def _keys_of(found: TunedWeights) -> dict[str, Any]:
+    """Keys of a result for the file: the contender's, and those that differ from the plant."""
     here = dict(flat(reading.to_table(found.scenario)))
     own = {f"control.{key}": here[f"control.{key}"] for key in found.contender.control}
     return own | differences(found.scenario, found.case.plant)

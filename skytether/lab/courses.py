@@ -1,8 +1,8 @@
-"""Inputs that a vehicle should fly under a horizon or trajectory, computed independently.
+"""Inputs that a vehicle should fly by a horizon or trajectory, computed independently for checks.
 
-A course is the motion that one message prescribes. Its inputs follow from the equations of
-`shared.law.rule` and `shared.law.spline`, written here a second time, in plain numpy: a mistake in
-the compiled functions, which both ends fly and predict by, cannot hide in their check.
+A course is the motion that one message prescribes. The equations of `shared.law.rule` and
+`shared.law.spline` are written here a second time, in plain numpy, so that these checks do not
+share an error with the compiled functions that both ends use.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from skytether.shared.wire.protocol import (
     FEEDBACK,
     GAIN_P,
     GAIN_V,
-    LED,
+    REFERENCE,
     Horizon,
     Trajectory,
 )
@@ -43,30 +43,36 @@ class PlannedCourse:
             feedback = np.zeros((terms.axes, FEEDBACK))
         self.lag = np.zeros(terms.axes)
         self._gain, self._disturbance = feedback[:, [GAIN_P, GAIN_V]], feedback[:, DISTURBANCE]
-        self._led, self._stage = feedback[:, LED], 0
+        self._reference, self._stage = feedback[:, REFERENCE], 0
 
-    def told(self, stage: int) -> Array:
+    def prescribed(self, stage: int) -> Array:
         """Prescribed input at a stage, and after the last stage the braking curve [m/s]."""
         length = self._inputs.shape[1]
         u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
         left = self._speed - max(stage - length + 1, 0) * self._brake
         return u * (max(0.0, left) / self._speed) if self._speed else 0.0 * u
 
-    def back(self, stage: int, state: Array, found: Sequence[float]) -> Array:  # noqa: ARG002
+    def feedback(
+        self,
+        stage: int,
+        state: Array,
+        disturbance: Sequence[float],  # noqa: ARG002
+    ) -> Array:
         """Feedback at a stage for a state of shape (axes, 2) [m/s]; stages must not decrease.
 
         Args:
-            found: disturbance estimate of the vehicle's filter, unused here [m/s].
+            disturbance: estimate of the vehicle's filter, unused here [m/s].
         """
         if stage < 0 or not self.feeds_back:
             return np.zeros(len(self._inputs))
         for reached in range(self._stage, stage):
-            told = self.told(reached)
-            stands = reached >= self._inputs.shape[1] and not told.any()
-            self._led = self._model.step(self._led, told if stands else told + self._disturbance)
+            u = self.prescribed(reached)
+            is_at_rest = reached >= self._inputs.shape[1] and not u.any()
+            u = u if is_at_rest else u + self._disturbance
+            self._reference = self._model.step(self._reference, u)
         self._stage = max(self._stage, stage)
-        back: Array = (self._gain * (self._led - state)).sum(axis=1)
-        return back
+        u_feedback: Array = (self._gain * (self._reference - state)).sum(axis=1)
+        return u_feedback
 
 
 class FollowedCourse:
@@ -85,10 +91,10 @@ class FollowedCourse:
         self._knots, self._spacing = trajectory.knots.astype(float), trajectory.spacing
         self._length, self._terms = length, terms
         self._gain, self.lag = regulator[:, :2], regulator[:, 2]
-        """K; and λ, the share of the input before that is kept; shape (axes,)."""
+        """K; and λ, the weight of the previous input; shape (axes,)."""
         self._model, self._bound = terms.model, np.array(terms.u_max)
         self._last = self._along(length - 1)
-        self._led, self._stage = self._state(length), length
+        self._reference, self._stage = self._state(length), length
 
     def _state(self, stage: int) -> Array:
         """State of the spline at a stage, position [m] and velocity [m/s]; shape (axes, 2)."""
@@ -111,7 +117,7 @@ class FollowedCourse:
         u: Array = (ahead - self._model.A[:, 1, 1] * v) / self._model.B[:, 1]
         return np.clip(u, -self._bound, self._bound)
 
-    def told(self, stage: int) -> Array:
+    def prescribed(self, stage: int) -> Array:
         """Prescribed input ū at a stage, and after the last stage the braking curve [m/s]."""
         if stage < self._length or not self._terms.brake:
             return self._along(stage)
@@ -119,20 +125,20 @@ class FollowedCourse:
         left = speed - (stage - self._length + 1) * self._terms.brake
         return self._last * (max(0.0, left) / speed) if speed else 0.0 * self._last
 
-    def back(self, stage: int, state: Array, found: Sequence[float]) -> Array:
+    def feedback(self, stage: int, state: Array, disturbance: Sequence[float]) -> Array:
         """Feedback minus the disturbance at a stage [m/s]; stages must not decrease.
 
         Args:
             state: state of the vehicle [m, m/s]; shape (axes, 2).
-            found: disturbance estimate of the vehicle's filter on each axis [m/s].
+            disturbance: estimate of the vehicle's filter on each axis [m/s].
         """
-        led = self._state(stage)
+        reference = self._state(stage)
         if stage > self._length and self._terms.brake:
             for reached in range(self._stage, stage):
-                self._led = self._model.step(self._led, self.told(reached))
-            led, self._stage = self._led, stage
-        back: Array = (self._gain * (led - state)).sum(axis=1) - np.array(found)
-        return back
+                self._reference = self._model.step(self._reference, self.prescribed(reached))
+            reference, self._stage = self._reference, stage
+        u_feedback: Array = (self._gain * (reference - state)).sum(axis=1) - np.array(disturbance)
+        return u_feedback
 
 
 Course = PlannedCourse | FollowedCourse

@@ -1,7 +1,7 @@
-"""Crowds: flights with more and more vehicles on one shared network, scheme by scheme.
+"""Largest number of vehicles on one shared network, for each scheme.
 
 All vehicles of a flight share one network with the scenario's finite rate. A number of vehicles
-flies if all of them fly to the end, none brakes after `settle`, and the root mean square of all
+"flies" if all of them fly to the end, none brakes after `settle`, and the root mean square of all
 distances from the targets is within a limit.
 """
 
@@ -39,9 +39,7 @@ EXACT = 0.05
 
 
 class CrowdPoint(msgspec.Struct, frozen=True):
-    """Flight of a number of vehicles; an entry of the journal. Figures of a direction cover all
-    packets.
-    """
+    """Results of a flight; an entry of the journal. Figures of a direction cover all packets."""
 
     scheme: Scheme
     vehicles: int
@@ -86,7 +84,7 @@ class Crowd:
     udp: bool
 
     def settings(self) -> dict[str, Any]:
-        """All that the points follow from, as plain values."""
+        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         return {"name": self.name, "udp": self.udp, "files": files, "scenario": table}
 
@@ -103,8 +101,8 @@ class Crowd:
             table["vehicle"]["report"] = "always"
         table["control"]["shared_bytes_per_s"] = 0.0
         if scheme == "budget":
-            given = self.scenario.control.shared_bytes_per_s
-            table["control"]["shared_bytes_per_s"] = given or "auto"
+            rate = self.scenario.control.shared_bytes_per_s
+            table["control"]["shared_bytes_per_s"] = rate or "auto"
         return reading.check(table, self.name)
 
 

@@ -34,7 +34,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
@@ -111,7 +111,7 @@ class Envelope:
     scenario: Scenario
 
     def settings(self) -> dict[str, Any]:
-        """All that the points follow from, as plain values."""
+        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         return {"name": self.name, "files": files, "scenario": table}
 
@@ -124,7 +124,7 @@ class Envelope:
 
     def _table(self, number: int) -> dict[str, Any]:
         table = reading.to_table(self.scenario)
-        lay(self.keys(number), table)
+        set_keys(self.keys(number), table)
         return table
 
     def scenario_of(self, number: int) -> Scenario:
@@ -251,10 +251,10 @@ def _faults(
     time_s = client["step"] * dt
     position, velocity = client["state"][..., 0], client["state"][..., 1]
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
-    # A finished horizon is still in force; the vehicle comes to rest where the plan would.
-    led = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
-    blind = ~covered & ~led
-    begun = _begun(covered, led)
+    # A finished horizon is still in force: feedback leads the vehicle to where the plan stops.
+    guided = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
+    blind = ~covered & ~guided
+    begun = _begun(covered, guided)
     since_s = time_s - time_s[begun]
     age_s = client["age_ns"] / SECOND_NS
     # Wind cannot be compensated before it has been observed.
@@ -271,38 +271,38 @@ def _faults(
         return np.exp(-np.maximum(0.0, passed_s) / tau_s)
 
     travelled_m = np.linalg.norm(position - position[begun], axis=1)
-    behind_m = led * (NEAR_M + error_m[begun])  # behind the plan, which leads to the reference
+    behind_m = guided * (NEAR_M + error_m[begun])  # behind the plan, which leads to the reference
     curve_mps = speed[begun] * left(since_s)
     curve_mps += gain * on_its_way * left(since_s - stopping_s)
-    # Newest time under plans that the maker of the plan in force had observed.
+    # Time under plans at the newest observation that the plan in force was made from.
     seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (
-            "it is commanded {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
+            "its command is {:.3g} m/s without a plan, while braking allows {:.3g} m/s",
             blind,
             command,
             np.maximum(0.0, command[begun] - brake * since_s),
         ),
         (
-            "it went {:.3g} m without a plan, where braking takes {:.3g} m",
+            "it went {:.3g} m without a plan, while braking takes at most {:.3g} m",
             ~covered,
             travelled_m,
             stop_m(speed[begun], on_its_way) + pushed_m + behind_m,
         ),
         (
-            "it has {:.3g} m/s without a plan, where braking leaves {:.3g} m/s",
+            "its speed is {:.3g} m/s without a plan, while braking allows {:.3g} m/s",
             blind,
             speed,
             curve_mps + pushed_mps,
         ),
         (
-            "it is {:.3g} m outside the reference's disc, where stopping may take {:.3g} m",
+            "it is {:.3g} m outside the disc around the reference; stopping takes at most {:.3g} m",
             np.ones_like(covered),
             outside_m,
             NEAR_M + stop_m(top_mps * max(1.0, gain), top_mps) + pushed_m,
         ),
         (
-            "it is {:.3g} m from the reference, which {:.3g} m would hold if it stood still",
+            "it is {:.3g} m from the reference; a vehicle at rest would be at most {:.3g} m away",
             covered & (seen_s >= settling_s(scenario)),
             error_m,
             NEAR_M + radius_m + pushed_m,
@@ -311,20 +311,20 @@ def _faults(
     lost = ~np.isfinite(client["state"]).all(axis=(1, 2))
     if lost.any():
         step = int(lost.argmax())
-        yield step, f"at {time_s[step]:.2f} s its state is no number"
-    for says, rows, given, most in rules:
-        broken = rows & (given > most + ROUNDING)
+        yield step, f"at {time_s[step]:.2f} s its state is not finite"
+    for message, rows, value, most in rules:
+        broken = rows & (value > most + ROUNDING)
         if broken.any():
             step = int(broken.argmax())
-            yield step, f"at {time_s[step]:.2f} s {says.format(given[step], most[step])}"
+            yield step, f"at {time_s[step]:.2f} s {message.format(value[step], most[step])}"
 
 
-def _begun(covered: Flags, led: Flags) -> Any:
+def _begun(covered: Flags, guided: Flags) -> Any:
     """Row at which the present stretch of one kind began; shape (steps,).
 
     Kinds are: covered by planned inputs, following the feedback alone, and neither.
     """
-    rows, kind = np.arange(len(covered)), covered + 2 * led
+    rows, kind = np.arange(len(covered)), covered + 2 * guided
     changed = np.concatenate([[True], kind[1:] != kind[:-1]])
     return np.maximum.accumulate(np.where(changed, rows, 0))
 

@@ -17,7 +17,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 
 
-class Kind(StrEnum):
+class FaultKind(StrEnum):
     """Kind of a fault."""
 
     LOSS = "loss"
@@ -49,21 +49,23 @@ class Kind(StrEnum):
     CORRUPTION = "corruption"
     """Attacker that flips a bit in a share of the packets."""
     FLOOD = "flood"
-    """Stranger that sends forged packets, as many per second as the amount."""
+    """Attacker without keys that sends forged packets, as many per second as the amount."""
     COPY = "copy"
-    """Attacker that copies a share of the packets, sends the copies to either end from his own
-    addresses, before or after the originals, and forwards the answers."""
+    """Attacker that copies a share of the packets, sends the copies from other addresses to either
+    end, before or after the originals, and forwards the answers."""
     KEYS = "keys"
     """Restart of the server with other keys, then with the right ones again."""
     CROWD = "crowd"
-    """Attacker on a host of his own that sends copies of vehicles' packets to netem from many
-    ports, as many per second as the amount, and forwards the answers."""
+    """Attacker that sends copies of vehicles' packets to netem from another host and many ports, as
+    many per second as the amount, and forwards the answers."""
     PORT = "port"
-    """NAT that gives every vehicle another port, permanent; what is sent to the old one is lost."""
+    """NAT that permanently gives every vehicle another port; packets to the old one are lost."""
 
 
-HARMLESS = frozenset({Kind.COPY, Kind.CROWD, Kind.DUPLICATES, Kind.REPLAY, Kind.FLOOD})
-"""Faults that must not keep any vehicle from flying, because every packet passes."""
+HARMLESS = frozenset(
+    {FaultKind.COPY, FaultKind.CROWD, FaultKind.DUPLICATES, FaultKind.REPLAY, FaultKind.FLOOD}
+)
+"""Faults during which all vehicles must fly, because every packet still arrives."""
 
 NETWORK = ("uplink", "downlink", "both")
 """Directions in which packets are affected."""
@@ -87,25 +89,25 @@ class Range:
 
 
 RANGES = {
-    Kind.LOSS: Range(NETWORK, (0.1, 30.0), SHARE),
-    Kind.BURST: Range(NETWORK, (1.0, 30.0), (2.0, 100.0)),
-    Kind.DUPLICATES: Range(NETWORK, (1.0, 30.0), SHARE),
-    Kind.REORDERING: Range(NETWORK, (1.0, 30.0), (0.1, 5.0)),
-    Kind.PARTITION: Range(("both",), (0.1, 30.0)),
-    Kind.STEP: Range(HOSTS, (0.0, 0.0), (7.0, 3600.0), signed=True),
-    Kind.SKEW: Range(HOSTS, (10.0, 60.0), (200.0, 200.0), signed=True),
-    Kind.RESTART: Range(("server", "client", "netem"), (0.01, 10.0)),
-    Kind.FREEZE: Range(HOSTS, (0.1, 5.0)),
-    Kind.SOLVER: Range(("server",), (0.1, 10.0), SHARE),
-    Kind.OVERLOAD: Range(("server",), (0.1, 10.0), (1.5, 20.0)),
-    Kind.REPLAY: Range(NETWORK, (1.0, 30.0), (0.1, 30.0)),
-    Kind.DELAY: Range(NETWORK, (0.5, 10.0), (0.1, 10.0)),
-    Kind.CORRUPTION: Range(NETWORK, (1.0, 30.0), SHARE),
-    Kind.FLOOD: Range(HOSTS, (0.1, 5.0), (100.0, 2_000.0)),
-    Kind.COPY: Range(("both",), (5.0, 30.0), SHARE),
-    Kind.KEYS: Range(("server",), (0.1, 10.0)),
-    Kind.CROWD: Range(("netem",), (5.0, 30.0), (20.0, 1_000.0)),
-    Kind.PORT: Range(("client",), (0.0, 0.0)),
+    FaultKind.LOSS: Range(NETWORK, (0.1, 30.0), SHARE),
+    FaultKind.BURST: Range(NETWORK, (1.0, 30.0), (2.0, 100.0)),
+    FaultKind.DUPLICATES: Range(NETWORK, (1.0, 30.0), SHARE),
+    FaultKind.REORDERING: Range(NETWORK, (1.0, 30.0), (0.1, 5.0)),
+    FaultKind.PARTITION: Range(("both",), (0.1, 30.0)),
+    FaultKind.STEP: Range(HOSTS, (0.0, 0.0), (7.0, 3600.0), signed=True),
+    FaultKind.SKEW: Range(HOSTS, (10.0, 60.0), (200.0, 200.0), signed=True),
+    FaultKind.RESTART: Range(("server", "client", "netem"), (0.01, 10.0)),
+    FaultKind.FREEZE: Range(HOSTS, (0.1, 5.0)),
+    FaultKind.SOLVER: Range(("server",), (0.1, 10.0), SHARE),
+    FaultKind.OVERLOAD: Range(("server",), (0.1, 10.0), (1.5, 20.0)),
+    FaultKind.REPLAY: Range(NETWORK, (1.0, 30.0), (0.1, 30.0)),
+    FaultKind.DELAY: Range(NETWORK, (0.5, 10.0), (0.1, 10.0)),
+    FaultKind.CORRUPTION: Range(NETWORK, (1.0, 30.0), SHARE),
+    FaultKind.FLOOD: Range(HOSTS, (0.1, 5.0), (100.0, 2_000.0)),
+    FaultKind.COPY: Range(("both",), (5.0, 30.0), SHARE),
+    FaultKind.KEYS: Range(("server",), (0.1, 10.0)),
+    FaultKind.CROWD: Range(("netem",), (5.0, 30.0), (20.0, 1_000.0)),
+    FaultKind.PORT: Range(("client",), (0.0, 0.0)),
 }
 """Range of every kind."""
 
@@ -119,7 +121,7 @@ SHORTEST_NS = MILLISECOND_NS
 class ScheduledFault:
     """Scheduled fault."""
 
-    kind: Kind
+    kind: FaultKind
     where: str
     """Host or direction that is affected, one of those in its range."""
     start_ns: Annotated[int, msgspec.Meta(ge=0)]
@@ -131,14 +133,14 @@ class ScheduledFault:
 
     @property
     def end_ns(self) -> int:
-        """Time of the world at which it ends."""
+        """Time of the world at which the fault ends [ns]."""
         return self.start_ns + self.length_ns
 
     @property
     def over_ns(self) -> int:
-        """Time of the world at which the last packet that it has held back arrives."""
-        held = self.kind in (Kind.REORDERING, Kind.DELAY)
-        return self.end_ns + (seconds_to_ns(self.amount) if held else 0)
+        """Time of the world at which the last packet delayed by the fault arrives [ns]."""
+        delays = self.kind in (FaultKind.REORDERING, FaultKind.DELAY)
+        return self.end_ns + (seconds_to_ns(self.amount) if delays else 0)
 
 
 def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[ScheduledFault, ...]:
@@ -149,33 +151,33 @@ def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[ScheduledFault
         duration_ns: time within which all faults begin and end [ns].
     """
     count = 1 + rng.poisson(duration_ns / EVERY_NS)
-    kinds = list(Kind)
+    kinds = list(FaultKind)
     drawn = [_draw(rng, kinds[rng.integers(len(kinds))], duration_ns) for _ in range(count)]
     kept = [fault for fault in drawn if not _hides(fault, drawn)]
     return tuple(sorted(kept or drawn[:1], key=lambda fault: fault.start_ns))
 
 
 def _hides(step: ScheduledFault, drawn: Sequence[ScheduledFault]) -> bool:
-    """Whether a clock is set while its host is frozen, or shortly after another step.
+    """Whether a step of a clock happens while its host is frozen, or shortly after another step.
 
-    The host then cannot know how long it was frozen. Real hosts do not have this problem:
-    CLOCK_MONOTONIC cannot be set.
+    Then the host cannot know how long it was frozen. Real hosts use CLOCK_MONOTONIC, which cannot
+    be set.
     """
-    if step.kind is not Kind.STEP:
+    if step.kind is not FaultKind.STEP:
         return False
     of_host = [each for each in drawn if each.where == step.where and each is not step]
     frozen = any(
-        each.kind is Kind.FREEZE and each.start_ns <= step.start_ns <= each.end_ns
+        each.kind is FaultKind.FREEZE and each.start_ns <= step.start_ns <= each.end_ns
         for each in of_host
     )
     before = any(
-        each.kind is Kind.STEP and 0 <= step.start_ns - each.start_ns < SECOND_NS
+        each.kind is FaultKind.STEP and 0 <= step.start_ns - each.start_ns < SECOND_NS
         for each in of_host
     )
     return frozen or before
 
 
-def _draw(rng: np.random.Generator, kind: Kind, duration_ns: int) -> ScheduledFault:
+def _draw(rng: np.random.Generator, kind: FaultKind, duration_ns: int) -> ScheduledFault:
     bounds = RANGES[kind]
     where = bounds.where[rng.integers(len(bounds.where))]
     start_ns = int(rng.integers(duration_ns))
@@ -192,7 +194,7 @@ def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
 
 
 class Timed(Protocol):
-    """Data class of something that lasts for a while."""
+    """Data class with a length."""
 
     @property
     def length_ns(self) -> int:
@@ -203,14 +205,14 @@ T = TypeVar("T", bound=Timed)
 
 
 def shrink(faults: Sequence[T], fails: Callable[[tuple[T, ...]], bool]) -> tuple[T, ...]:
-    """Shrink a schedule to one that still fails, and no longer does without any one of its faults.
+    """Shrink a failing schedule until leaving out any single fault makes it pass.
 
     Delta debugging: faults are left out, first many at a time and finally one by one; then each is
     halved in length while the schedule still fails.
 
     Args:
         faults: schedule that fails.
-        fails: tells whether a schedule fails; called often, also with the empty one.
+        fails: whether a schedule fails; called often, also with the empty one.
     """
     kept = tuple(faults)
     size, dropped = len(kept), True

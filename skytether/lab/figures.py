@@ -60,11 +60,11 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     line_s = np.geomspace(0.01, float(trip_s.max()), 100)
     cover.plot(line_s, line_s, "k-", linewidth=1.0)
     cover.set_yscale("log")
-    cover.set_ylabel("what a horizon covers, H · Δt [s]")
-    cover.set_title("all points; above the line a horizon covers a round trip", fontsize=10)
+    cover.set_ylabel("length of a horizon, H · Δt [s]")
+    cover.set_title("all points; above the line horizons are longer than a round trip", fontsize=10)
     losses.set_ylabel("loss, the larger of both ways")
     for plane in (delays, losses):
-        plane.set_title("where a horizon covers a round trip", fontsize=10)
+        plane.set_title("points with horizons longer than a round trip", fontsize=10)
     for plane in (cover, losses):
         plane.set_xlabel("mean round trip [s]")
     delays.set_xlabel("mean delay to the vehicle [s]")
@@ -109,9 +109,11 @@ def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
     plane.set_xlim(RATIOS[0], RATIOS[-1])
     plane.set_ylim(0.0, 1.0)
     plane.axvline(1.0, color="k", linewidth=1.0)
-    plane.set_xlabel("what a horizon covers, in round trips; the ends hold all beyond")
+    plane.set_xlabel("length of a horizon in round trips; the outer bars include all beyond")
     plane.set_ylabel("share of points")
-    plane.set_title("all points; right of the line a horizon covers a round trip", fontsize=10)
+    plane.set_title(
+        "all points; right of the line horizons are longer than a round trip", fontsize=9
+    )
 
 
 UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
@@ -233,10 +235,10 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: 
     panes[0].set_yscale("log")
     panes[0].legend(fontsize=8)
     panes[1].set_title(
-        "median, and dotted what 99 of 100 packets stay below; × where they no longer fly",
+        "median, and dotted the 99 % quantile; × if the vehicles do not fly",
         fontsize=9,
     )
-    panes[-1].set_xlabel("vehicles on the air")
+    panes[-1].set_xlabel("number of vehicles")
     ticks = sorted({2**i for i in range(13)} & set(range(1, _most(flown) + 1)))
     panes[-1].set_xticks(ticks, list(map(str, ticks)))
     figure.suptitle(title, fontsize=11)

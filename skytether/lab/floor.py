@@ -47,8 +47,8 @@ def wind_floor_m(scenario: Scenario, client: Rows) -> float:
     wind.
 
     An input cannot compensate wind after the observation that it was planned from. Steps flown
-    without a plan count as if there had been no wind. Gusts are not included; feedback aboard
-    compensates wind itself, and has no such floor.
+    without a plan are counted as without wind. Gusts are not included. With feedback aboard the
+    vehicle compensates wind itself, so this floor does not apply.
 
     Args:
         client: rows of one vehicle, with the ages.
@@ -62,11 +62,11 @@ def wind_floor_m(scenario: Scenario, client: Rows) -> float:
 
 
 def target_floor_m(scenario: Scenario, client: Rows) -> float:
-    """Floor of RMSE xy [m], from `settle` on, for a target that only the server sees.
+    """Floor of RMSE xy [m], from `settle` on, for a target that only the server knows.
 
     A vehicle cannot know the target's motion after its plan was made: white acceleration of the
-    strength `reference.agility`, except for what the server sees ahead. The target's bounds are
-    ignored. Steps flown without a plan count as if the target had stood still.
+    strength `reference.agility`, except within `reference.preview`. The target's bounds are
+    ignored. Steps flown without a plan are counted as if the target had been at rest.
 
     Args:
         client: rows of one vehicle, with the ages of its plans.
@@ -101,10 +101,11 @@ def fly_aboard(scenario: Scenario) -> Rows:
         ValueError: only the server knows the reference.
     """
     if scenario.reference.shape in UNKNOWN:
-        raise ValueError(f"reference.shape: {scenario.reference.shape!r} is no shape known aboard")
+        shape = scenario.reference.shape
+        raise ValueError(f"reference.shape: {shape!r} is known to the server only")
     terms, vehicle = scenario.terms(), scenario.vehicle
     constants = Constants.of(terms, regulator(scenario))
-    flies, known = simulated(scenario, 1), Navigation(scenario)
+    flies, navigation = simulated(scenario, 1), Navigation(scenario)
     desired = _due(scenario)
     change_max = math.inf if terms.exhausted == "hold" else vehicle.slew_mps2 * terms.dt_s
     rows = np.zeros(scenario.steps, client_columns(terms.axes))
@@ -114,22 +115,25 @@ def fly_aboard(scenario: Scenario) -> Rows:
     u: Array = np.zeros(terms.axes)
     for k, row in enumerate(rows):
         now_ns = k * terms.dt_ns
-        known.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
+        navigation.advance(flies.measurements(now_ns=now_ns), u, now_ns=now_ns)
         spline = SplineFollower(constants, desired[k : k + 2].swapaxes(0, 1), 1, 1)
-        wanted, told = spline.input_at(0, known.predicted, known.disturbance, u).tolist()
-        flown = clamped(wanted, u.tolist(), terms.u_max, change_max, without_feedback=told)
+        wanted, without_feedback = spline.input_at(
+            0, navigation.predicted, navigation.disturbance, u
+        ).tolist()
+        flown = clamped(
+            wanted, u.tolist(), terms.u_max, change_max, without_feedback=without_feedback
+        )
         assert flown is not None
         u = np.array(flown)
-        row["state"], row["measured"] = flies.truth(), known.measured
-        row["estimate"], row["input"] = known.predicted, u
+        row["state"], row["measured"] = flies.truth(), navigation.measured
+        row["estimate"], row["input"] = navigation.predicted, u
         flies.fly(u)
     return rows
 
 
 def _due(scenario: Scenario) -> Array:
-    """Desired states for the inputs' arrival at the vehicle [m, m/s]; shape (steps + 1, axes, 2).
-
-    There is one more state than there are steps.
+    """Desired states at the times when inputs take effect, after each axis' dead time [m, m/s];
+    shape (steps + 1, axes, 2).
     """
     sample, times_s = scenario.make_reference(), np.arange(scenario.steps + 1) * scenario.control.dt
     late_s = scenario.terms().dead_time_s

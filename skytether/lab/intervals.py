@@ -1,9 +1,9 @@
-"""Confidence intervals of everything that the laboratory says, at 95 %.
+"""Confidence intervals of the laboratory's figures, at 95 %.
 
-There are two kinds. A mean over independent flights has Student's interval. Anything else that
-follows from a sample of flights (a ratio of means, a rate of growth) has the jackknife's: it asks
-only how much the statistic moves when one flight is left out, and needs no formula of its own. The
-fit of `identify` has the robust interval that goes with least squares, see `lab.identify.fit`.
+A mean over independent flights has Student's interval. Any other statistic of a sample of flights
+(a ratio of means, a rate of growth) has the jackknife's, which follows from the change of the
+statistic when one flight is left out. The fit of `identify` has the robust interval of least
+squares, see `lab.identify.fit`.
 """
 
 import math
@@ -19,7 +19,11 @@ Estimate = tuple[float | None, float | None]
 
 
 def students(freedom: int) -> float:
-    """Half-width of a 95 % interval in standard errors, with so many degrees of freedom."""
+    """Half-width of a 95 % interval in standard errors.
+
+    Args:
+        freedom: degrees of freedom.
+    """
     return float(stats.t.ppf(0.975, freedom))
 
 

@@ -1,10 +1,10 @@
-"""Invariants of every step of every vehicle under torture, and their checks.
+"""Checks of the invariants of every step of every vehicle in `skytether torture`.
 
-A `WatchedLife` wraps the link of one run of a client, and takes its record: it sees every message
+A `WatchedLife` wraps the link of one run of a client and receives its record: it sees every message
 that the vehicle accepts, and every input that it flies. A `Gatekeeper` wraps the gate of one run of
-the server. Both keep a `Ledger` of all messages that were really sent, to check that no other is
-accepted. Deadlines of the vehicle are counted in its own steps (a frozen vehicle cannot act), all
-others in the world's time. A "life" is one run of an endpoint, from start to restart.
+the server. A `Ledger` has all messages that were really sent, to check that no others are accepted.
+Deadlines of the vehicle are counted in its own steps (a frozen vehicle cannot act), all others in
+the world's time. A "life" is one run of an endpoint, from start to restart.
 """
 
 import io
@@ -20,7 +20,7 @@ from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
 from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
-from skytether.server.gate import Call, Gate, ReplyPath
+from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import ALTITUDE, Array
@@ -42,11 +42,11 @@ WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY = 2, 3, 4, 5, 7
 ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
 """Message types of which each message is unique, and so may be accepted once at most."""
 REMEMBERED = 8192
-"""Number of newest messages of a direction that are remembered; none is under way for longer."""
+"""Number of newest messages of a direction that are stored, more than can be in flight."""
 STEPS_REMEMBERED = 4096
-"""Number of newest steps of a life whose time is remembered."""
-HELD_MAX = 1024
-"""Number of newest horizons of a life that are remembered."""
+"""Number of newest steps of a life whose time is stored."""
+HORIZONS_MAX = 1024
+"""Number of newest horizons of a life that are stored."""
 ROUNDING = 1e-6
 """Rounding tolerance of a speed [m/s], as horizons travel as float32."""
 MARGIN_M = 2.0
@@ -76,8 +76,8 @@ class Ledger:
         entry = self._sealed.setdefault((vehicle, payload), [life, 0, 0])
         # The same bytes may be sent more than once, as CLOSE is.
         entry[1] += 1
-        # The oldest goes first: a message that is opened after that would be reported as forged, so
-        # REMEMBERED is far more than can be under way.
+        # A message that arrives after its removal would be reported as forged, so REMEMBERED is far
+        # more than can be in flight.
         if len(self._sealed) > REMEMBERED:
             self._sealed.popitem(last=False)
 
@@ -89,10 +89,10 @@ class Ledger:
         """
         entry = self._sealed.get((vehicle, payload))
         if entry is None:
-            raise Violation("authentic", f"a message of type {kind} that nobody has sent")
+            raise Violation("authentic", f"a message of type {kind} was accepted but never sent")
         entry[2] += 1
         if kind in ONCE and entry[2] > entry[1]:
-            raise Violation("once", f"a message of type {kind} is believed again")
+            raise Violation("once", f"a message of type {kind} was accepted again")
 
     def life(self, vehicle: int, payload: bytes) -> int:
         """Sender's life of a message, or -1 if it was not sent."""
@@ -114,7 +114,7 @@ class Gatekeeper:
         self._life = life
         self._up, self._down = up, down
 
-    def open(self, datagram: Datagram, *, now_ns: int) -> Call | None:
+    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
         """See `Gate`; the message must be one that a vehicle has sent."""
         call = self.gate.open(datagram, now_ns=now_ns)
         if call is None:
@@ -123,7 +123,7 @@ class Gatekeeper:
         self._down.believe(call.vehicle, call.payload, kind_of(call.payload))
         return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
 
-    def admit(self, call: Call, *, now_ns: int) -> None:
+    def admit(self, call: GateCall, *, now_ns: int) -> None:
         """See `Gate`."""
         assert isinstance(call.line, _Noted)
         self.gate.admit(call._replace(line=call.line.inner), now_ns=now_ns)
@@ -134,7 +134,7 @@ class Gatekeeper:
 
 
 class _Noted:
-    """Wrapper around a way back that notes all messages."""
+    """Wrapper around a reply path that notes all messages."""
 
     __slots__ = ("_life", "_up", "_vehicle", "inner")
 
@@ -158,10 +158,10 @@ class WatchedLife(Recorder):
         number: number of this life.
         up, down: ledgers of the server's and of the vehicles' messages.
         clock: returns the world's time [ns].
-        overdue: returns whether faults have been over for so long that the vehicle must fly.
-        rekey_ns: time after which the vehicle wants new keys, if earlier than the link's own time
+        overdue: returns whether all faults ended so long ago that the vehicle must fly.
+        rekey_ns: time after which the vehicle asks for new keys, if earlier than the link does
             [ns].
-        drifted_m: distance that it may have flown while frozen, in earlier lives [m].
+        drifted_m: distance that the vehicle may have flown while frozen, in earlier lives [m].
     """
 
     def __init__(  # noqa: PLR0915 - a docstring counts for a statement
@@ -194,13 +194,13 @@ class WatchedLife(Recorder):
         self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
 
         self._adopted_ns = 0
-        """Time at which the newest keys were adopted [vehicle's clock]."""
+        """Time at which the newest keys were adopted [ns; vehicle's clock]."""
         self._welcome: tuple[int, int] | None = None
         """Session and server's life of the newest WELCOME that was opened."""
         self._session: tuple[int, int] | None = None
         """Session and server's life that were adopted."""
         self._heard = False
-        """Whether a packet of the session has come since the last step."""
+        """Whether a packet of the session has arrived since the last step."""
         self._silent = 0
         """Steps since the newest packet of the session."""
         self._good_ns: int | None = None
@@ -208,10 +208,10 @@ class WatchedLife(Recorder):
         self._speed_lost = 0.0
         """Speed at the last step before the link was lost [m/s]."""
         self._times_ns: OrderedDict[int, int] = OrderedDict()
-        """Time of the world of each step that was flown."""
-        self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HELD_MAX)
+        """Time of the world of each step that was flown [ns]."""
+        self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HORIZONS_MAX)
         """Session, server's life and message of each horizon that was opened."""
-        self._held: tuple[int, int, Horizon | Trajectory] | None = None
+        self._in_force: tuple[int, int, Horizon | Trajectory] | None = None
         """Horizon or trajectory in force, decoded."""
         self._observed = -1
         """Step of the observation that the plan in force was made from."""
@@ -235,7 +235,7 @@ class WatchedLife(Recorder):
         self.planned, self.followed = 0, 0
         """Number of steps flown by a horizon of inputs, and along a trajectory."""
         self.row_ns = -1
-        """Time of the world of its newest step, or -1."""
+        """Time of the world of the newest step [ns], or -1."""
 
     # -- the link ----------------------------------------------------------------------------
 
@@ -274,7 +274,7 @@ class WatchedLife(Recorder):
         self._link.adopt(now_ns=now_ns)
         self._adopted_ns = now_ns
         assert self._welcome is not None
-        # Another life of the server: the link has to be good for a second anew.
+        # Another life of the server: the link must again be good for a second.
         if self._session is None or self._welcome[1] != self._session[1]:
             self._good_ns = None
         self._session = self._welcome
@@ -293,7 +293,7 @@ class WatchedLife(Recorder):
     # -- the record --------------------------------------------------------------------------
 
     def append_row(self, *values: float) -> None:
-        """Take one row of the record, and check it.
+        """Check one row of the record.
 
         Raises:
             Violation: the row violates an invariant.
@@ -316,9 +316,9 @@ class WatchedLife(Recorder):
         self._check_follows(step, known, flown, covered=bool(covered))
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
-        # Safe for ever is not enough: a vehicle that never flies again would break no other rule.
+        # Without this rule a vehicle that never flies again would pass.
         if mode not in FLYING and mode is not Mode.LAND and self._overdue():
-            raise Violation("recovers", f"{mode}, though nothing has happened for long")
+            raise Violation("recovers", f"{mode}, though all faults ended long ago")
         self.step, self.missed, self.mode, self.input = step, int(missed), mode, flown
         self.steps += 1
         self.row_ns = now_ns
@@ -342,9 +342,7 @@ class WatchedLife(Recorder):
                 raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
 
     def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
-        """Check that the mode is reachable in the table, and does not go on flying after a
-        freeze.
-        """
+        """Check that the table allows the mode, and that no horizon is flown after a freeze."""
         if mode not in REACHED[self.mode]:
             raise Violation("table", f"from {self.mode} to {mode}")
         if mode is Mode.FAULT:
@@ -370,21 +368,21 @@ class WatchedLife(Recorder):
         too old.
         """
         if in_force == NO_HORIZON:
-            self._held = self._course = None
+            self._in_force = self._course = None
             return
-        if self._held is None or self._held[2].step != in_force:
+        if self._in_force is None or self._in_force[2].step != in_force:
             self._observed = step - age_ns // self._dt_ns
-            self._held = self._find(in_force)
+            self._in_force = self._find(in_force)
             self._course = None
             good_ns = self._good_ns
-            # Two steps of tolerance: what came within a step is noticed at the begin of the next.
+            # Two steps of tolerance: a packet is noticed at the beginning of the next step.
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
-                raise Violation("good link", f"a horizon is flown, the link good for {since}")
-        session, life, horizon = self._held
+                raise Violation("good link", f"a horizon is flown, the link is good since {since}")
+        session, life, horizon = self._in_force
         if (session, life) != self._session:
-            said = f"of life {life} and session {session}, not {self._session}"
-            raise Violation("foreign", f"a horizon {said}")
+            origin = f"of life {life} and session {session}, not {self._session}"
+            raise Violation("foreign", f"a horizon {origin}")
         if self._observed not in self._times_ns or self._observed > step:
             raise Violation("observed", f"a horizon from an observation of step {self._observed}")
         if self._course is None:
@@ -396,39 +394,38 @@ class WatchedLife(Recorder):
 
     def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
         """Find the horizon in force, by the step that it was made for and its observation."""
-        # A step alone does not name a horizon: two lives of the server may have planned for the
-        # same.
+        # The step alone is ambiguous: two lives of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
             assert isinstance(horizon, Horizon | Trajectory)
             if horizon.step == made_for and horizon.step - horizon.age == self._observed:
                 return session, life, horizon
-        raise Violation("foreign", f"a horizon for step {made_for} that has not come")
+        raise Violation("foreign", f"a horizon for step {made_for} that was never received")
 
     def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
-        """Check that the input follows the horizon, within the rate limit, and that no old one is
-        used.
+        """Check that the input follows the horizon within the rate limit, and that none is too old.
 
-        After the horizon's last input, the vehicle must follow the braking curve, and not exceed
-        the prescribed speed before feedback.
+        After the horizon's last input the vehicle must follow the braking curve: without feedback,
+        its speed must not exceed the prescribed one.
         """
         course, before = self._course, np.array(self.input)
         if course is None:
             self._speed, self._covered = math.hypot(*flown), covered
             return
-        assert self._held is not None
+        assert self._in_force is not None
         if covered:
             self._check_age(step, self._observed)
-        stage, most, found = step - self._held[2].step, math.inf, self.disturbance()
-        told = course.told(stage)
+        stage, most, disturbance = step - self._in_force[2].step, math.inf, self.disturbance()
+        prescribed = course.prescribed(stage)
         if not covered:
             most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
-        # Behind the last input the told part may not speed up; feedback comes on top of it.
-        left_out = told * (1.0 - min(1.0, most / max(float(np.linalg.norm(told)), ROUNDING)))
+        # After the last input, the part without feedback must not accelerate.
+        speed = max(float(np.linalg.norm(prescribed)), ROUNDING)
+        left_out = prescribed * (1.0 - min(1.0, most / speed))
         bound = np.array(self._terms.u_max)
-        want = np.clip(told + course.back(stage, state, found), -bound, bound)
+        want = np.clip(prescribed + course.feedback(stage, state, disturbance), -bound, bound)
         want = course.lag * before + (1.0 - course.lag) * want - left_out
-        told = told - left_out
+        prescribed = prescribed - left_out
         near = np.clip(want, before - self._change_max, before + self._change_max)
         near = np.clip(near, -bound, bound)
         for u, should, meant in zip(flown, near.tolist(), want.tolist(), strict=True):
@@ -438,11 +435,11 @@ class WatchedLife(Recorder):
             self.followed += isinstance(course, FollowedCourse)
             self.planned += isinstance(course, PlannedCourse)
         feeds_back = course.feeds_back
-        self._speed = float(np.linalg.norm(told)) if feeds_back else math.hypot(*flown)
+        self._speed = float(np.linalg.norm(prescribed)) if feeds_back else math.hypot(*flown)
         self._covered = covered
 
     def _check_age(self, step: int, observed: int) -> None:
-        """Check that no input is flown later after its observation than allowed."""
+        """Check that the observation behind the input is not older than allowed."""
         limit_ns = self._terms.age_max * self._dt_ns
         # By both clocks: a vehicle whose clock is slow must not fly old inputs either.
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
@@ -452,13 +449,13 @@ class WatchedLife(Recorder):
             )
 
     def _check_silence(self, mode: Mode, flown: list[float]) -> None:
-        """Check that the vehicle brakes while the link is lost, and at most descends."""
+        """Check that the vehicle brakes while the link is lost; a landing one may also descend."""
         lost = self._silent - self._timeout - 1
         if lost < 0:
             return
         speed = math.hypot(*flown)
         if mode is Mode.LAND:
-            # A landing vehicle may sink; everything else it does in silence has to be braking.
+            # A landing vehicle may descend; horizontally it must brake.
             sinks = len(flown) > ALTITUDE and -LAND_MPS <= flown[ALTITUDE] <= 0.0
             speed = math.hypot(*flown[:ALTITUDE]) if sinks else speed
         most = max(0.0, self._speed_lost - lost * self._terms.brake)
@@ -467,15 +464,13 @@ class WatchedLife(Recorder):
             raise Violation("brakes", f"{speed:.3f} m/s after {silent_s:.2f} s of silence")
 
     def _check_place(self, position: tuple[float, ...], asleep: int) -> None:
-        """Check that the vehicle is near the reference, or where unplanned flight may have taken
-        it.
-        """
+        """Check that the vehicle is near the reference, or within reach of unplanned flight."""
         away = max(
             max(low - p, p - high) for p, (low, high) in zip(position, self._extent, strict=True)
         )
         if away <= MARGIN_M:  # the vehicle is back at the reference
             self.drifted_m = 0.0
-        # While it was frozen it flew on with its last input, wherever that led.
+        # A frozen vehicle flies on with its last input.
         self.drifted_m += _speed_max(self._terms) * asleep * self._terms.dt_s
         if away > self._reach_m + self.drifted_m:
             raise Violation("place", f"{away:.1f} m outside of the reference")
@@ -485,11 +480,11 @@ MOVES = frozenset(
     {(str(mode), str(after)) for (mode, _), after in TABLE.items()}
     | {(str(mode), str(mode)) for mode in Mode}
 )
-"""Names of modes, and of those that the table reaches from them in one transition."""
+"""Pairs of a mode and a mode that the table reaches from it in one transition, by name."""
 
 
 def _reached(mode: Mode) -> frozenset[Mode]:
-    """Modes that the table reaches from one, in any number of transitions."""
+    """Modes that the table reaches from a mode, in any number of transitions."""
     reached = {mode}
     while True:
         more = {after for (before, _), after in TABLE.items() if before in reached} - reached
@@ -559,7 +554,7 @@ def _sizes(thing: Any, name: str, seen: set[int]) -> Iterator[tuple[str, int]]:
     seen.add(id(thing))
     if isinstance(thing, dict | list | deque | set):
         yield name, len(thing)
-        # What is beyond the bound is a violation already, and need not be searched.
+        # More items than the bound are a violation already, so the others are not searched.
         for each in list(thing.values() if isinstance(thing, dict) else thing)[:BOUND]:
             yield from _sizes(each, name, seen)
     elif type(thing).__module__.startswith(OURS):

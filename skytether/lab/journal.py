@@ -27,17 +27,17 @@ SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
 E = TypeVar("E")
 
 
-class Journal(Generic[E]):
+class StudyJournal(Generic[E]):
     """Results of one study, in a folder that is created if missing.
 
     Args:
-        folder: where the journal is kept; None: nothing is kept.
+        folder: folder of the journal; None: results are not stored.
         settings: all settings that determine the results, as plain values; the version is added.
         kind: type of a result.
 
     Raises:
-        ConfigError: the folder holds another computation or an invalid line, or another process
-            writes.
+        ConfigError: the folder has results of other settings or an invalid line, or another process
+            is writing to it.
         OSError: the folder cannot be written.
     """
 
@@ -73,7 +73,7 @@ class Journal(Generic[E]):
             if now.get(key) != before.get(key):
                 raise ConfigError(
                     f"{folder}: {key.removeprefix('scenario.')}: got {now.get(key)!r}, "
-                    f"expected {before.get(key)!r}, to go on there; or another --out"
+                    f"expected {before.get(key)!r} to continue there; or choose another --out"
                 )
 
     def _read(self, decoder: msgspec.json.Decoder[tuple[str, E]]) -> None:
@@ -91,13 +91,13 @@ class Journal(Generic[E]):
                 self.results[name] = result
             except (ValueError, msgspec.MsgspecError) as error:
                 where = f"{self._folder / ENTRIES}: line {number}"
-                raise ConfigError(f"{where} is not what was written: {error}") from None
+                raise ConfigError(f"{where} has been altered: {error}") from None
             whole += len(line)
         self._file.seek(whole)
         self._file.truncate()
 
     def add(self, name: str, result: E) -> None:
-        """Keep the result of a cell, on disk."""
+        """Store the result of a cell on disk."""
         self.results[name] = result
         if self._file is not None:
             self._file.write(sealed(msgspec.json.encode((name, result))))

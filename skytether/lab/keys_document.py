@@ -4,15 +4,14 @@ The text of each key is its docstring in the source, as in `--help`; the unit is
 docstring's brackets.
 """
 
-import ast
 import inspect
 import re
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS
 from skytether.shared.scenario.schema import Scenario, Section
 
@@ -40,15 +39,15 @@ def document() -> str:
 
 def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
     """Tables of a section's keys, and of its nested sections."""
-    told = sentences(section)
+    descriptions = meanings(section)
     rows: list[str] = []
     within: list[str] = []
     for field in msgspec.structs.fields(section):
         name = f"{prefix}{field.name}"
         if name in KEYS:
-            rows.append(_row(name, field, told[field.name]))
+            rows.append(_row(name, field, descriptions[field.name]))
         else:
-            inner = told.get(field.name) or inspect.getdoc(field.type) or ""
+            inner = descriptions.get(field.name) or inspect.getdoc(field.type) or ""
             within += _tables(field.type, f"{name}.", inner)
     yield f"## {prefix.rstrip('.') or 'scenario'}\n\n{about}\n"
     yield "| key | values | default | owner | meaning |"
@@ -58,7 +57,7 @@ def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
 
 
 def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
-    """Row of a key; its unit stands behind its values."""
+    """Table row of a key; its unit is put after the allowed values."""
     key = KEYS[name]
     units = ", ".join(dict.fromkeys(re.findall(r"\[(.*?)\]", sentence)))
     cells = (
@@ -90,14 +89,14 @@ def values(kind: Any) -> str:
 
 
 def _either(kinds: list[str]) -> str:
-    """Allowed values of a union, its words first; a number or a list of such has one range."""
+    """Allowed values of a union, words first; "number or list of numbers" shares one range."""
     if kinds[1] == f"list of numbers, {kinds[0]}":
         return f"number or {kinds[1]}"
     return " or ".join(sorted(kinds, key=lambda each: not each.startswith("`")))
 
 
 def _bounded(kind: type, meta: msgspec.Meta) -> str:
-    """Range of a number; texts have a bound that nobody comes near."""
+    """Range of a number; the largest length of a text is not shown."""
     if kind is str:
         return "text"
     low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
@@ -113,17 +112,6 @@ def _number(value: float | None) -> str:
 def _toml(value: object) -> str:
     """Value in the form that TOML and JSON share."""
     return msgspec.json.encode(value).decode()
-
-
-def sentences(section: type[Section]) -> dict[str, str]:
-    """Docstring of each documented key of a section, in one line."""
-    (definition,) = ast.parse(inspect.getsource(section)).body
-    assert isinstance(definition, ast.ClassDef)
-    return {
-        ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
-        for key, text in pairwise(definition.body)
-        if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Flights of a mission in virtual time in which processes die and begin anew.
+"""Missions in virtual time in which server and clients stop and restart.
 
-A life is one run of a process. A vehicle outlives its clients, as with an autopilot: without one it
-keeps its last velocity for a while and then rests. What the operator has set outlives the server.
+A life is one run of a process. A vehicle flies on without its client, as with an autopilot: it
+keeps its last velocity for HOLD_NS and then rests. Keys set by the operator survive the server.
 """
 
 import io
@@ -37,16 +37,16 @@ from skytether.sim.world import Clock, World
 
 NETWORK: Address = ("netem", 0)
 CLOCK = Clock(10**6 * SECOND_NS)
-"""Clock of all hosts: the map of clocks does not depend on what they show."""
+"""Clock of all hosts; its offset has no effect, as the server estimates clock offsets."""
 HOLD_NS = SECOND_NS
 """Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
 
 
 class Body(SimulatedVehicle):
-    """Simulated vehicle that outlives its clients.
+    """Simulated vehicle that flies on without its client.
 
     Args:
-        scenario: what is flown.
+        scenario: scenario of the flight.
         number: number of the vehicle.
     """
 
@@ -58,18 +58,18 @@ class Body(SimulatedVehicle):
         """Times [s; client's clock] and positions [m] of steps without a client."""
 
     def fly_alone(self, now_ns: int) -> None:
-        """Fly the steps that have begun by now without a client."""
-        told, lost, velocity = list[Measurement](), self._step, self._velocity
+        """Fly without a client up to the present step."""
+        measurements, lost, velocity = list[Measurement](), self._step, self._velocity
         while lost >= 0 and self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             is_held = (self._step - lost) * self._dt_ns < HOLD_NS
             self.plant.advance(velocity if is_held else 0.0 * velocity)
             self._step += 1
-            self._measure(told)
+            self._measure(measurements)
             time_s = (self._began_ns + self._step * self._dt_ns) / SECOND_NS
             self.unflown.append((time_s, self.plant.state()[:, 0].tolist()))
 
-    def begin_anew(self, sensor: Sensor) -> None:
-        """Rest until a client flies it, which counts steps of its own."""
+    def reset(self, sensor: Sensor) -> None:
+        """Rest until the next client, which counts its steps from 0."""
         self.sensor, self._step, self._velocity = sensor, -1, 0.0 * self._velocity
 
 
@@ -86,14 +86,12 @@ class Life(NamedTuple):
 
 
 class Lives:
-    """Mission, and the lives of the processes that fly it.
+    """Mission whose server and clients can be stopped and restarted.
 
     Args:
-        scenario: what is flown; a mission.
-        network: endpoint between clients, whose host it is to, and server; that of the scenario
-            unless given.
-        mortal: numbers of vehicles whose clients may die: only these keep what the next life is to
-            find.
+        scenario: scenario of the mission.
+        network: endpoint between clients and server; the scenario's network unless given.
+        mortal: numbers of vehicles whose clients may stop; only these save their state.
     """
 
     def __init__(
@@ -107,7 +105,7 @@ class Lives:
         self.scenario, self.mission = scenario, mission
         self.events: list[tuple[float, str, Event]] = []
         """Time of the world [s], host and event."""
-        self.world = World(self._hear)
+        self.world = World(self._on_event)
         flows = 2 * len(mission.vehicles)
         self.world.add(NETWORK[0], network or Proxy(scenario, server=SERVER, flows=flows))
         self._mortal = mission.vehicles if mortal is None else mortal
@@ -120,16 +118,16 @@ class Lives:
             self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
         self._servers = 0
         self.running: Running | None = None
-        """Server and its scenario, while it is up."""
+        """Server and its scenario, while the server runs."""
         self._settings: Mapping[str, Any] = {}
-        """What was set, as the journal of the server keeps it."""
+        """Keys set in flight, as the server's journal stores them."""
         self.world.add(SERVER[0], self._server(scenario), clock=CLOCK)
 
-    def _hear(self, time_ns: int, host: str, event: Event) -> None:
+    def _on_event(self, time_ns: int, host: str, event: Event) -> None:
         self.events.append((time_ns / SECOND_NS, host, event))
 
     def _server(self, scenario: Scenario) -> Server:
-        """The next life of the server."""
+        """Make the next life of the server."""
         self._servers += 1
         entropy = stream(scenario.seed, "entropy", self._servers).bytes
         count = len(self.mission.vehicles)
@@ -138,7 +136,7 @@ class Lives:
         return self.server
 
     def _client(self, number: int, *, remembers: bool) -> Client:
-        """The next life of a vehicle's client."""
+        """Make the next life of a vehicle's client."""
         lives, before, sink = self._lives[number], None, io.BytesIO()
         if remembers and (kept := self.world.memory(f"client {number}")):
             before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
@@ -156,40 +154,40 @@ class Lives:
         return client
 
     def _keeps(self, number: int) -> bool:
-        """Whether a vehicle's client keeps anything for its next life."""
+        """Whether a vehicle's client saves its state."""
         return number in self._mortal and self.scenario.vehicle.memory != "none"
 
-    # -- what dies and begins anew -----------------------------------------------------------------
+    # -- stops and restarts ------------------------------------------------------------------------
 
     def stop_client(self, number: int) -> None:
-        """End a vehicle's client."""
+        """Stop a vehicle's client."""
         self.world.stop(f"client {number}")
 
     def start_client(self, number: int, *, remembers: bool = True) -> None:
-        """Begin the next life of a vehicle's client.
+        """Start the next life of a vehicle's client.
 
         Args:
             number: number of the vehicle.
-            remembers: whether it finds what the life before has kept.
+            remembers: whether it finds the saved state of the previous life.
         """
         body, remembers = self.bodies[number], remembers and self._keeps(number)
         body.fly_alone(CLOCK.local(self.world.now_ns))
         if not remembers:
-            body.begin_anew(_sensor(self.scenario, number, len(self._lives[number])))
+            body.reset(_sensor(self.scenario, number, len(self._lives[number])))
         self.world.restart(f"client {number}", self._client(number, remembers=remembers))
 
     def stop_server(self) -> None:
-        """End the server."""
+        """Stop the server."""
         if self.running is not None:
             self._settings, self.running = self.running.settings, None
         self.world.stop(SERVER[0])
 
     def start_server(self, changes: Mapping[str, Any], *, remembers: bool = True) -> None:
-        """Begin the next life of the server.
+        """Start the next life of the server.
 
         Args:
-            changes: keys with which it begins, and their values.
-            remembers: whether it takes up what was set in flight before.
+            changes: keys that differ from the scenario, and their values.
+            remembers: whether keys that were set in flight are kept.
         """
         if not remembers:
             self._settings = {}
@@ -202,10 +200,10 @@ class Lives:
             with suppress(ConfigError):  # the refusal is an event
                 self.world.act(SERVER[0], partial(self.running.change, values))
 
-    # -- what is flown -----------------------------------------------------------------------------
+    # -- the flight --------------------------------------------------------------------------------
 
     def track(self, number: int) -> Track:
-        """Track of a vehicle, from its first step on a mission on, through all its lives."""
+        """Track of a vehicle through all its lives, from its first step on the mission."""
         dt_s, scale = self.scenario.control.dt, self.scenario.mission.height_scale
         tracks: list[Track] = []
         for client, sink in self._lives[number]:
@@ -216,7 +214,7 @@ class Lives:
         if not tracks:
             return np.zeros(0), np.zeros((0, self.scenario.model.axes))
         body = self.bodies[number]
-        # Whoever has no client, or one that is refused, is where it was left.
+        # A vehicle without a client, or with one that is refused, stays at its last position.
         now = CLOCK.local(self.world.now_ns) / SECOND_NS, body.plant.state()[:, 0].tolist()
         times, at = (np.array(each) for each in zip(*body.unflown, now, strict=True))
         at[:, 2:] *= scale
@@ -236,5 +234,5 @@ class Lives:
 
 
 def world_s(time_s: float) -> float:
-    """Time of the world, of one of the hosts' clocks [s]."""
+    """Time of the world for a time on the hosts' clock [s]."""
     return float(time_s) - CLOCK.offset_ns / SECOND_NS

@@ -1,10 +1,11 @@
-"""Margin maps: flights of vehicles that differ from the model, over a box of differences.
+"""Margin maps: flights of vehicles that differ from the model, over a grid of differences.
 
-Each point of the box is flown without wind, twice: at rest, from START_M beside the point where it
-is to hover; and along the scenario's reference. At rest nothing disturbs it, so a vehicle whose
-loop is stable comes to rest. A vehicle that still moves in the last quarter, by more than REST_M
-about the point and hardly less than in the quarter before, is in a limit cycle: it oscillates
-between the bounds of its input. The table also has the growth after a push (`lab.margins`).
+Each point of the grid is flown without wind in two ways: hovering, from a start START_M beside the
+hover point; and along the scenario's reference. Hovering without disturbance, a vehicle whose loop
+is stable comes to rest. If its RMS distance from the hover point is above REST_M in the last
+quarter of the flight, and above SUSTAINED of that in the quarter before, it is in a limit cycle: it
+oscillates between the bounds of its input. The table also has the growth after a push
+(`lab.margins`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,14 +32,14 @@ from skytether.shared.telemetry.summary import Summary, position_error, summaris
 from skytether.sim.flight import fly_batch
 
 START_M = 1.0
-"""Distance along the first axis from which a vehicle starts to come to rest [m]."""
+"""Initial distance from the hover point, along the first axis [m]."""
 REST_S = 60.0
-"""Length of the flights to rest [s]."""
+"""Length of the hovering flights [s]."""
 REST_M = 0.05
-"""Root mean square distance from the point above which a vehicle has not come to rest [m]."""
+"""RMS distance from the hover point above which a vehicle has not come to rest [m]."""
 SUSTAINED = 0.7
-"""Ratio of the last quarter's distance to that of the quarter before, above which it does not
-decay."""
+"""Ratio of the last quarter's RMS distance to that of the quarter before, above which the
+oscillation does not decay."""
 RUNS = 2
 """Number of flights of each kind at a point, with seeds that count up from the scenario's."""
 PUSHES = 4
@@ -53,18 +54,18 @@ class Place(NamedTuple):
     dead_time_s: float
     """Dead time of the vehicle minus that of the model [s]."""
     gain: float
-    """Gain of the vehicle over that of the model."""
+    """Gain of the vehicle relative to that of the model."""
     tau: float
-    """Time constants of the vehicle over those of the model."""
+    """Time constants of the vehicle relative to those of the model."""
 
 
 class MapPoint(msgspec.Struct, frozen=True):
     """Results of a point; an entry of a map's journal."""
 
     cycles: bool
-    """Whether a flight to rest ended in a limit cycle."""
+    """Whether a hovering flight ended in a limit cycle."""
     rest_m: float
-    """Largest root mean square distance in the last quarter of the flights to rest [m]."""
+    """Largest RMS distance in the last quarter of the hovering flights [m]."""
     rmse_m: float | None
     """RMSE along the reference, over all axes of the plane [m]."""
     saturated: float | None
@@ -77,7 +78,7 @@ class MapPoint(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Scenario, and the box of differences from it."""
+    """Scenario, and the grid of differences from it."""
 
     name: str
     """Name of the scenario."""
@@ -120,7 +121,7 @@ class Box:
         )
 
     def fly(self, number: int) -> MapPoint:
-        """Fly a point in virtual time, and judge it; called in a worker."""
+        """Fly a point in virtual time and evaluate it; called in a worker."""
         scenario = self.scenario_of(number)
         seeds = range(scenario.seed, scenario.seed + RUNS)
         rest = at_rest(scenario)
@@ -148,7 +149,7 @@ class Box:
 
 
 def _in_bursts(direction: str, burst_s: float) -> str:
-    """A direction whose losses come in bursts of a mean length."""
+    """Impairments of a direction with its losses in bursts of a mean length [s]."""
     calls = IMPAIRMENTS.calls(direction)
     share = next((call.values[0] for call in calls if call.name == "loss"), 0.0)
     others = [call.text for call in calls if call.name != "loss"]
@@ -156,7 +157,7 @@ def _in_bursts(direction: str, burst_s: float) -> str:
 
 
 def at_rest(scenario: Scenario) -> Scenario:
-    """Scenario as a flight to rest."""
+    """Scenario of a hovering flight that starts START_M beside the hover point."""
     beside, still = (START_M,) + (0.0,) * (scenario.model.axes - 1), hovering(scenario, REST_S)
     return replace(still, vehicle=replace(still.vehicle, start_m=beside))
 

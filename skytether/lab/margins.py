@@ -1,19 +1,19 @@
-"""Margins: whether a loop is stable over a network, and how far the vehicle may differ.
+"""Stability margins: whether a loop is stable over a network, and how far the vehicle may differ
+from the model.
 
-The loop is the product's own, flown in virtual time: vehicle, server and network of a scenario,
-hovering. A flight answers one of three questions.
+The loop is flown in virtual time: vehicle, server and network of a scenario, hovering. There are
+three kinds of flights.
 
-    push   no wind but PUSH_S of a weak one; h(n): mean over seeds and axes of p² n steps after it
+    push   only a weak wind for PUSH_S; h(n): mean over seeds and axes of p² n steps after it
            growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
-    wind   the scenario's white wind and noise alone: root mean square of p and u
-    rest   no wind, from START_M beside the point: a vehicle that does not come to rest is in a
-           limit cycle, an oscillation between the bounds of its input
+    wind   only the scenario's white wind and noise: root mean square of p and u
+    rest   no wind, START_M beside the hover point: a vehicle that does not come to rest is in a
+           limit cycle, an oscillation between the bounds of its input (`lab.maps`)
 
-What is not linear is kept out of the growth. Bounds: steps count until the answer of an input
-reaches SMALL of its bound. Noise: pushes are flown twice, with and without; p is the difference.
-Thresholds: the weak push stays below all of them, so that a trigger that looks at the state would
-never send; it is replaced by a periodic one with its measured rate. Wind and rest are flown with
-the scenario's own trigger.
+The growth is that of the linear loop. Bounds: only steps before an input reaches SMALL of its bound
+are used. Noise: the flight is repeated without the push, and p is the difference. Thresholds: a
+weak push stays below all of them, so a trigger that uses the state would never send; it is replaced
+by a periodic one with its measured rate. Wind and rest are flown with the scenario's own trigger.
 """
 
 import math
@@ -34,51 +34,53 @@ from skytether.shared.telemetry.summary import AT_BOUND
 from skytether.sim.flight import fly_batch
 
 PUSH_S, FOLLOWED_S = 0.25, 24.0
-"""Length of a push, and time for which its answer is followed [s]: six time constants of a typical
-disturbance observer."""
+"""Length of a push, and time for which its response is evaluated [s]: six time constants of a
+typical disturbance observer."""
 PUSH = 1e-4
-"""Strength of the push, a white acceleration [m/s per √s]: too weak for any bound or
-threshold, and well above what rounding on the wire adds beside noise of some centimetres."""
+"""Strength of the push, a white acceleration [m/s per √s]: too weak to reach any bound or
+threshold, and well above the rounding errors of messages with noise of some centimetres."""
 FLOOR = 1e-9
 """Share of its largest value below which a mean square is rounding."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
 """Time [s], plus a number of mean round trips, before a push: by then sessions are open and the
 delay bound is stationary."""
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
-"""Time for which the answer to wind counts, and time before that in which it builds up [s]."""
+"""Time for which the response to wind is evaluated, and time before that in which it builds up
+[s]."""
 SMALL = 0.05
-"""Share of an input's bound up to which its answer to a push counts: no bound acts there."""
+"""Share of an input's bound up to which the response to a push is evaluated, so that no bound
+acts."""
 STEPS_MIN = 10
-"""Fewest steps from the push to the end from which a rate of growth can be estimated."""
+"""Smallest number of steps from which a rate of growth can be estimated."""
 WIND_ALONE = 0.1
-"""Wind in which a vehicle is flown if its scenario has neither wind nor noise."""
+"""Wind if the scenario has neither wind nor noise [m/s per √s]."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
-"""Policies that do not look at the state."""
+"""Policies that do not use the state."""
 RATE_RUNS, LIMIT_RUNS = 4, 4
-"""Number of seeds: for the rate of a trigger, and at most for each value that is tried for a limit.
-"""
+"""Number of seeds for the rate of a trigger, and largest number for each step of a limit's
+bisection."""
 HALVINGS = 7
-"""Number of halvings of a limit's interval."""
+"""Number of bisections for a limit."""
 
 
 class Differing(NamedTuple):
     """Differences of a vehicle and its network from the model."""
 
     tau: float = 1.0
-    """Time constants over those of the model."""
+    """Time constants relative to those of the model."""
     gain: float = 1.0
-    """Gains of the velocity loop over those of the model."""
+    """Gains of the velocity loop relative to those of the model."""
     dead_time_s: float = 0.0
     """Dead time minus that of the model [s]."""
     delay_s: float = 0.0
     """Delay added to the network's, each way [s]."""
 
     def is_of(self, scenario: Scenario) -> bool:
-        """Whether such a vehicle exists: its dead time must not be negative."""
+        """Whether the vehicle is possible: its dead time must not be negative."""
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        """Scenario with such a vehicle and network."""
+        """Scenario with this vehicle and network."""
         terms, network = scenario.terms(), scenario.network
         vehicle = replace(
             scenario.vehicle,
@@ -109,7 +111,7 @@ VEHICLES: dict[str, Differing] = {
     "dead time 0.2 s more": Differing(dead_time_s=0.2),
     "dead time 0.3 s more": Differing(dead_time_s=0.3),
 }
-"""Vehicles that are flown besides the scenario's own, if they exist."""
+"""Vehicles that are flown besides the scenario's own, if they are possible."""
 LIMITS: dict[str, tuple[str, float, float]] = {
     "time constant, least": ("tau", 1.0, 0.1),
     "time constant, most": ("tau", 1.0, 10.0),
@@ -118,11 +120,11 @@ LIMITS: dict[str, tuple[str, float, float]] = {
     "dead time, more [s]": ("dead_time_s", 0.0, 2.0),
     "delay each way, more [s]": ("delay_s", 0.0, 2.0),
 }
-"""Quantities whose limit is searched for: field of `Differing`, and from and up to which value."""
+"""Quantities whose limit is searched for: field of `Differing`, first value and last value."""
 
 
 class Margin(msgspec.Struct, frozen=True, kw_only=True):
-    """Results for a vehicle that equals, or differs from, the model."""
+    """Results for one vehicle."""
 
     vehicle: str
     """Name of the vehicle in a table."""
@@ -142,26 +144,26 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the steps with an input at its bound on some axis; None if unstable."""
 
 
-class Limit(msgspec.Struct, frozen=True, kw_only=True):
-    """Largest difference from the model up to which the loop is stable, all else being equal."""
+class MarginLimit(msgspec.Struct, frozen=True, kw_only=True):
+    """Limit of one quantity, up to which the loop is stable, with all others equal."""
 
     quantity: str
     """Name of the quantity in a table."""
     searched: float
-    """Value up to which it was searched for."""
+    """Last value of the search."""
     value: float | None
     """The limit; None if the loop is stable at `searched`."""
 
 
-def looks_at_state(scenario: Scenario) -> bool:
-    """Whether the trigger looks at the state, and so has a threshold."""
+def uses_state(scenario: Scenario) -> bool:
+    """Whether the trigger uses the state, and so has a threshold."""
     trigger, splines = TRIGGERS.parse(scenario.control.trigger), scenario.terms().splines
     return not splines and any(each.name not in CLOCK_ONLY for each in leaves(trigger))
 
 
 def clocked_trigger(scenario: Scenario) -> str:
     """Trigger without a threshold: the scenario's own, or `periodic` at its measured rate."""
-    if not looks_at_state(scenario):
+    if not uses_state(scenario):
         return scenario.control.trigger
     events = np.concatenate([each.server["event"] for each in _flown(scenario, RATE_RUNS)])
     period = max(1, round(1.0 / max(events.mean(), 1.0 / PERIOD_MAX)))
@@ -169,7 +171,7 @@ def clocked_trigger(scenario: Scenario) -> str:
 
 
 def hovering(scenario: Scenario, duration: float) -> Scenario:
-    """Scenario of a simulated vehicle without wind that hovers where it begins.
+    """Scenario of a simulated vehicle that hovers at the origin without wind.
 
     Args:
         duration: length of the flight [s].
@@ -204,13 +206,14 @@ def _flown(scenario: Scenario, runs: int, **keys: Any) -> list[Record]:
 def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float | None]:
     """Growth of the mean square after a push, and half-width of its 95 % interval (jackknife).
 
-    It is infinite where SMALL is reached within STEPS_MIN, or there is no session.
+    The growth is infinite if SMALL is reached within STEPS_MIN, or if there is no session.
 
     Args:
+        scenario: scenario of the loop.
         trigger: see `clocked_trigger`.
         runs: number of seeds.
     """
-    h = _answers(scenario, trigger, runs)
+    h = _responses(scenario, trigger, runs)
     if h.shape[1] < STEPS_MIN:
         return math.inf, None
 
@@ -220,7 +223,7 @@ def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float
     return (growth(h), None) if runs < 2 else jackknife(growth, h)
 
 
-def _answers(scenario: Scenario, trigger: str, runs: int) -> Array:
+def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
     """Mean of p² over the axes at each step after a push; shape (runs, steps)."""
     dt, begin_s = scenario.control.dt, settled_s(scenario)
     flown = hovering(scenario, begin_s + FOLLOWED_S)
@@ -256,9 +259,9 @@ def _positions_and_inputs(flights: Sequence[Record]) -> tuple[Array, Array]:
 
 
 def _growth(h: Array) -> float:
-    """Growth per step in the later part of an answer, by least squares of its logarithm.
+    """Growth per step in the later part of a response, by least squares of its logarithm.
 
-    Averaging over quarters of the answer removes most of slow oscillations.
+    Averaging over quarters of the response removes most of slow oscillations.
     """
     (rounded,) = np.nonzero(h < FLOOR * h[:1])
     h = h[: int(rounded[0])] if len(rounded) else h
@@ -282,7 +285,7 @@ def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
     if growth + (half or 0.0) >= 1.0:
         none = dict.fromkeys(("rms_m", "rms_ci95_m", "rms_input_mps", "saturated"))
         return Margin(vehicle=vehicle, growth=growth, growth_ci95=half, stable=False, **none)
-    # It blows from there on: until its first plan a vehicle drifts, and comes back for long.
+    # Wind starts at `begin_s`: before its first plan a vehicle would drift far away.
     begin_s = settled_s(scenario)
     wind = [(begin_s, {"vehicle.wind": wind_of(scenario)})]
     flown = hovering(scenario, begin_s + WIND_BUILDS_S + WIND_S)
@@ -308,14 +311,14 @@ def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
 
 
 def wind_of(scenario: Scenario) -> float:
-    """White wind in which vehicles are flown [m/s per √s]."""
+    """White wind of the flights of the kind "wind" [m/s per √s]."""
     noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
     alone = not any(noises) and scenario.vehicle.wind == 0.0
     return WIND_ALONE if alone else scenario.vehicle.wind
 
 
-def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> Limit:
-    """Limit of a quantity, by bisection: between a stable vehicle and one that is not.
+def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> MarginLimit:
+    """Limit of a quantity, by bisection between a stable and an unstable vehicle.
 
     Args:
         quantity: one of LIMITS.
@@ -323,7 +326,7 @@ def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> Limit:
         runs: number of seeds for each value.
     """
     name, near, far = LIMITS[quantity]
-    found, searched = None, far
+    stable_up_to, searched = None, far
 
     def is_stable(value: float) -> bool:
         differing = Differing(**{name: value}).of(scenario)
@@ -333,5 +336,5 @@ def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> Limit:
         for _ in range(HALVINGS):
             middle = math.sqrt(near * far) if near else 0.5 * (near + far)
             near, far = (middle, far) if is_stable(middle) else (near, middle)
-        found = near
-    return Limit(quantity=quantity, searched=searched, value=found)
+        stable_up_to = near
+    return MarginLimit(quantity=quantity, searched=searched, value=stable_up_to)

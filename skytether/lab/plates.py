@@ -1,7 +1,7 @@
-"""Figures of a report, drawn for print, each with its numbers and a caption.
+"""Figures of a report for print, each with its numbers and a caption.
 
-Sizes are those of a journal's columns, letters 8 points. The reference is red and dashed, the
-vehicle black, as in the paper.
+Widths are those of a journal's columns, and letters have 8 points. The reference is red and dashed,
+the vehicle black, as in the paper.
 """
 
 import io
@@ -108,9 +108,9 @@ def delay(direction: str, delay_ms: Array) -> Plate:
     p50, p99 = np.quantile(late_ms, (0.5, 0.99))
     worst = np.max(np.abs(share - pdf))
     says = (
-        f"The delay (17), as corrected (E1, E2), and what {len(took_ms)} packets met in netem over "
-        f"UDP on loopback: they came {p50:.2f} ms (median) and {p99:.2f} ms (p99) later than "
-        f"drawn, and no probability is off by more than {worst:.3f}."
+        f"The delay (17), as corrected (E1, E2), and the measured delay of {len(took_ms)} packets "
+        f"through netem over UDP on loopback. They arrived {p50:.2f} ms (median) and {p99:.2f} ms "
+        f"(p99) later than drawn, and the largest error of a probability is {worst:.3f}."
     )
     at = dict(zip(lattice_ms.round(6).tolist(), zip(pdf, share, strict=True), strict=True))
     rows = [
@@ -135,8 +135,8 @@ def paths(samples: Samples) -> Plate:
             positions.append(position)
         planes[0].legend(loc="center")
     says = (
-        f"One flight each, of the same seed. Without compensation the vehicle is {rmse[0]:.3f} m "
-        f"off (RMSE xy), with both compensators {rmse[1]:.3f} m."
+        f"One flight each, with the same seed. RMSE xy is {rmse[0]:.3f} m without compensation and "
+        f"{rmse[1]:.3f} m with both compensators."
     )
     header = ("step", "reference_x_m", "reference_y_m", "a_x_m", "a_y_m", "b_x_m", "b_y_m")
     rows = np.column_stack([step, wanted, *positions]).tolist()
@@ -161,12 +161,12 @@ def events(samples: Samples) -> Plate:
         below.set_ylabel("event")
     rmse = summarise(scenario, EVENT, flight.client).rmse_xy
     says = (
-        f"The event trigger (16), same seed: {rmse:.3f} m (RMSE xy) with a packet at "
-        f"{np.mean(flight.server['event']):.1%} of the steps."
+        f"One flight with the event trigger (16), with the same seed: RMSE xy is {rmse:.3f} m with "
+        f"packets at {np.mean(flight.server['event']):.1%} of the steps."
     )
     header = ("step", "reference_x_m", "reference_y_m", "x_m", "y_m", "event")
     rows = np.column_stack([step, wanted, position, sent]).tolist()
-    title = "Fig. 4: position with the event trigger, and when it sent"
+    title = "Fig. 4: position with the event trigger, and its events"
     return picture(figure, "fig4", title, says, to_csv(header, rows))
 
 
@@ -279,7 +279,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
 
     rows = [row(EVENT, (*values, None), runs) for values, runs in flown.items()]
     rows += [row("periodic", (None, None, *values), runs) for values, runs in periodic.items()]
-    title = "Fig. 5 as curves: what a packet buys"
+    title = "Fig. 5 as curves: RMSE over event ratio"
     return picture(figure, "fig5-pareto", title, says, rows_csv(rows))
 
 
@@ -318,7 +318,7 @@ def curve(study: Study, cells: Cells) -> Plate:
         f"values and worse at {worse} (95 % intervals apart)."
     )
     if failed:
-        says += f" {failed} runs never got a session and count in no mean."
+        says += f" {failed} runs without a session are left out of the means."
     rows = [
         {
             study.name: value,

@@ -1,7 +1,7 @@
-"""Attackers: a man in the middle between vehicles and netem, and an observer beside them.
+"""Attackers: a man in the middle between vehicles and netem, and an observer on another host.
 
-Neither can read packets. They pass unless a fault is active (`lab.faults`): then they are lost,
-duplicated, delayed, altered or replayed, or a stranger sends further packets.
+Neither can read packets. Without an active fault (`lab.faults`) packets pass unchanged. During one
+they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional packets.
 """
 
 from collections import Counter, deque
@@ -10,7 +10,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from skytether.lab.faults import Kind, ScheduledFault
+from skytether.lab.faults import FaultKind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.wire.channel import kind as kind_of
@@ -34,11 +34,11 @@ ones, and the latter's count."""
 COPIER_SOCKET, COPIERS = 300, 16
 """First number and count of the sockets that send copies and receive the answers."""
 OTHER_PORTS = 1000
-"""Number of sockets from those of the vehicles to those that NAT gives them next."""
+"""Offset from a vehicle's socket to the one after NAT has given it another port."""
 CROWD_PORTS = (100, 600)
 """Fewest and most ports from which an observer sends."""
 HELLOS = 0.8
-"""Share of handshakes among an observer's copies: the server answers them all."""
+"""Share of handshake packets among an observer's copies; the server answers each of them."""
 COPY_S = 0.3
 """Longest delay of a copy, or of an answer to one [s]."""
 SWIFT = 0.5
@@ -90,11 +90,11 @@ class Saboteur(Endpoint):
     def begin(self, fault: ScheduledFault, now_ns: int) -> None:
         """Apply a fault to packets from now on."""
         self._on.append(fault)
-        if fault.kind is Kind.FLOOD:
+        if fault.kind is FaultKind.FLOOD:
             self._volley_ns = now_ns
-        if fault.kind is Kind.COPY and self._rng.random() < SWIFT:
+        if fault.kind is FaultKind.COPY and self._rng.random() < SWIFT:
             self._swift.add(fault)
-        if fault.kind is Kind.REPLAY:
+        if fault.kind is FaultKind.REPLAY:
             for direction in self._directions(fault):
                 for passed_ns, datagram in self._recorded[direction]:
                     self._replay(fault, datagram, passed_ns, now_ns)
@@ -139,7 +139,7 @@ class Saboteur(Endpoint):
     def wake(self, *, now_ns: int) -> None:
         """Pass delayed packets on, and send forged ones."""
         if self._volley_ns is not None and now_ns >= self._volley_ns:
-            floods = [fault for fault in self._on if fault.kind is Kind.FLOOD]
+            floods = [fault for fault in self._on if fault.kind is FaultKind.FLOOD]
             for fault in floods:
                 for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
                     self._forge(fault.where)
@@ -167,28 +167,28 @@ class Saboteur(Endpoint):
                 continue
             rng, amount = self._rng, fault.amount
             match fault.kind:
-                case Kind.PARTITION:
+                case FaultKind.PARTITION:
                     copies = 0
-                case Kind.LOSS if rng.random() < amount:
+                case FaultKind.LOSS if rng.random() < amount:
                     copies = 0
-                case Kind.BURST:
+                case FaultKind.BURST:
                     left = self._left.get(fault, 0)
                     if not left and rng.random() < 1.0 / amount:
                         left = round(amount)
                     self._left[fault] = max(0, left - 1)
                     copies = 0 if left else copies
-                case Kind.DUPLICATES if rng.random() < amount:
+                case FaultKind.DUPLICATES if rng.random() < amount:
                     copies *= 2
-                case Kind.REORDERING:
+                case FaultKind.REORDERING:
                     delay_ns += seconds_to_ns(amount * rng.random())
-                case Kind.DELAY:
+                case FaultKind.DELAY:
                     delay_ns += seconds_to_ns(amount)
-                case Kind.CORRUPTION if rng.random() < amount:
+                case FaultKind.CORRUPTION if rng.random() < amount:
                     datagram = datagram._replace(payload=self._flipped(datagram.payload))
-                case Kind.REPLAY:
+                case FaultKind.REPLAY:
                     self._replay(fault, datagram, now_ns, now_ns)
                     continue
-                case Kind.COPY:
+                case FaultKind.COPY:
                     self._copy(fault, direction, datagram, now_ns)
                     continue
                 case _:
@@ -215,7 +215,7 @@ class Saboteur(Endpoint):
         swift = fault in self._swift
         if not swift and self._rng.random() >= fault.amount:
             return
-        self.counts[f"packets: {Kind.COPY}"] += 1
+        self.counts[f"packets: {FaultKind.COPY}"] += 1
         socket = COPIER_SOCKET + int(self._rng.integers(COPIERS))
         if direction == "uplink":
             self._send_copy(datagram.payload, datagram.peer, socket, now_ns)
@@ -253,7 +253,7 @@ class Saboteur(Endpoint):
         return bytes(flipped)
 
     def _forge(self, where: str) -> None:
-        """Send packets that a stranger can make: random bytes, or altered recorded packets."""
+        """Send forged packets: random bytes, or altered copies of recorded packets."""
         rng = self._rng
         recorded = self._recorded["downlink" if where == "server" else "uplink"]
         payload = rng.bytes(int(rng.integers(1, 600)))
@@ -277,7 +277,7 @@ class Saboteur(Endpoint):
             else clients[int(rng.integers(len(clients)))]
         )
         self._out.append(Datagram(payload, to, socket))
-        self.counts[f"packets: {Kind.FLOOD}"] += 1
+        self.counts[f"packets: {FaultKind.FLOOD}"] += 1
 
     def _hold(self, due_ns: int, datagram: Datagram) -> None:
         if len(self._held) < HELD_MAX:
@@ -290,13 +290,13 @@ class Saboteur(Endpoint):
 
 
 class Observer(Endpoint):
-    """Attacker on a host of his own who sends copies of vehicles' packets to netem from many ports.
+    """Attacker on another host that sends copies of vehicles' packets to netem from many ports.
 
     The answers go to the vehicles under their server's address.
 
     Args:
         rng: random generator.
-        saboteur: shows him the packets, and forges the address.
+        saboteur: man in the middle, which gives access to packets and forges addresses.
     """
 
     def __init__(self, rng: np.random.Generator, saboteur: Saboteur) -> None:
@@ -331,7 +331,7 @@ class Observer(Endpoint):
                 if payload is not None:
                     self._sent += 1
                     self.send(payload, NETEM, self._sent % ports)
-                    self._saboteur.counts[f"packets: {Kind.CROWD}"] += 1
+                    self._saboteur.counts[f"packets: {FaultKind.CROWD}"] += 1
         self._volley_ns = now_ns + FLOOD_NS if self._on else None
 
     def next_wake_ns(self) -> int | None:

@@ -62,7 +62,7 @@ class Free:
         if last.isdigit():
             dotted.value(table, ".".join(sections))[int(last)] = value
         else:
-            dotted.lay({self.key: value}, table)
+            dotted.set_keys({self.key: value}, table)
 
 
 def check_free(free: Sequence[Free], start: Scenario) -> None:

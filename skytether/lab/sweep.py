@@ -21,7 +21,7 @@ from skytether.lab.journal import digests
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim.flight import fly_batch
@@ -185,7 +185,7 @@ class Sweep:
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
         table = reading.to_table(self.scenario)
-        lay(changes, table)
+        set_keys(changes, table)
         where = ", ".join(f"{key}={value}" for key, value in changes.items())
         return reading.check(table, f"{self.name} with {where}" if where else self.name)
 

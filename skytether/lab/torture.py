@@ -25,7 +25,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.client.simulated.weather import Weather
-from skytether.lab.faults import HARMLESS, Kind, ScheduledFault, Trial, schedule, shrink
+from skytether.lab.faults import HARMLESS, FaultKind, ScheduledFault, Trial, schedule, shrink
 from skytether.lab.invariants import (
     FLYING,
     Gatekeeper,
@@ -64,7 +64,7 @@ QUIET_NS = SECOND_NS
 """Time for which a flight goes on after the recovery deadline [ns]."""
 SHORT_S = (8.0, 25.0)
 """Range of the time within which the faults of a short trial begin and end [s]."""
-RESTARTED = (Kind.RESTART, "client")
+RESTARTED = (FaultKind.RESTART, "client")
 TRAJECTORIES = 0.5
 """Share of the trials that fly the scheme "trajectory"."""
 REKEYING = 0.3
@@ -73,8 +73,8 @@ REKEY_NS = 4 * SECOND_NS
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
 """Time after which the server has forgotten clock measurements from before a step [ns]."""
 FLOWS = 128
-"""Number of netem's places: more than one host holds against others, and fewer than an observer has
-ports."""
+"""Number of netem's places for flows: more than one host can occupy alone, and fewer than an
+observer has ports."""
 COMPUTE_NS = MILLISECOND_NS
 """Computing time of the server per step [ns]."""
 
@@ -183,7 +183,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
 
     trial: Trial
     failure: str = ""
-    """Violation or exception that ended it; empty for none."""
+    """Violation or exception that ended the trial; empty if there was none."""
     invariant: str = ""
     """Name of the violated invariant, or `raises` for an exception."""
     flown_s: float
@@ -253,7 +253,7 @@ class Torture:
         self._under_way = 0
         """Number of faults that are active, or have effects under way."""
         restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
-        steps = any(each.kind is Kind.STEP and is_small(each.amount) for each in trial.faults)
+        steps = any(each.kind is FaultKind.STEP and is_small(each.amount) for each in trial.faults)
         self._step_ns = STEP_FOUND_NS if steps else 0
         """Time after a clock's step until clocks are known again; such a step looks like a
         freeze."""
@@ -509,36 +509,36 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
     world, dt_ns = torture.world, torture.scenario.dt_ns
     names = torture.hosts(fault.where)
     match fault.kind:
-        case Kind.STEP if begins:
+        case FaultKind.STEP if begins:
             for name in names:
                 world.set_clock(name, step_ns=seconds_to_ns(fault.amount))
-        case Kind.STEP:
+        case FaultKind.STEP:
             pass
-        case Kind.SKEW:
+        case FaultKind.SKEW:
             for name in names:
                 world.set_clock(name, drift_ppb=round(1000 * fault.amount) if begins else 0)
-        case Kind.RESTART:
+        case FaultKind.RESTART:
             for name in names:
                 torture.set_down(name, down=begins)
-        case Kind.KEYS:
+        case FaultKind.KEYS:
             torture.set_keys(right=not begins)
             torture.set_down(SERVER[0], down=True)
             torture.set_down(SERVER[0], down=False)
-        case Kind.FREEZE:
+        case FaultKind.FREEZE:
             for name in names:
                 (world.freeze if begins else world.thaw)(name)
-        case Kind.SOLVER:
+        case FaultKind.SOLVER:
             torture.set_solver(fault.amount, failing=begins)
-        case Kind.OVERLOAD:
+        case FaultKind.OVERLOAD:
             world.set_compute(SERVER[0], round(fault.amount * dt_ns) if begins else COMPUTE_NS)
-        case Kind.PORT if begins:
+        case FaultKind.PORT if begins:
             torture.saboteur.change_ports()
-        case Kind.PORT:
+        case FaultKind.PORT:
             pass
-        case Kind.CROWD if begins:
+        case FaultKind.CROWD if begins:
             torture.observer.begin(fault, world.now_ns)
             world.rearm(OBSERVER)
-        case Kind.CROWD:
+        case FaultKind.CROWD:
             torture.observer.end(fault)
         case _ if begins:
             torture.saboteur.begin(fault, world.now_ns)

@@ -1,5 +1,6 @@
 """Flight from Python: its arrays, summary and events, its picture and its file."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -7,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,7 @@ from skytether.view.rows import Columns, arrays, readable
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 PARTS = ("client", "server", "netem", "plan")
@@ -132,14 +135,21 @@ class Flight:
         return self.record.failure
 
     @extras.named()
-    def plot(self) -> "Figure":
-        """Picture of the flight: the path over the reference, and the times of uplink packets.
+    def plot(self, ax: "Axes | None" = None) -> "Figure":
+        """Picture of the flight: the path over the reference, and the packets in each second.
+
+        Args:
+            ax: axes of matplotlib on which the path alone is drawn, such as those of a figure as
+                wide as a paper's column; a figure of its own unless given.
 
         Raises:
             FlightError: no step was flown.
         """
         if not len(self.record.client):
             raise FlightError(f"{self.name}: no step was flown: {self.failure or 'no vehicle'}")
+        if ax is not None:
+            figures.draw_path(ax, self.scenario, self.record)
+            return ax.figure.canvas.figure
         title = f"{self.name}, seed {self.scenario.seed}"
         return figures.drawn({title: (self.scenario, self.record)})
 
@@ -225,6 +235,24 @@ class Flight:
             f"{name:{name_width}}  {shape:{shape_width}}  {unit}" for name, shape, unit in rows
         )
         return "\n".join([repr(self), *(line.rstrip() for line in lines)])
+
+
+@extras.named()
+def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
+    """Table of flights: one row each, one column for each field of `Summary` that is one value.
+
+    Raises:
+        ExtraMissing: pandas is not installed.
+    """
+    import pandas as pd
+
+    return pd.DataFrame([values(each.summary) for each in flights])
+
+
+def values(summary: Summary) -> dict[str, Any]:
+    """Fields of a summary that are one value: not `modes` and `drops`, which are tables."""
+    fields = msgspec.structs.asdict(summary)
+    return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
 
 
 def _no_rows(scenario: Scenario) -> dict[str, Table]:

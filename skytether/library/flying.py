@@ -4,7 +4,6 @@ import threading
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any
 
@@ -15,7 +14,7 @@ from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError, FlightError
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell import plugins, temporary
@@ -105,7 +104,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     """Fly a scenario once for each seed in virtual time, several times faster than one by one.
 
     Each flight equals that of `fly` with the same seed, to the last bit, except for the plans,
-    which are not recorded, and `Summary.drops`, which is None.
+    which are not recorded.
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
@@ -128,9 +127,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     from skytether.sim import flight  # imports the planner and numba, which takes a while
 
     records = flight.fly_batch(flown, numbers)
-    # A batch has one server, whose figures are those of all its flights together.
-    own = (replace(record, figures={}) for record in records)
-    return [Flight(run, record, name=name) for run, record in zip(each, own, strict=True)]
+    return [Flight(run, record, name=name) for run, record in zip(each, records, strict=True)]
 
 
 def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
@@ -165,7 +162,7 @@ def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario
 def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """Table with plain values of keys laid over it."""
     plain: dict[str, Any] = msgspec.to_builtins(dict(keys), enc_hook=_plain)
-    lay(dict(flat(plain)), table)
+    set_keys(dict(flat(plain)), table)
     return table
 
 

@@ -4,17 +4,22 @@ import multiprocessing
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from skytether.lab import sweep as lab
 from skytether.lab.intervals import Estimate
+from skytether.library.flight import values
 from skytether.library.flying import Given, named, prepare
+from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary
+
+if TYPE_CHECKING:
+    import pandas
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,19 @@ class Swept:
         if figure not in lab.FIGURES:
             raise KeyError(f"no figure {figure!r}; {hint(str(figure), lab.FIGURES)}")
         return lab.estimate(self.runs, figure)
+
+    @extras.named()
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Table of the flights: one row each, with the keys of the grid in its first columns.
+
+        The other columns are those of `skytether.table`.
+
+        Raises:
+            ExtraMissing: pandas is not installed.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([dict(self.keys) | values(run) for run in self.runs])
 
 
 def sweep(

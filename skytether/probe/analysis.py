@@ -140,6 +140,21 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     )
 
 
+def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
+    """Clocks, and delays of both ways, of a log: its two ways are one, on one clock.
+
+    Raises:
+        ValueError: fewer than two packets arrived.
+    """
+    way = measured.downlink
+    if way.came.sum() < 2:
+        raise ValueError("fewer than two packets arrived")
+    time_s, delay_s = _points(way.sent_ns, way.came_ns)
+    found = _alone(way, time_s, delay_s, None)
+    least_s = float(delay_s[way.came].min())
+    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), found, found
+
+
 def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
     return sent_ns / SECOND_NS, (came_ns - sent_ns) / SECOND_NS
 

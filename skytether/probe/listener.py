@@ -28,7 +28,7 @@ from skytether.probe.wire import (
     decode,
     encode,
 )
-from skytether.server.gate import Call, Gate
+from skytether.server.gate import Gate, GateCall
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name, host_of
 from skytether.shared.wire.channel import OVERHEAD_BYTES
@@ -54,7 +54,7 @@ class HeldPacket:
 
     number: int
     """Number of the packet's arrival."""
-    call: Call
+    call: GateCall
     peer: Address
     size: int
     """Size of the datagram [B]."""
@@ -104,7 +104,7 @@ class Listener(Endpoint):
             self._dropped[error.reason] += 1
         self._out += self._gate.outbox()
 
-    def _hear(self, call: Call, datagram: Datagram, now_ns: int) -> None:
+    def _hear(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
         if isinstance(message, ProbeHello):
             room = self._gives_way(datagram.peer, now_ns) is not None
@@ -160,7 +160,7 @@ class Listener(Endpoint):
         return next(name for name, each in self._sessions.items() if each.host == host)
 
     def _probe(
-        self, session: ProbeSession, probe: Probe, call: Call, datagram: Datagram, now_ns: int
+        self, session: ProbeSession, probe: Probe, call: GateCall, datagram: Datagram, now_ns: int
     ) -> None:
         log = session.log
         while log and session.logged - len(log) < probe.held:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isnan
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -80,11 +81,14 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a path, as written with --json."""
 
     listener: str
+    """Address of the other end, or the files that were read."""
     secure: bool
+    log: Literal["", "round trips", "one way"]
+    """What a log was of, whose delays both ways have; of round trips they have half."""
     seconds: float
     """Length of the measurement [s]."""
     bytes: int
-    """UDP payload of a packet [B]."""
+    """UDP payload of a packet [B]; 0 where a log does not have it."""
     every_s: float
     """Time between two packets [s]."""
     offset_s: float
@@ -100,7 +104,8 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     round_trip_least_s: float
     """Sum of both least delays [s]."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them."""
+    """Number of arrivals that the listener dropped before it could report them, or of packets in
+    captures that are left out."""
     uplink: DirectionFigures
     """Direction from the listener to the prober."""
     downlink: DirectionFigures
@@ -117,24 +122,32 @@ class ProbeOutcome:
     told: PathFigures
 
 
-def outcome(measured: MeasuredPath, listener: str, *, secure: bool) -> ProbeOutcome:
+def outcome(
+    measured: MeasuredPath,
+    listener: str,
+    *,
+    secure: bool,
+    log: Literal["", "round trips", "one way"] = "",
+) -> ProbeOutcome:
     """Result of a measurement.
 
     Args:
-        listener: HOST:PORT of the other end.
+        listener: HOST:PORT of the other end, or the names of files.
         secure: whether packets were encrypted.
+        log: what it is from, where it is from a log.
 
     Raises:
         ValueError: too few packets arrived.
     """
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
-    clocks, down, up = analysis.delays(measured)
+    clocks, down, up = (analysis.delays_of_log if log else analysis.delays)(measured)
     delays = {"uplink": up, "downlink": down}
     told = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
     near = measured.downlink.sent_ns
     path = PathFigures(
         listener=listener,
         secure=secure,
+        log=log,
         seconds=float(near[-1] - near[0]) / SECOND_NS,
         bytes=measured.size,
         every_s=measured.period_ns / SECOND_NS,

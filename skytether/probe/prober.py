@@ -90,7 +90,8 @@ class MeasuredPath:
     period_ns: int
     """Time between two probes [ns]."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them."""
+    """Number of arrivals that the listener dropped before it could report them, or of packets in
+    captures that are left out."""
 
 
 class Prober(Endpoint):

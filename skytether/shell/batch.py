@@ -31,7 +31,7 @@ NEAR_NS, READINGS = 5_000, 4
 """Largest time from one reading of a clock to the next for the two to count as simultaneous [ns],
 and number of attempts."""
 SIZE_MAX = 2048
-"""Largest payload that `Batch.send` takes [B]: packets of a flight have at most 1200."""
+"""Largest payload that `DatagramBatch.send` takes [B]: packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
 """Most datagrams that are sent as one; older kernels take no more."""
 SEGMENTED_BYTES_MAX = 65_000
@@ -138,7 +138,7 @@ def _address(room: bytearray | mmap.mmap) -> int:
     return ctypes.addressof(ctypes.c_char.from_buffer(room))
 
 
-class Batch:
+class DatagramBatch:
     """Preallocated arrays with which all sockets of one family receive and send.
 
     Args:

@@ -26,10 +26,10 @@ from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, NoFailsafe, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
-from skytether.shell.options import Argument, asks_help, key_values, read
+from skytether.shell.options import HELP_KEYS, Argument, key_values, read
 from skytether.shell.udp import (
     SPARE_FILES,
     allow_sockets,
@@ -121,7 +121,7 @@ def parse(
     """
     plugins.load(plugins.named(argv))
     argv, values = key_values(argv, type(defaults))
-    if asks_help(argv):  # it shows the keys as they are in the scenario
+    if HELP_KEYS in argv:  # it shows the keys as they are in the scenario
         named = leads and argv and not argv[0].startswith("-")
         base = reading.load_base(argv[0] if named else defaults.scenario)
         defaults = replace(defaults, config=base)  # type: ignore[type-var]
@@ -129,7 +129,7 @@ def parse(
     name = options.scenario
     base = reading.load_base(name)
     table = reading.to_table(base)
-    lay(values, table)
+    set_keys(values, table)
     read_scenario = reading.check if is_final else reading.convert
     source = name if table == reading.to_table(base) else f"{name} and the command line"
     checked = read_scenario(table, source)

@@ -23,7 +23,7 @@ from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, ma
 from skytether.shared.core.events import Event, Fault, HostFound, HostMissing
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shell.batch import BATCH_MAX, Batch, Segments
+from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.memory import MemoryFile
@@ -33,9 +33,11 @@ from skytether.shell.udp import (
     Names,
     admit_only,
     from_kernel,
+    heed_refusals,
     is_loopback,
     kernel_drops,
     open_socket,
+    refusals,
     within_reach_of,
 )
 
@@ -137,12 +139,12 @@ class Shell:
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """Buffer for every datagram: to copy out of it costs less than a new one of full size."""
-        self._batches: dict[int, Batch | None] = {}
+        self._batches: dict[int, DatagramBatch | None] = {}
         """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
         """Counts of arrivals by socket, of an endpoint with `patience_ns`."""
-        self._crowded: dict[int, Batch] = {}
+        self._crowded: dict[int, DatagramBatch] = {}
         """Sockets that are read in slices of time, and the arrays that read them."""
         self._heard_ns = 0
         """Newest time that the endpoint was given [ns]; later ones may not be earlier."""
@@ -228,19 +230,23 @@ class Shell:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
         room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
-        stopwatch = self._stopwatch
+        stopwatch, is_refused = self._stopwatch, False
         try:
-            for count in range(BURST_MAX):  # noqa: B007 - used below
+            for count in range(BURST_MAX):
                 stopwatch.start()
                 try:
                     size, sender = receive(room)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
+                    is_refused |= count == 0  # for what else are we here
                     break
                 except OSError:  # an earlier packet of ours found the peer's port closed
+                    is_refused = True
                     continue
                 stopwatch.lap("receive")
                 hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+            for reason in refusals(self._sockets[number]) if is_refused else ():
+                self.endpoint.undelivered(number, reason)
             if self._patience_ns:
                 self._count(number, count)
         finally:  # a fault of ours goes to the loop's handler, and the flight goes on
@@ -311,16 +317,16 @@ class Shell:
         if self._crowded and self._slices:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
-    def _batch(self, sock: socket) -> Batch | None:
+    def _batch(self, sock: socket) -> DatagramBatch | None:
         """Arrays of the socket's family, made when they are first used."""
         if sock.family not in self._batches:
             try:
-                self._batches[sock.family] = Batch(sock.family)
+                self._batches[sock.family] = DatagramBatch(sock.family)
             except OSError:
                 self._batches[sock.family] = None
         return self._batches[sock.family]
 
-    def _read_batch(self, number: int, batch: Batch) -> list[tuple[int, Datagram]]:
+    def _read_batch(self, number: int, batch: DatagramBatch) -> list[tuple[int, Datagram]]:
         """Datagrams that one call reads from a socket, each with the time at which it came [ns]."""
         self._stopwatch.start()
         payloads, raws, came_ns = batch.receive(self._sockets[number])
@@ -430,10 +436,12 @@ class Shell:
             sock = self._sockets.get(number)
             if sock is None:
                 sock = self._sockets[number] = open_socket(self._elsewhere)
+                heed_refusals(sock)
                 self._listen(number)
             sock.sendto(payload, self._names.kernel(peer))
-        except OSError:  # buffer full, port closed, network down: to the endpoint, a lost packet
+        except OSError as error:  # buffer full, port closed, network down
             self.send_errors += 1
+            self.endpoint.undelivered(number, error.strerror or str(error))
 
     async def _keep_resolving(self) -> None:
         for (host, _), reason in self._names.missing.items():

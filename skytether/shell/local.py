@@ -16,7 +16,8 @@ class Local:
     """Non-blocking Unix socket, bound to a path with mode 0600.
 
     Args:
-        path: path of the socket; a socket that no process listens at is replaced.
+        path: path of the socket; a socket that no process listens at is replaced, and a folder that
+            is missing is made.
         kind: SOCK_DGRAM or SOCK_STREAM.
 
     Raises:
@@ -29,6 +30,7 @@ class Local:
         """Bound socket."""
         try:
             self.socket.setblocking(False)
+            path.parent.mkdir(0o700, parents=True, exist_ok=True)
             _clear(path, kind)
             before = os.umask(0o177)
             try:

@@ -122,6 +122,8 @@ refused netem_refused_packets_total
     UDP payload of the packets that entered.
 {direction}/forwarded netem_forwarded_packets_total
     Packets that left.
+{direction}/undelivered netem_undelivered_packets_total
+    Packets that could not be sent on, or were refused on their way.
 {direction}/lost netem_lost_packets_total
     Packets that the scenario's loss model dropped.
 {direction}/reordered netem_reordered_packets_total
@@ -167,6 +169,8 @@ by_vehicle/{vehicle}/plan_age_ms client_plan_age_seconds
 by_vehicle/{vehicle}/horizons client_horizons_total
     Horizons received.
 by_vehicle/{vehicle}/dropped/{reason} client_dropped_datagrams_total
+    Datagrams that were not the server's, came too late or could not be read, by reason.
+others_dropped/{reason} client_dropped_datagrams_total vehicle=others
     Datagrams that were not the server's, came too late or could not be read, by reason.
 by_vehicle/{vehicle}/autopilot/armed autopilot_armed
     Whether the autopilot is armed: 1 or 0.

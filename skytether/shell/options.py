@@ -3,14 +3,14 @@
 Flags of keys, as in `--control.trigger always`, are read here and checked with the scenario. tyro
 reads the options, shows the help and reports wrong flags. But to import it takes 0.2 s and 9 MB at
 each start of a process. So simple flags, as commands use to start processes, are read here as well,
-and tyro is given a scenario's keys for the help alone.
+and tyro is given a scenario's keys for `--help-keys` alone.
 """
 
 import dataclasses
 import json
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from inspect import cleandoc
@@ -20,10 +20,14 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 
 T = TypeVar("T")
+
+HELP_KEYS = "--help-keys"
+"""Flag that shows the help with every key of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +61,16 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
     import tyro
 
     kind: Any = type(default)
-    _tell_tyro(kind, keys=asks_help(argv))
     about = cleandoc(help_ or "")
-    return tyro.cli(kind, args=argv, default=default, prog=prog, description=about)
-
-
-def asks_help(argv: Sequence[str]) -> bool:
-    """Whether a command line asks for the help."""
-    return not {"-h", "--help"}.isdisjoint(argv)
+    if "" in _flags(kind)[0]:
+        about += (
+            f"\n\nEvery key of a scenario is a flag, as in --duration 20; {HELP_KEYS} lists all."
+        )
+    keys = HELP_KEYS in argv
+    argv = ["--help" if word == HELP_KEYS else word for word in argv]
+    with ExitStack() as undo:
+        _tell_tyro(kind, undo, keys=keys)
+        return tyro.cli(kind, args=argv, default=default, prog=prog, description=about)
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
@@ -217,24 +223,33 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
     raise ValueError(text)
 
 
-def _tell_tyro(options: type, *, keys: bool) -> None:
-    """Add tyro's annotations to options, from their own; with a scenario's keys or without."""
+def _tell_tyro(options: type, undo: ExitStack, *, keys: bool) -> None:
+    """Add tyro's annotations to options, from their own; with a scenario's keys or without.
+
+    Args:
+        undo: restores the options' own annotations.
+    """
     from tyro import conf
 
-    def told(hint: Any) -> Any:
-        argument = _argument(hint)
-        if hint is bool:
-            return Annotated[hint, conf.FlagCreatePairsOff]  # no --no-no-page
-        if argument is None:
-            return hint
+    said = meanings(options)
+
+    def told(name: str, hint: Any) -> Any:
+        argument = _argument(hint) or Argument()
         if argument.name == "" and not keys:
-            return Annotated[hint, conf.SuppressFixed]
-        words = [conf.arg(name=argument.name, metavar=argument.metavar, help=argument.help)]
+            return Annotated[hint, conf.Fixed, conf.Suppress]
+        within = hint if isinstance(hint, type) else get_args(hint)[0]
+        if dataclasses.is_dataclass(within) or hasattr(within, "__struct_fields__"):
+            _tell_tyro(within, undo, keys=keys)
+        # In one line: tyro would keep the breaks of the source, and wrap what is between them.
+        text = argument.help or said.get(name)
+        words = [conf.arg(name=argument.name, metavar=argument.metavar, help=text)]
+        words += [conf.FlagCreatePairsOff] * (hint is bool)  # no --no-no-page
         words += [conf.Positional] * argument.positional
         words += [conf.UseAppendAction] * argument.append
         return Annotated[(hint, *words)]
 
-    options.__annotations__ = {name: told(hint) for name, hint in _hints(options).items()}
+    undo.callback(setattr, options, "__annotations__", options.__annotations__)
+    options.__annotations__ = {name: told(name, hint) for name, hint in _hints(options).items()}
 
 
 @cache

@@ -62,9 +62,9 @@ def prepare(kernels: Sequence["Missing"]) -> None:
         return
     from skytether.shell.compiling import compile_kernels
 
-    title = "compiling the control loops, once on this machine"
-    print(f"{title}: it takes up to a minute", file=sys.stderr, flush=True)
-    with progress(title, len(kernels), "kernels") as bar:
+    said = "compiling control loops, which this machine then keeps: it takes up to a minute"
+    print(said, file=sys.stderr, flush=True)
+    with progress("compiling", len(kernels), "kernels") as bar:
         done = count(1)
         compile_kernels(kernels, lambda: bar(next(done)))
 
@@ -122,7 +122,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ),
         ("lost, reordered packets", _values("d", s.lost, s.reordered)),
         ("stale packets", _values("d", s.stale)),
-        *((f"dropped by {end}", _counts(reasons)) for end, reasons in (s.drops or {}).items()),
+        *drops(s.drops or {}),
         ("link", "sealed" if s.secure else "plaintext"),
         ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
         ("mean age, its peaks, age of the plan [s]", ages),
@@ -133,8 +133,12 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
     return [(name, values) for name, values in rows if values]
 
 
-def _counts(reasons: Mapping[str, int]) -> str:
-    return ", ".join(f"{reason} {count}" for reason, count in reasons.items())
+def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
+    """Rows of a summary about dropped packets, one for each end that dropped some."""
+    return [
+        (f"dropped by {end}", ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
+        for end, reasons in by_end.items()
+    ]
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:

@@ -7,12 +7,13 @@ scope among them (the interface of a link-local address) is written into the hos
 
 import contextlib
 import ipaddress
+import os
 import resource
 import socket
 import struct
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, cast
 
 from skytether.shared.core.endpoint import Address, Form
@@ -37,6 +38,7 @@ FIND_S = 2.0
 """Longest time for which the start of a patient process waits for a name's address [s]."""
 
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
+_IP_RECVERR, _IPV6_RECVERR, _MSG_ERRQUEUE, _FROM_THIS_MACHINE = 11, 25, 0x2000, 1
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
 _BYTE, _LENGTH, _IF_EQUAL, _IF_AT_LEAST, _RETURN = 0x30, 0x80, 0x15, 0x35, 0x06
 """Instructions of a packet filter of Linux (classic BPF): load a byte, load the length, compare
@@ -207,6 +209,27 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
     code = ctypes.create_string_buffer(program, len(program))
     filter_ = struct.pack("@HP", len(program) // instruction.size, ctypes.addressof(code))
     sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filter_)
+
+
+def heed_refusals(sock: socket.socket) -> None:
+    """Let the kernel keep the ICMP errors about datagrams from a socket; on Linux only."""
+    if sys.platform == "linux":
+        six = sock.family == socket.AF_INET6
+        level, option = (socket.IPPROTO_IPV6, _IPV6_RECVERR) if six else (0, _IP_RECVERR)
+        sock.setsockopt(level, option, 1)
+
+
+def refusals(sock: socket.socket) -> Iterator[str]:
+    """Reasons for which datagrams from a socket were refused on their way, a reason for each."""
+    while True:
+        try:
+            _, news, _, _ = sock.recvmsg(0, 512, _MSG_ERRQUEUE)
+        except OSError:  # there are no more
+            return
+        for _, kind, error in news:
+            # Errors of this machine were raised when the datagram was sent.
+            if kind in (_IP_RECVERR, _IPV6_RECVERR) and error[4] != _FROM_THIS_MACHINE:
+                yield os.strerror(int.from_bytes(error[:4], sys.byteorder))
 
 
 def kernel_drops(sock: socket.socket) -> int:

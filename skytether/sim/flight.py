@@ -11,7 +11,7 @@ are numbered from 1.
 """
 
 import io
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -34,10 +34,10 @@ from skytether.shared.base.kernel import compile_all
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import VehicleEvent
 from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address, Endpoint
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.scenario.dotted import whole
+from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -52,6 +52,7 @@ from skytether.shared.telemetry.record import (
     server_columns,
 )
 from skytether.shared.wire import keys
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.keys import Keyring
 from skytether.sim.world import Clock, World
 
@@ -132,8 +133,9 @@ def fly_batch(
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
     Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, except
-    for `figures`. If the server's computing time exceeds a step, so that it misses ticks, runs are
-    flown one by one: which ticks it misses depends on when it began.
+    that of the server's `figures` only the drops are known. If the server's computing time exceeds
+    a step, so that it misses ticks, runs are flown one by one: which ticks it misses depends on
+    when it began.
 
     Args:
         scenario: what to fly.
@@ -160,6 +162,21 @@ def fly_batch(
     return flights
 
 
+class SharedServer(Server):
+    """Server of several runs, which also counts for each what it drops."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.dropped_by_host: defaultdict[str, Counter[Drop]] = defaultdict(Counter)
+        """Number of dropped datagrams by the host that sent them, and reason."""
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """See `Endpoint`."""
+        dropped = self._reception.hear(datagram, now_ns=now_ns)
+        if dropped is not None:
+            self.dropped_by_host[datagram.peer[0]][dropped] += 1
+
+
 class Run:
     """Vehicles of one seed and their network, in a world shared with other runs.
 
@@ -167,6 +184,7 @@ class Run:
         world: where its hosts are added.
         scenario: what to fly, with the run's seed.
         server_rows: returns the number of rows that the server has recorded so far.
+        server_figures: returns the server's figures so far, of what comes from a host.
         number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
         vehicles: number of its vehicles.
         keyring: their keys, where the link is sealed.
@@ -177,11 +195,12 @@ class Run:
         world: World,
         scenario: Scenario,
         server_rows: Callable[[], int],
+        server_figures: Callable[[str], Mapping[str, Any]],
         number: int,
         vehicles: int,
         keyring: Keyring | None,
     ) -> None:
-        self._server_rows, self._dt_ns = server_rows, scenario.dt_ns
+        self._server_rows, self._server_figures = server_rows, server_figures
         self._before = number * vehicles
         self._sinks = io.BytesIO(), io.BytesIO()
         recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
@@ -192,7 +211,8 @@ class Run:
             recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
         )
         netem_at = world.add(f"netem {scenario.seed}", self.netem)
-        self.hosts: dict[str, Endpoint] = {netem_at[0]: self.netem}
+        self.netem_host = netem_at[0]
+        self.hosts: dict[str, Endpoint] = {self.netem_host: self.netem}
         """Endpoints by the names of their hosts."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
@@ -226,6 +246,8 @@ class Run:
         """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem when the last vehicle finished."""
+        self._figures: dict[str, Any] | None = None
+        """Figures of each process at that time."""
 
     def hear(self, time_ns: int, host: str, event: Event) -> None:
         """Keep an event of this run, numbered as if it flew alone, until its last vehicle has
@@ -241,13 +263,21 @@ class Run:
         self.flying -= 1
         if not self.flying:
             self._ends = self._server_rows(), self._sinks[1].tell()
+            self._figures = self._figures_now()
 
-    def flight(self, server_rows: Rows, server_figures: Mapping[str, Any]) -> Record:
+    def _figures_now(self) -> dict[str, Any]:
+        each = {str(one.vehicle - self._before): one.vehicle_figures() for one in self._clients}
+        return {
+            "server": self._server_figures(self.netem_host),
+            "netem": self.netem.figures(),
+            "client": {"by_vehicle": each},
+        }
+
+    def flight(self, server_rows: Rows) -> Record:
         """Record of the run, numbered as if it had flown alone.
 
         Args:
             server_rows: the server's rows of all runs.
-            server_figures: figures of the server.
         """
         rows_end, bytes_end = self._ends
         client = parse(self._sinks[0].getvalue()).copy()
@@ -260,12 +290,7 @@ class Run:
         failure = next((client.failure for client in self._clients if client.failure), None)
         if failure:
             failure = msgspec.structs.replace(failure, vehicle=failure.vehicle - self._before)
-        told = {str(each.vehicle - self._before): each.vehicle_figures() for each in self._clients}
-        figures = {
-            "server": server_figures,
-            "netem": self.netem.figures(),
-            "client": {"by_vehicle": told},
-        }
+        figures = self._figures or self._figures_now()
         return Record(client, server, netem, failure, figures, tuple(self._events))
 
 
@@ -330,7 +355,8 @@ def _fly(
     has_own = scenario.is_mission or scenario.reference.shape == "target"
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
-    server = own_server or Server(
+    make_server = SharedServer if len(seeds) > 1 else Server
+    server = own_server or make_server(
         scenario,
         boot_id=BOOT_ID,
         entropy=entropy,
@@ -345,8 +371,14 @@ def _fly(
     def server_rows() -> int:
         return (sink.tell() - header_bytes) // row_bytes
 
+    def server_figures(host: str) -> Mapping[str, Any]:
+        if isinstance(server, SharedServer):
+            return {"dropped": by_name(server.dropped_by_host[host])}
+        return server.figures()
+
     runs = [
-        Run(world, run, server_rows, number, vehicles, keyring) for number, run in enumerate(each)
+        Run(world, run, server_rows, server_figures, number, vehicles, keyring)
+        for number, run in enumerate(each)
     ]
     run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
@@ -385,8 +417,8 @@ def _fly(
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))
-    recorded, figures = parse(sink.getvalue()), server.figures()
-    return [run.flight(recorded, figures) for run in runs]
+    recorded = parse(sink.getvalue())
+    return [run.flight(recorded) for run in runs]
 
 
 def plan_changes(
@@ -401,8 +433,10 @@ def plan_changes(
 
     def change(values: Mapping[str, Any]) -> None:
         for i, (host, each) in enumerate(running.items()):
-            here = each.changeable if i else each.changeable | ({*map(whole, values)} - changeable)
-            if own := {key: value for key, value in values.items() if whole(key) in here}:
+            here = (
+                each.changeable if i else each.changeable | ({*map(text_key, values)} - changeable)
+            )
+            if own := {key: value for key, value in values.items() if text_key(key) in here}:
                 with suppress(ConfigError):  # the refusal is reported as an event
                     world.act(host, partial(each.change, own))
 

@@ -17,7 +17,7 @@ import numpy as np
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.scenario import catalogue
 from skytether.shared.scenario.catalogue import KEYS
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import Owner
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.schema import Scenario
@@ -58,7 +58,7 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
             raise RecordingError(f"{each.path}: {said}")
         owners = {OWNERS.get(part) for part in each.parts}
         values = flat(to_table(each.scenario))
-        lay({key: value for key, value in values if KEYS[key].owner in owners}, table)
+        set_keys({key: value for key, value in values if KEYS[key].owner in owners}, table)
     return check(table, "the scenarios together")
 
 

@@ -26,7 +26,12 @@ SPARE = 6
 HEIGHT = 150
 """Height of a plot [pixels]."""
 GREY = "#868e96"
-MARK = "rgba(240, 62, 62, 0.6)"
+UP, DOWN = "#12b886", "#e64980"
+"""Colours of the two directions, in plots of one flight or of what all flights share."""
+TIME = "time of flight [s]"
+"""Label of most plots' horizontal axis."""
+UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
+"""Series of a plot that only widens its range: another range would make the browser begin anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +55,9 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; that of the flight unless given."""
+    """Colour; that of the flight unless given, and where each of several flights has this line."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
-    marks: bool = False
-    """Whether the line is a mark: 1 for a bar across the whole plot, 0 for none."""
     once: bool = False
     """Whether the line is the same for all flights."""
 
@@ -66,9 +69,13 @@ class Plot:
     title: str
     lines: tuple[PlotLine, ...]
     grid: Values = lambda look: look.curves.time_s
+    across: str = TIME
+    """Label of the horizontal axis."""
     log: bool = False
     crop: bool = False
     """Whether trailing zeros are cropped."""
+    equal: bool = False
+    """Whether its range is as wide as that of the others with this flag."""
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:
@@ -84,6 +91,15 @@ def _seconds(look: Look) -> Array:
     """Seconds of flight shown [s], one each."""
     ages_s = np.arange(-SPAN_S, 0.0) + 0.5
     return look.state.time_s(look.now_ns) + ages_s
+
+
+def _rates(direction: int) -> Values:
+    def values(look: Look) -> Array:
+        """Packets in each second, from the last one before the flight on; NaN before."""
+        rates = look.state.network.rates(direction, look.now_ns)
+        return np.where(_seconds(look) > -1.0, rates, np.nan)
+
+    return values
 
 
 def _delays(direction: int) -> Values:
@@ -127,12 +143,13 @@ def _compared(look: Look) -> Array:
 
 
 BY_DELAY = Plot(
-    "Packets by their delay [ms], %",
+    "Packets by their delay [%]",
     (
-        PlotLine("up", _share(UPLINK)),
-        PlotLine("down", _share(DOWNLINK), GREY, dash=(2, 3), once=True),
+        PlotLine("up", _share(UPLINK), UP),
+        PlotLine("down", _share(DOWNLINK), DOWN, dash=(2, 3)),
     ),
     grid=_bins_ms,
+    across="delay [ms]",
     crop=True,
 )
 """Histogram plot of packets by their delay."""
@@ -158,23 +175,21 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
     """Plots of a vehicle with so many axes, alone or on a mission."""
     return (
         *((APART,) if mission else ()),
-        *(Plot(f"{name} [m]", _axis(axis)) for axis, name in enumerate("xyz"[:axes])),
+        *(Plot(f"{name} [m]", _axis(axis), equal=True) for axis, name in enumerate("xyz"[:axes])),
         Plot(
-            "What the trigger compares, and packets",
+            "Packets in a second",
+            (
+                PlotLine("every step", _every_step, GREY, dash=(4, 4), once=True),
+                PlotLine("up", _rates(UPLINK), UP),
+                PlotLine("down", _rates(DOWNLINK), DOWN, dash=(2, 3)),
+            ),
+            grid=_seconds,
+        ),
+        Plot(
+            "What the trigger compares",
             (
                 PlotLine("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
                 PlotLine("compared", _compared),
-                PlotLine(
-                    "sent", lambda look: look.curves.event, MARK, marks=True, width=1.0, once=True
-                ),
-            ),
-        ),
-        Plot(
-            "Age of what is flown by [s]",
-            (
-                PlotLine("age", lambda look: look.curves.age_s),
-                PlotLine("delay up", _delays(UPLINK), GREY, once=True, width=1.0),
-                PlotLine("delay down", _delays(DOWNLINK), GREY, dash=(2, 3), once=True, width=1.0),
             ),
         ),
     )
@@ -184,12 +199,12 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
     """Plots of the network, and of the cost of plans where inputs are planned."""
     packets = (
         Plot(
-            "Packets up in a second",
+            "Age of what is flown by, and delays [s]",
             (
-                PlotLine("every step", _every_step, GREY, dash=(4, 4), once=True),
-                PlotLine("up", lambda look: look.state.network.rates(UPLINK, look.now_ns)),
+                PlotLine("age", lambda look: look.curves.age_s),
+                PlotLine("delay up", _delays(UPLINK), UP, once=True, width=1.0),
+                PlotLine("delay down", _delays(DOWNLINK), DOWN, dash=(2, 3), once=True, width=1.0),
             ),
-            grid=_seconds,
         ),
         BY_DELAY,
     )
@@ -222,8 +237,8 @@ def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float
     def line(direction: int) -> Values:
         return lambda look: scale * values(look.state.network, direction, look.now_ns)
 
-    down = PlotLine("down", line(DOWNLINK), GREY, once=True)
-    return Plot(title, (PlotLine("up", line(UPLINK)), down), grid=_seconds)
+    down = PlotLine("down", line(DOWNLINK), DOWN, dash=(2, 3))
+    return Plot(title, (PlotLine("up", line(UPLINK), UP), down), grid=_seconds, across="time [s]")
 
 
 class Plots:
@@ -246,7 +261,8 @@ class Plots:
             for line in plot.lines:
                 if line.once and place:
                     continue
-                rgb = line.rgb or css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
+                own = css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
+                rgb = line.rgb if line.rgb and (line.once or len(titles) == 1) else own
                 label = " ".join(filter(None, ("" if line.once else title, line.label)))
                 shown: uplot.Series = {
                     "label": label or "flown",
@@ -254,20 +270,28 @@ class Plots:
                     "width": line.width,
                     "dash": line.dash,
                     "points": {"show": False},
-                    "scale": "marks" if line.marks else "y",
                 }
                 series.append(shown)
-        # Zeros lie below the scale's lower end, and so are not seen.
-        marks: uplot.Scale = {"auto": False, "range": (0.5, 1.0)}
-        scales: dict[str, uplot.Scale] = {"x": {"time": False}, "marks": marks}
+        if plot.equal:
+            series.append(UNSEEN)
+        scales: dict[str, uplot.Scale] = {"x": {"time": False}}
         if plot.log:
             scales["y"] = {"distr": 3}
+        upright: uplot.Axis = {"ticks": {"show": False}}
+        across: uplot.Axis = {
+            "label": plot.across,
+            "labelSize": 16,
+            "labelFont": "11px sans-serif",
+            "size": 26,
+            **upright,
+        }
         nothing = (np.array([0.0, 1.0]),) * len(series)
         return gui.add_uplot(
             nothing,
             tuple(series),
             title=plot.title,
             scales=scales,
+            axes=(across, upright),
             legend={"show": len(series) > 2, "live": False},
             cursor={"drag": {"x": False, "y": False, "setScale": False}},
             height=HEIGHT,
@@ -276,12 +300,28 @@ class Plots:
 
     def draw(self, looks: Sequence[Look]) -> None:
         """Redraw the flights; the first one determines the times."""
-        for plot, handle in zip(self._plots, self._handles, strict=True):
+        drawn = []
+        for plot in self._plots:
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
                 data.extend(line.values(look) for line in plot.lines if not (line.once and place))
-            shown: Any = drawable(begun(cropped(data) if plot.crop else data))
+            drawn.append(begun(cropped(data) if plot.crop else data))
+        equal = [data for plot, data in zip(self._plots, drawn, strict=True) if plot.equal]
+        for data, ends in zip(equal, spans([data[1:] for data in equal]), strict=True):
+            data.append(np.resize(ends, len(data[0])))
+        for handle, data in zip(self._handles, drawn, strict=True):
+            shown: Any = drawable(data)
             handle.data = shown
+
+
+def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
+    """Ranges of the same width that contain the values of each plot, around their middles."""
+    together = [np.concatenate(lines) for lines in plots]
+    known = [values[~np.isnan(values)] for values in together]
+    known = [values if len(values) else np.zeros(1) for values in known]
+    half = max((float(np.ptp(values)) / 2 for values in known), default=0.0)
+    middles = [float(values.min() + values.max()) / 2 for values in known]
+    return [(middle - half, middle + half) for middle in middles]
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:

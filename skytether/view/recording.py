@@ -245,7 +245,7 @@ def _text(value: str | int) -> str:
 def trajectory(scenario: Scenario) -> Array:
     """Desired positions of a whole flight [m]; shape (points, axes)."""
     time_s = np.linspace(0.0, scenario.duration, POINTS_MAX)
-    path: Array = scenario.given_reference()(time_s)[..., 0]
+    path: Array = scenario.unallocated_reference()(time_s)[..., 0]
     return path
 
 

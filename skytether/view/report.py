@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.figures.colours import MODE_COLOURS, PALETTE, css
-from skytether.figures.flights import draw_reference
+from skytether.figures.flights import draw_packets, draw_reference
 from skytether.figures.page import Picture, Table, as_png, lettered, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows, compared
+from skytether.shared.telemetry.record import Rows, compared
 from skytether.shared.telemetry.summary import desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 from skytether.view.recorded import Recorded
@@ -237,14 +237,10 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
     below.set_ylabel("packets per s")
     if not len(flown.netem):
         return
-    seconds = np.arange(int(flown.time_s[-1]) + 2)
     # In seconds: a damaged file may have an epoch that fits no 64-bit integer.
     arrived_s = flown.netem["arrived_ns"] / SECOND_NS - flown.epoch_ns / SECOND_NS
-    for direction, name, color in ((UPLINK, "up", "k"), (DOWNLINK, "down", "#0072b2")):
-        counts, _ = np.histogram(arrived_s[flown.netem["direction"] == direction], seconds)
-        below.stairs(counts, seconds, color=color, label=name)
-    below.axhline(1.0 / flown.scenario.control.dt, color="r", linestyle="--", label="every step")
-    below.set_ylim(bottom=0.0)
+    flying = arrived_s < flown.time_s[-1] + 1.0
+    draw_packets(below, flown.scenario, flown.netem["direction"][flying], arrived_s[flying])
 
 
 def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:

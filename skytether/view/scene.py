@@ -100,7 +100,7 @@ def _desired(scenario: Scenario) -> Array:
             middle = np.array(points[0])
         return np.array([middle - corner, middle + corner])
     try:
-        reference = scenario.given_reference()
+        reference = scenario.unallocated_reference()
     except (OSError, ValueError):  # the trajectory's table is on another machine
         return np.zeros((2, axes))
     if isinstance(reference, Mission):

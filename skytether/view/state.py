@@ -92,8 +92,6 @@ class Curves:
     """Figure that the trigger compares; shape (n,)."""
     threshold: Array
     """Threshold that the figure is compared with; shape (n,)."""
-    event: Array
-    """1 where a horizon was sent, 0 elsewhere; shape (n,)."""
     age_s: Array
     """Age of the observation behind the input in force [s]; shape (n,)."""
     solve_ms: Array
@@ -125,7 +123,6 @@ class VehicleTrack:
                 ("reference", "f8", (axes,)),
                 ("figure", "f8"),
                 ("threshold", "f8"),
-                ("event", "?"),
                 ("age_s", "f8"),
                 ("solve_ms", "f8"),
             ],
@@ -165,7 +162,6 @@ class VehicleTrack:
         ring["reference"][at] = rows["reference"][:, :, 0]
         ring["figure"][at] = compared(rows)
         ring["threshold"][at] = rows["threshold"]
-        np.logical_or.at(ring["event"], at, rows["event"])
         ring["solve_ms"][at] = np.where(
             rows["solve_ns"] >= 0, rows["solve_ns"] / MILLISECOND_NS, np.nan
         )
@@ -296,15 +292,7 @@ class VehicleTrack:
         end_s = self.time_s if end_s is None else end_s
         grid_s = end_s + np.linspace(-SPAN_S, 0.0, points)
         on_grid = self._at_slots(np.floor(grid_s / self._slot_s + ROUNDING).astype(np.int64))
-        sent_s = self._ring["slot"][self._ring["event"]] * self._slot_s
-        event = np.zeros(points)
-        at = np.searchsorted(grid_s, sent_s[sent_s >= grid_s[0]])
-        event[at[at < points]] = 1.0
-        return Curves(
-            time_s=grid_s,
-            event=event,
-            **{name: on_grid[name] for name in VALUES},
-        )
+        return Curves(time_s=grid_s, **{name: on_grid[name] for name in VALUES})
 
     def error_m(self, seconds: float) -> float:
         """Root mean square distance to the reference in the last seconds [m]; NaN if unknown."""
@@ -370,6 +358,8 @@ class State:
         """Name of the scenario; empty before anything is known."""
         self.scenario = Scenario()
         """Scenario, as the first process heard flies it."""
+        self.duration_s = 0.0
+        """Length of the flight [s]: the client's, where a client is heard."""
         self.vehicles: dict[int, VehicleTrack] = {}
         """Vehicles by number."""
         self.omitted = 0
@@ -427,6 +417,8 @@ class State:
             raise FeedError(f"got no scenario: {error}") from None
         if known and process == "client":
             self._begin()  # another flight
+        if process == "client" or not self.name:
+            self.duration_s = scenario.duration
         if not self.name:
             self.flights += 1
             self.name = opened.name
@@ -508,6 +500,11 @@ class State:
     def zones(self) -> str:
         """Zones of a mission, as TOML text."""
         return self.scenario.mission.zones if self._zones is None else self._zones
+
+    @property
+    def has_zones(self) -> bool:
+        """Whether the vehicle has a fence, or zones to avoid."""
+        return self.scenario.fence.is_there or self.scenario.is_mission
 
     @property
     def kept(self) -> Zones:

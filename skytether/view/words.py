@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from html import escape
+from itertools import cycle
 
 import numpy as np
 
+from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
 from skytether.view.state import LOSS_S, State, Word, group, told
 
 CSS = {
@@ -57,7 +60,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     head = f"<b>{escape(title or state.title)}</b>"
     if track is None:
         return f'<div style="{_BODY}">{head}: no vehicle {vehicle} has been heard of yet.</div>'
-    rows = [("time of flight", f"{track.time_s:.0f} s of {state.scenario.duration:g} s")]
+    rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
     rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
     rows.append(("age of what the server knows", number(track.known_s, ".2f", " s")))
@@ -112,11 +115,13 @@ def _gone(state: State) -> str:
 
 
 def _newest(state: State) -> str:
-    """The last few events, newest first."""
-    return "".join(
-        f"<div>{time_s:.1f} s {escape(text)}</div>"
+    """The last few events, newest first, in a line each: what stands below does not move."""
+    cut = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+    lines = "".join(
+        f'<div style="{cut}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
         for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
     )
+    return f'<div style="height:{1.45 * NEWEST}em">{lines}</div>'
 
 
 def _link(state: State, vehicle: int, now_ns: int) -> Word:
@@ -205,9 +210,34 @@ def note(text: str) -> str:
     return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
 
 
-def answer(text: str, *, refused: bool) -> str:
-    """Answer to a request; empty before any."""
-    if not text:
-        return ""
-    colour = CSS["red"] if refused else CSS["green"]
-    return f'<div style="{_BODY};color:{colour}">{escape(text)}</div>'
+def answers(given: Sequence[tuple[str, bool]]) -> str:
+    """Answers to the newest request, in a box whose height does not depend on them.
+
+    Args:
+        given: answer of each flight, and whether it is a refusal.
+    """
+    lines = "".join(
+        f'<div style="color:{CSS["red" if refused else "green"]}">{escape(text)}</div>'
+        for text, refused in dict.fromkeys(given)
+    )
+    return f'<div style="{_BODY};height:2.9em;overflow-y:auto">{lines}</div>'
+
+
+def legend(titles: Sequence[str], *, has_zones: bool) -> str:
+    """Meaning of the lines on the map.
+
+    Args:
+        titles: titles of the flights, in the order of their colours.
+        has_zones: whether a fence or zones are drawn.
+    """
+    marks = [("─", "reference", GOAL_RGB), ("+", "start", GOAL_RGB)]
+    for title, rgb in zip(titles, cycle(FLIGHT_RGB), strict=False):
+        marks += [("─", f"{title} flown".strip(), rgb), ("━", f"{title} plan".strip(), rgb)]
+    if has_zones:
+        marks.append(("□", "fence, zones", FENCE_RGB))
+    items = "".join(
+        f'<span style="margin-right:0.9em;white-space:nowrap"><b style="color:{css(rgb)}">{mark}'
+        f"</b> {escape(what)}</span>"
+        for mark, what, rgb in marks
+    )
+    return f'<div style="{_BODY};{_DIM}">On the map: {items}</div>'

@@ -23,7 +23,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
@@ -41,7 +41,7 @@ PX4 = {"tau_s": [0.5], "gain": [0.85], "dead_time_s": [0.1]}
 def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
     table = reading.to_table(reading.load("swap-autopilot")) | {"duration": 55.0}
     table["vehicle"]["address"] = f"udpout:autopilot{number}:0"
-    lay({"network.uplink.loss": loss, "network.downlink.loss": loss}, table)
+    set_keys({"network.uplink.loss": loss, "network.downlink.loss": loss}, table)
     if flavour == "px4":
         table["model"] |= PX4
     return check(table, "three")

@@ -164,7 +164,7 @@ def test_help_shows_the_scenario_that_was_named(
     name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as exit_:
-        main([name, "paper", "--help"])
+        main([name, "paper", "--help-keys"])
     assert exit_.value.code == 0
     said = " ".join(re.sub(r"[│\n]", " ", capfd.readouterr().out).split())
     assert f"usage: skytether {name}" in said
@@ -290,6 +290,19 @@ def test_a_second_scenario_is_judged_as_it_is_flown(
     flown = ["fly", "demo", "--virtual", "--duration", "20", "--beside", str(fenced)]
     assert main(flown) == 2
     assert "fenced.toml: fence.radius_m: got 6.0, expected more" in capfd.readouterr().err
+
+
+def test_a_flight_is_compared_with_several_others(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["fly", "demo", "--virtual", "--duration", "4", "--settle", "0"]
+    argv += ["--beside", "demo-paper", "--beside", "demo-no-compensation"]
+    assert main([*argv, "--figure", str(tmp_path / "three.svg")]) == 0
+    told = capfd.readouterr().out
+    drawn = (tmp_path / "three.svg").read_text()
+    for name in ("demo", "demo-paper", "demo-no-compensation"):
+        assert f"{name}, in virtual time, seed 1" in told
+        assert f"<!-- {name}, in virtual time, seed 1" in drawn
 
 
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:

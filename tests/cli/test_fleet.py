@@ -15,16 +15,17 @@ from PIL import Image
 from helpers import SKYTETHER, ran, refused
 from skytether.cli.fleet import STAGES
 from skytether.client.endpoint import Client
-from skytether.client.fleet import Fleet
+from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram
 from skytether.shared.core.events import NoAnswer
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
 from skytether.shell import workers
 from skytether.sim.world import Clock, World
@@ -66,7 +67,7 @@ def flown(count: int, *, together: bool) -> Rows:
     )
     netem = world.add("netem", Proxy(GUSTY, server=server))
     vehicles, sink = clients(GUSTY, count, netem)
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     if together:
         world.add("fleet", fleet)
     else:
@@ -89,7 +90,7 @@ def test_a_fleet_flies_as_its_vehicles_would_alone() -> None:
 
 def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() -> None:
     vehicles, _ = clients(GUSTY, 3, ("nowhere", 1))
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     assert fleet.next_wake_ns() == 0
     fleet.wake(now_ns=SECOND_NS)
     assert [datagram.socket for datagram in fleet.outbox()] == [0, 1, 2]
@@ -108,9 +109,18 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
     assert fleet.next_wake_ns() is None
 
 
+def test_drops_of_vehicles_without_figures_of_their_own_are_added_up() -> None:
+    vehicles, _ = clients(GUSTY, VEHICLES_TOLD_MAX + 2, ("server", 1))
+    fleet = ClientFleet(vehicles)
+    for number in range(len(vehicles)):
+        fleet.receive(Datagram(b"?", ("server", 1), number), now_ns=0)
+    assert fleet.figures()["others_dropped"] == {"not a message": 2}
+    assert drops({"client": fleet.figures()}) == {"client": {"not a message": len(vehicles)}}
+
+
 def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -> None:
     vehicles, _ = clients(GUSTY, 2, ("server", 1))
-    fleet = Fleet(vehicles)
+    fleet = ClientFleet(vehicles)
     fleet.receive(Datagram(b"?", ("server", 1), 1), now_ns=0)
     assert [client.dropped.total() for client in vehicles] == [0, 1]
     assert fleet.figures()["by_vehicle"]["2"] == {
@@ -138,7 +148,7 @@ def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
 def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     figure = tmp_path / "fleet.png"
     argv = ("--virtual", "--vehicles", "3", "--duration", "8", "--figure", str(figure))
-    summary = fleet_command(tmp_path, *argv)
+    summary = fleet_command(tmp_path, *argv, "--network.downlink", "loss(0.1) & corrupt(0.1)")
     assert (summary["vehicles"], summary["workers"], summary["steps"]) == (3, 1, 1200)
     assert (summary["event_ratio"], summary["server_missed"]) == (1.0, 0)
     smallest, median, largest = summary["rmse_xy"]
@@ -147,6 +157,9 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     assert summary["machine_missed"] is None
     assert summary["vehicle_steps_per_core_s"] > 0
     assert figure.stat().st_size > 10_000
+    dropped = summary["drops"]
+    assert sum(dropped["netem"].values()) == summary["lost"]
+    assert sum(dropped["server"].values()) > 20
 
 
 def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import skytether.client.__main__ as client
 import skytether.netem.__main__ as netem
 from skytether.cli import fly, keygen
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.meanings import meanings
+from skytether.shared.scenario.schema import LinkConfig
 from skytether.shell import command, options
 
 CLIENT = client.ClientOptions()
@@ -50,11 +52,22 @@ def test_any_other_line_is_for_tyro(line: str) -> None:
     assert options.plain(CLIENT, shlex.split(line)) is None
 
 
-def test_the_help_shows_keys_after_a_mistake_as_well(capsys: pytest.CaptureFixture[str]) -> None:
-    for flag in ("--nonsense", "--help"):
+def test_the_help_has_options_and_another_one_has_keys(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their texts are wrapped once, whatever the width."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    shown = []
+    for flag in ("--nonsense", "--help", "--help-keys"):
         with pytest.raises(SystemExit):
-            command.parse(client.ClientOptions(), ["demo", flag], "x", None)
-    assert "--control.change-weight FLOAT" in capsys.readouterr().out
+            command.parse(client.ClientOptions(), [flag], "x", None)
+        shown.append(capsys.readouterr().out)
+    for said in shown[1:]:
+        for name, text in meanings(client.ClientOptions).items():
+            assert name == "config" or text in said
+    for name in LinkConfig.__struct_fields__:
+        flag = f"--link.{name.replace('_', '-')} "
+        assert [flag in said for said in shown] == [False, False, True]
 
 
 def test_a_command_with_a_required_option_is_for_tyro() -> None:

@@ -24,7 +24,7 @@ from airborne import (
 )
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
-from skytether.client.mavlink.port import VELOCITY_ALONE
+from skytether.client.mavlink.setpoints import VELOCITY_ALONE
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError
@@ -209,7 +209,24 @@ def test_a_parameter_that_cannot_be_set_is_refused() -> None:
     air = Air("ardupilot", parameters=SAFE["ardupilot"] | {"GUID_TIMEOUT": 3.0}, sets=True)
     air.flight.set = lambda *_: None
     air.end(20.0)
-    assert "GUID_TIMEOUT = 3" in str(air.client.failure)
+    failure = air.client.failure
+    assert isinstance(failure, ParametersUnsafe)
+    assert "GUID_TIMEOUT = 3" in str(failure)
+    assert failure.brief == (
+        "vehicle 1 is not armed: GUID_TIMEOUT; --set-parameters could not set them"
+    )
+
+
+@pytest.mark.parametrize("sets", [False, True])
+def test_no_flag_sets_what_an_autopilot_does_not_tell(*, sets: bool) -> None:
+    air = Air("ardupilot", sets=sets)
+    air.tap.alter = lambda message: b"" if message.get_type() == "PARAM_VALUE" else None
+    air.end(20.0)
+    failure = air.client.failure
+    assert isinstance(failure, ParametersUnsafe)
+    assert {each.value for each in failure.parameters} == {None}
+    assert failure.parameters[0].name in failure.brief
+    assert "--set-parameters" not in failure.brief
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address(
     beat()
     (told,) = air.of(AutopilotMoved)
     assert told.after.endswith(":2")
-    assert air.client._port._peer[1] == 2
+    assert air.client._port._connection.peer[1] == 2
     assert not air.client._flies.is_ready
 
 

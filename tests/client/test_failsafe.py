@@ -21,6 +21,7 @@ from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
 from skytether.client.link import PlainLink
+from skytether.client.session import SLEPT_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
@@ -206,6 +207,28 @@ def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
     """Mode and reason of every step of the record."""
     rows = hand.rows()
     return rows["mode"].tolist(), rows["reason"].tolist()
+
+
+def test_a_link_is_lost_after_more_than_its_time_out() -> None:
+    guard = aboard(timeout=1.0)
+    guard.heard(now_ns=SECOND_NS)
+    assert not guard.is_lost(2 * SECOND_NS)
+    assert guard.is_lost(2 * SECOND_NS + 1)
+
+
+@pytest.mark.parametrize(
+    ("gap_ns", "mode"),
+    [(600 * MILLISECOND_NS, Mode.READY), (600 * MILLISECOND_NS + 1, Mode.SYNC)],
+)
+def test_a_link_is_good_with_gaps_up_to_two_thirds_of_the_time_out(gap_ns: int, mode: Mode) -> None:
+    guard, now_ns = aboard(timeout=0.9), SECOND_NS
+    guard.heard(now_ns=now_ns)
+    guard.meet(Reason.OPENED, now_ns=now_ns)
+    for _ in range(2):
+        now_ns += gap_ns
+        guard.heard(now_ns=now_ns)
+    guard.step(late_ns=0, hindrance=None, now_ns=now_ns)
+    assert guard.mode is mode
 
 
 def test_a_link_that_stutters_is_not_good() -> None:
@@ -490,6 +513,20 @@ def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon()
     hand.plan()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
+
+
+@pytest.mark.parametrize(
+    ("over_ns", "mode"), [(-MILLISECOND_NS, Mode.TRACK), (MILLISECOND_NS, Mode.BRAKE)]
+)
+def test_a_server_whose_clock_went_on_for_half_a_minute_shows_a_suspended_machine(
+    over_ns: int, mode: Mode
+) -> None:
+    hand = tracking()
+    hand.heartbeat()
+    server_us = 1 + stamp_us(SLEPT_NS + over_ns)
+    hand.say(Heartbeat(4, hand.session, server_us, Idle.PLANS, 0))
+    hand.fly(0.02, beats=False)
+    assert hand.mode is mode
 
 
 def test_a_vehicle_that_oversleeps_by_less_flies_on() -> None:

@@ -11,7 +11,7 @@ from helpers import packaged
 from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.events import FenceHolds, ModeChanged
-from skytether.shared.scenario.fence import SLOW_STEPS, inner
+from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Mode
@@ -135,7 +135,7 @@ def test_wind_that_a_weak_vehicle_cannot_fly_against_is_refused() -> None:
 def test_near_a_bound_the_speed_towards_it_is_the_distance_over_t() -> None:
     """T = τ + 2 Δt: without τ in it, a vehicle of a larger inertia would come too close."""
     flown = scenario(fence={"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]})
-    terms, (_, high, _) = flown.terms(), inner(flown)
+    terms, (_, high, _) = flown.terms(), inner_bounds(flown)
     T = terms.tau_s[0] + SLOW_STEPS * flown.control.dt
     distance = 0.1 * flown.vehicle.brake_mps2 * T * T
     places = [(high[0] - distance, 0.0), *[(0.0, 0.0)] * (len(high) - 1)]

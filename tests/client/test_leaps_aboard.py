@@ -118,7 +118,7 @@ def test_the_chosen_frame_is_that_of_the_origin() -> None:
     """Whoever keeps the origin over a restart keeps the choice with it."""
     air = leapt()
     air.change(vehicle__after_leap="old")
-    assert air.flies.port.positions.origin == pytest.approx(LEAP, abs=0.1)
+    assert air.flies.port.autopilot.positions.origin == pytest.approx(LEAP, abs=0.1)
     again = leapt()
     again.change(vehicle__after_leap="new")
-    assert again.flies.port.positions.origin == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+    assert again.flies.port.autopilot.positions.origin == pytest.approx((0.0, 0.0, 0.0), abs=0.05)

@@ -14,7 +14,7 @@ from by_hand import ByHand
 from helpers import packaged
 from skytether.client import filter as aboard
 from skytether.client.filter import Kalman
-from skytether.client.navigation import Navigation, sensing
+from skytether.client.navigation import CARRIED_NS, Navigation, sensing
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import simulated
@@ -419,16 +419,18 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
 
 
 def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
-    """By eq. (1), exactly; one at the step itself is used unchanged, to the last bit."""
+    """By eq. (1), exactly; one at the step itself is used unchanged, to the last bit, and one that
+    is older than CARRIED_NS is carried so far and no further.
+    """
     flown, u = scenario(), np.array([1.0, -0.5])
     tau, position, velocity = flown.tau_s, [1.0, 2.0], [0.3, 0.4]
     known = Navigation(flown)
     known.advance([Measurement(0, [0.0, 0.0], [0.0, 0.0])], u, now_ns=0)
-    for age_ns in (0, 1, 17_000_000, DT_NS - 1):
+    for age_ns in (0, 1, 17_000_000, DT_NS - 1, CARRIED_NS, 3 * CARRIED_NS):
         measured = Measurement(DT_NS - age_ns, position, velocity)
         carried = known._carried(measured, DT_NS, u.tolist())
         assert (carried is measured) == (age_ns == 0)
-        age, v = age_ns / SECOND_NS, np.array(velocity)
+        age, v = min(age_ns, CARRIED_NS) / SECOND_NS, np.array(velocity)
         left = np.exp(-age / tau)
         np.testing.assert_allclose(carried.velocity, u + (v - u) * left, rtol=1e-12)
         moved = u * age + (v - u) * tau * (1.0 - left)

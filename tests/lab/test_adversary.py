@@ -15,11 +15,11 @@ import pytest
 import skytether.lab.commands.adversary as commands
 from skytether.__main__ import main
 from skytether.lab.adversary import (
-    Air,
+    AdversaryNetwork,
     Climb,
     Climbed,
-    Kind,
     Move,
+    MoveKind,
     climb,
     dumps,
     fly,
@@ -58,7 +58,7 @@ def scenario(shape: str, duration: float = 30.0) -> Scenario:
 
 
 def move(
-    kind: Kind, vehicle: int, way: str, start_s: float, length_s: float, *amounts: float
+    kind: MoveKind, vehicle: int, way: str, start_s: float, length_s: float, *amounts: float
 ) -> Move:
     """A move, in seconds."""
     start_ns, length_ns = seconds_to_ns(start_s), seconds_to_ns(length_s)
@@ -73,7 +73,7 @@ FOUR = scenario("swap(4)")
 
 def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -> list[float]:
     """Times after which packets of vehicle 2 arrive that enter the air at one time [s]."""
-    air, entered_ns = Air(moves, seed=1), seconds_to_ns(at_s)
+    air, entered_ns = AdversaryNetwork(moves, seed=1), seconds_to_ns(at_s)
     for _ in range(count):
         if way == "downlink":
             air.receive(Datagram(b"", ("client 2", 0), 0), now_ns=entered_ns)
@@ -89,7 +89,7 @@ def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -
 
 def test_a_delay_is_of_one_vehicle_and_one_way_and_grows_as_it_says() -> None:
     """Others take the base delay, and what lasts long changes slowly; delays add up."""
-    grows = move(Kind.DELAYS, 2, "downlink", 10.0, 10.0, 0.2, 0.4)
+    grows = move(MoveKind.DELAYS, 2, "downlink", 10.0, 10.0, 0.2, 0.4)
     assert arrivals(grows, at_s=9.9) == [0.05]
     assert arrivals(grows, at_s=10.0) == pytest.approx([0.25])
     assert arrivals(grows, at_s=15.0) == pytest.approx([0.35])
@@ -101,10 +101,10 @@ def test_a_delay_is_of_one_vehicle_and_one_way_and_grows_as_it_says() -> None:
 
 
 def test_packets_are_cut_lost_and_copied() -> None:
-    assert arrivals(move(Kind.CUTS, 2, "", 1.0, 1.0), at_s=1.5) == []
-    lost = move(Kind.LOSSES, 2, "", 0.0, 9.0, 0.3)
+    assert arrivals(move(MoveKind.CUTS, 2, "", 1.0, 1.0), at_s=1.5) == []
+    lost = move(MoveKind.LOSSES, 2, "", 0.0, 9.0, 0.3)
     assert 600 < len(arrivals(lost, at_s=1.0, count=1000)) < 800
-    copied = move(Kind.COPIES, 2, "", 0.0, 9.0, 0.7)
+    copied = move(MoveKind.COPIES, 2, "", 0.0, 9.0, 0.7)
     assert arrivals(copied, at_s=1.0) == pytest.approx([0.05, 0.75])
 
 
@@ -184,7 +184,7 @@ def test_each_kind_of_move_finds_a_planted_fault(
 ) -> None:
     """One safeguard is off; with it the same moves do no harm."""
     flown = replaced(FOUR, duration=80.0) if "server" in kinds else FOUR
-    named = tuple(map(Kind, kinds.split(",")))
+    named = tuple(map(MoveKind, kinds.split(",")))
     with monkeypatch.context() as without:
         ablation(without)
         climbs = (climb(Climb(flown, named, first + n, 7)).best for n in range(20))
@@ -197,8 +197,8 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
 ) -> None:
     """Somebody rests there whom it has not heard; without the question who that is, inside."""
     moves = (
-        move(Kind.SERVER, 0, "", 20.0, 0.5),
-        move(Kind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
+        move(MoveKind.SERVER, 0, "", 20.0, 0.5),
+        move(MoveKind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
     )
     assert spare_m(FOUR, fly(FOUR, moves)) > 0.0
     monkeypatch.setattr(MissionState, "unknown", lambda _: None)
@@ -207,20 +207,20 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
 
 # -- what is found comes again -------------------------------------------------------------------
 
-DIES = move(Kind.CUTS, 0, "", 3.0, 2.0)
-IN_THE_WAY = move(Kind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)
+DIES = move(MoveKind.CUTS, 0, "", 3.0, 2.0)
+IN_THE_WAY = move(MoveKind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)
 
 
 def test_a_flight_comes_again_to_the_last_bit() -> None:
     """Also from its line of JSON, with moves of all kinds."""
     moves = (
         DIES,
-        move(Kind.DELAYS, 1, "uplink", 0.0, 30.0, 0.1, 0.7),
-        move(Kind.LOSSES, 3, "", 0.0, 30.0, 0.4),
-        move(Kind.COPIES, 4, "downlink", 0.0, 30.0, 0.3),
-        move(Kind.GOALS, 2, "", 4.0, 3.0, 1.0, -3.0),
-        move(Kind.CLIENT, 3, "", 6.0, 0.2),
-        move(Kind.SERVER, 0, "", 7.0, 1.0),
+        move(MoveKind.DELAYS, 1, "uplink", 0.0, 30.0, 0.1, 0.7),
+        move(MoveKind.LOSSES, 3, "", 0.0, 30.0, 0.4),
+        move(MoveKind.COPIES, 4, "downlink", 0.0, 30.0, 0.3),
+        move(MoveKind.GOALS, 2, "", 4.0, 3.0, 1.0, -3.0),
+        move(MoveKind.CLIENT, 3, "", 6.0, 0.2),
+        move(MoveKind.SERVER, 0, "", 7.0, 1.0),
     )
     found = fly(FOUR, moves)
     assert math.isfinite(found.apart.distance_m)
@@ -230,17 +230,19 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     """A zone is flown into; a cut and a goal that do nothing to that are left out."""
     heedless(monkeypatch)
-    found = fly(FOUR, (DIES, IN_THE_WAY, move(Kind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
+    found = fly(FOUR, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
     assert found.clear.distance_m < 0.0
     fewest = shrunk(FOUR, found)
-    assert [each.kind for each in fewest.moves] == [Kind.ZONES]
+    assert [each.kind for each in fewest.moves] == [MoveKind.ZONES]
     assert fewest.moves[0].length_ns < IN_THE_WAY.length_ns
     assert spare_m(FOUR, fewest) < 0.0
 
 
 def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None:
     """All its chance follows from the seed and the number."""
-    tasks = [Climb(replaced(FOUR, duration=8.0), (Kind.DELAYS,), number, 3) for number in (1, 2)]
+    tasks = [
+        Climb(replaced(FOUR, duration=8.0), (MoveKind.DELAYS,), number, 3) for number in (1, 2)
+    ]
     one, other = map(climb, tasks)
     assert one.best.moves != other.best.moves
     assert climb(tasks[0]) == one
@@ -317,7 +319,7 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("demo",), "demo: got no mission, expected one, such as swap"),
+        (("demo",), "demo: expected a mission, such as swap"),
         (("swap", "--with", "rain"), "--with: got rain, expected some of delays,losses"),
         (("swap", "--tries", "0"), "--tries: got 0, expected 1 to"),
         (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),
@@ -333,6 +335,6 @@ def test_what_cannot_be_searched_is_refused(
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["sphere", "rings", "corridor", "warehouse"])
 def test_each_mission_can_be_searched(name: str) -> None:
-    found = climb(Climb(replaced(reading.load(name), duration=30.0), tuple(Kind), 1, 2))
+    found = climb(Climb(replaced(reading.load(name), duration=30.0), tuple(MoveKind), 1, 2))
     assert math.isfinite(found.best.apart.distance_m)
     assert len(found.spares_m) == 2

@@ -32,8 +32,8 @@ from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
 from bench.harness import (
     HOT,
     PACED,
-    Lateness,
     TextTable,
+    WakeLateness,
     interleave,
     machine,
     refresh,
@@ -130,9 +130,9 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
             each.fly()
         np.testing.assert_array_equal(heard.x, fleet.x)
     shape = (2, count, 2, scenario.control.horizon)
-    assert [each.shape for each in first.heard()] == [shape] * 2
-    assert [each.shape for each in later.heard(2)] == [shape] * 2
-    gradient, guess = later.heard()
+    assert [each.shape for each in first.recorded()] == [shape] * 2
+    assert [each.shape for each in later.recorded(2)] == [shape] * 2
+    gradient, guess = later.recorded()
     assert gradient.shape == guess.shape == (2, 2 * count, *shape[2:])
 
 
@@ -183,7 +183,7 @@ def test_contestants_take_turns_at_the_same_problems() -> None:
     """Hot in a row, of which the first only warms up; paced one by one, each after a pause."""
     done: list[tuple[str, int]] = []
     contest = {name: lambda i, name=name: done.append((name, i)) for name in "ab"}
-    lateness = Lateness()
+    lateness = WakeLateness()
     spent = interleave(contest, 3, PACED, lateness, "paced")
     assert [i for _, i in done] == [0, 0, 1, 1, 2, 2]
     assert {len(durations) for durations in spent.values()} == {3}

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from helpers import refusal, refused_before_writing
 from skytether.__main__ import main
 from skytether.lab import calibration
-from skytether.lab.calibration import COLUMNS, HERE, TABLE_1, UNFLYABLE, Rmse, SearchLimits, Table1
+from skytether.lab.calibration import COLUMNS, ONLY, TABLE_1, UNFLYABLE, Rmse, SearchLimits, Table1
 from skytether.lab.intervals import interval
 from skytether.lab.search import Free, Objective, Optimiser, SearchPoint, Values, check_free, put
 from skytether.lab.sweep import summaries
@@ -109,7 +109,7 @@ def flew(
 ) -> Values:
     """Figures of a point."""
     here = {"rmse_xy": rmse_xy, "event_ratio": event_ratio, "event_ratio_most": most}
-    return {HERE: {**here, "effort_mps": effort_mps, "saturated": saturated}}
+    return {ONLY: {**here, "effort_mps": effort_mps, "saturated": saturated}}
 
 
 def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
@@ -171,7 +171,7 @@ def test_a_trigger_has_the_keys_of_the_policies_in_it(trigger: str, keys: list[s
 def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
     """Mean, and the upper end of the 95 % interval; one that does not fly is no number."""
     short = replace(PAPER, duration=4.0, settle=0.0)
-    here = Rmse(short, TENTH).fly(short, [5, 6, 7])[HERE]
+    here = Rmse(short, TENTH).fly(short, [5, 6, 7])[ONLY]
     runs = summaries("", short, [5, 6, 7])
     ratios = [run.event_ratio for run in runs if run.event_ratio is not None]
     mean, half = interval(ratios)
@@ -273,10 +273,10 @@ def test_the_smallest_error_is_searched_for_and_shown(
     assert points[0].keys["control.input_weight"] == PAPER.control.input_weight
     assert best.score <= points[0].score
     said = capsys.readouterr().out
-    assert f"{best.values[HERE]['rmse_xy']:.4f}" in said
-    assert f"{best.values[HERE]['event_ratio']:.4f}" in said
+    assert f"{best.values[ONLY]['rmse_xy']:.4f}" in said
+    assert f"{best.values[ONLY]['event_ratio']:.4f}" in said
     assert main([*argv, "--packets", "0.2", "--generations", "2", "--out", str(tmp_path)]) == 2
-    assert "packets: got 0.2, expected 0.3, to go on there" in capsys.readouterr().err
+    assert "packets: got 0.2, expected 0.3 to continue there" in capsys.readouterr().err
 
 
 def test_another_search_in_the_same_folder_is_refused(
@@ -284,7 +284,7 @@ def test_another_search_in_the_same_folder_is_refused(
 ) -> None:
     """It would be told scores of other flights."""
     assert main([*ARGV, "--settle", "1", "--out", str(searched)]) == 2
-    said = f"{searched}: settle: got 1.0, expected 0.0, to go on there; or another --out"
+    said = f"{searched}: settle: got 1.0, expected 0.0 to continue there; or choose another --out"
     assert capsys.readouterr().err.strip() == f"calibrate: {said}"
 
 
@@ -298,7 +298,7 @@ def test_a_changed_digit_in_a_journal_is_refused(
     at = two.index('"rmse_x":0.') + 11
     file.write_text(one + two[:at] + str(9 - int(two[at])) + two[at + 1 :])
     assert main([*ARGV, "--generations", "2", "--out", str(tmp_path)]) == 2
-    said = f"calibrate: {file}: line 2 is not what was written: its checksum is wrong"
+    said = f"calibrate: {file}: line 2 has been altered: its checksum is wrong"
     assert capsys.readouterr().err.strip() == said
 
 
@@ -317,7 +317,7 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
     assert main([*argv, "--generations", "2"]) == 2
     said = capsys.readouterr().err
     assert f"out: files.{table}: got " in said
-    assert said.endswith(", to go on there; or another --out\n")
+    assert said.endswith(" to continue there; or choose another --out\n")
 
 
 @pytest.mark.parametrize(

@@ -41,11 +41,11 @@ from skytether.lab.contenders import (
     BESIDE,
     CASES,
     CONTENDERS,
-    LOOKED_AT,
+    QUICK,
     REGULATED,
     Case,
     Contender,
-    Found,
+    TunedWeights,
 )
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
@@ -128,7 +128,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
     control = replace(start.control, state_weight=(7.1, 1e-4), trigger="cost_gap(12.5)")
     found = replace(start, control=control)
     file = tmp_path / "mine.toml"
-    file.write_text(contenders.to_file([Found(contender, case, found, "A line.")], SCALE))
+    file.write_text(contenders.to_file([TunedWeights(contender, case, found, "A line.")], SCALE))
     read = reading.load(f"{file}/committed-gap-gusts")
     assert replace(read, title="") == replace(
         found, title="", duration=PAPER.duration, seed=PAPER.seed
@@ -485,7 +485,7 @@ def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_contender_gets_the_same_search(tuned: Path) -> None:
     """Seeds, points, flights and limits; what it found is its scenario."""
     weights, searches = tuned / "weights.toml", list((tuned / "searches").iterdir())
-    assert len(searches) == len(reading.names(str(weights))) == len(LOOKED_AT)
+    assert len(searches) == len(reading.names(str(weights))) == len(QUICK)
     for folder in searches:
         head = tomllib.loads((folder / "settings.toml").read_text())
         lines = map(json.loads, (folder / "journal.jsonl").read_text().splitlines())
@@ -533,7 +533,7 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     assert float(row["packets_per_s"]) <= 1.3 * float(row["budget"])
     assert float(row["rmse_xy_median"]) == pytest.approx(np.median([run.rmse_xy for run in runs]))
     weights = {row["contender"]: row for row in rows(out / "weights.csv")}
-    assert list(weights) == [*LOOKED_AT]
+    assert list(weights) == [*QUICK]
     here = float(weights["trajectory-expected"]["control.trigger.expected_gap"])
     expected = TRIGGERS.argument(found.control.trigger, "expected_gap")
     assert here == pytest.approx(expected, rel=1e-3)
@@ -544,7 +544,7 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
     assert (out / "trade-target.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "trade-target.pdf").read_bytes().startswith(b"%PDF")
     points = rows(out / "trade-target.csv")
-    assert {row["contender"] for row in points} <= {*LOOKED_AT}
+    assert {row["contender"] for row in points} <= {*QUICK}
     assert all(row["flown"] == row["runs"] == "3" for row in points)
     page = (out / "report.html").read_text()
     for name in {row["contender"] for row in points}:
@@ -578,7 +578,7 @@ def test_the_second_time_it_only_draws(
     assert main(["compare", "--quick", "--weights", weights, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "2 figures; 0 runs flown" in said
-    assert "ratios that are asked for hold" in said
+    assert "claimed ratios hold" in said
     changed = {path.name for path, content in kept.items() if path.read_bytes() != content}
     assert changed == {"report.html", "calls.jsonl"}
     calls = [json.loads(line)["runs"] for line in (out / "calls.jsonl").read_text().splitlines()]
@@ -596,7 +596,7 @@ def test_other_weights_are_another_comparison(
     assert main(["compare", "--quick", "--weights", str(file), "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"compare: {out / 'scouts' / 'target' / 'round-0'}: grid: got [")
-    assert said.endswith("], to go on there; or another --out\n")
+    assert said.endswith("] to continue there; or choose another --out\n")
 
 
 def test_weights_that_nobody_has_searched_for_are_refused(
@@ -633,10 +633,10 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130, said
-    assert f"of {2 * len(LOOKED_AT)} generations done; the same command goes on" in said
+    assert f"of {2 * len(QUICK)} generations done; the same command goes on" in said
     assert not (tmp_path / "weights.toml").exists()
     flown = journal.read_text()
-    for name in LOOKED_AT[1:]:  # a generation of theirs is done
+    for name in QUICK[1:]:  # a generation of theirs is done
         shutil.copytree(
             tuned / "searches" / f"{name}-target",
             journal.parents[1] / f"{name}-target",
@@ -644,7 +644,7 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
         )
     assert main([*TUNE, "--out", str(tmp_path)]) == 0
     assert journal.read_text().startswith(flown)
-    assert len(reading.names(str(tmp_path / "weights.toml"))) == len(LOOKED_AT)
+    assert len(reading.names(str(tmp_path / "weights.toml"))) == len(QUICK)
 
 
 @pytest.mark.parametrize(

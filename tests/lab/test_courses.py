@@ -68,7 +68,7 @@ def test_what_is_flown_is_what_the_equations_say(scheme: str) -> None:
             state, found = rng.normal(0.0, 2.0, (AXES, 2)), rng.normal(0.0, 0.3, AXES)
             before = rng.uniform(np.negative(flown.u_max), flown.u_max)
             u, _ = aboard.choose(k, state, found, before)
-            wanted = course.told(k - step) + course.back(k - step, state, found)
+            wanted = course.prescribed(k - step) + course.feedback(k - step, state, found)
             anew = np.clip(wanted, np.negative(flown.u_max), flown.u_max)
             anew = course.lag * before + (1.0 - course.lag) * anew
             away = max(away, float(np.abs(anew - u).max()))
@@ -83,7 +83,7 @@ def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple
     """Server's memory of the newest message: numbers, feedback, and steps between knots."""
     memory = scheme._memory
     if isinstance(scheme, Guidance):
-        slot = (memory.sent.heard["sent"][row] - 1) % trajectory.ROOM
+        slot = (memory.sent.delivery["sent"][row] - 1) % trajectory.RING
         count = memory.trajectories["count"][row, slot]
         knots = memory.knots[row, slot, :, : 2 * count]
         return (

@@ -26,13 +26,13 @@ from skytether.lab.envelope import (
     settling_s,
     worst_first,
 )
-from skytether.lab.journal import Journal
+from skytether.lab.journal import StudyJournal
 from skytether.server.controller import Controller
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
@@ -217,9 +217,9 @@ UNPLANNED = until(400)
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        (along(held, UNPLANNED), "at 20.05 s it is commanded 0.3 m/s without a plan, where"),
-        (along(slack, UNPLANNED), "at 20.05 s it is commanded 1.55 m/s without a plan, where"),
-        (along(restarted, UNPLANNED), "at 21.00 s it is commanded 1.6 m/s without a plan, where"),
+        (along(held, UNPLANNED), "at 20.05 s its command is 0.3 m/s without a plan, while"),
+        (along(slack, UNPLANNED), "at 20.05 s its command is 1.55 m/s without a plan, while"),
+        (along(restarted, UNPLANNED), "at 21.00 s its command is 1.6 m/s without a plan, while"),
     ],
     ids=["held", "too slow", "begun anew"],
 )
@@ -263,8 +263,12 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
 @pytest.mark.parametrize(
     ("moves_mps", "has_mps", "said"),
     [
-        (0.5, 0.0, "m without a plan, where braking takes 0.311 m"),
-        (0.0, 0.5, "at 20.05 s it has 0.5 m/s without a plan, where braking leaves 0.471 m/s"),
+        (0.5, 0.0, "m without a plan, while braking takes at most 0.311 m"),
+        (
+            0.0,
+            0.5,
+            "at 20.05 s its speed is 0.5 m/s without a plan, while braking allows 0.471 m/s",
+        ),
     ],
 )
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
@@ -365,9 +369,9 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
     )
     table = reading.to_table(reading.load("demo-committed"))
     for direction, delay_s in (("uplink", 0.05), ("downlink", 1.4)):
-        lay({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
-    lay({key.replace("__", "."): value for key, value in BLIND.items()}, table)
-    lay({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
+        set_keys({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
+    set_keys({key.replace("__", "."): value for key, value in BLIND.items()}, table)
+    set_keys({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
     scenario = msgspec.convert(table, Scenario)  # unchecked: it would be refused
     verdict = judge(scenario, flight.fly(scenario).client)
     assert verdict.outcome == "flyaway"
@@ -454,7 +458,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint("flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
-    with closing(Journal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
+    with closing(StudyJournal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
         journal.add("1", EnvelopePoint("astray", 1.25, 1.0, 0.0))
         journal.add("0", lost)
     assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
@@ -466,13 +470,13 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
 def test_another_seed_does_not_go_on_in_the_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Journal(tmp_path, DEMO.settings(), EnvelopePoint).close()
+    StudyJournal(tmp_path, DEMO.settings(), EnvelopePoint).close()
     assert (
         main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
         == 2
     )
-    said = f"envelope: {tmp_path}: seed: got 2, expected 1, to go on there; or another --out\n"
-    assert capsys.readouterr().err == said
+    said = "seed: got 2, expected 1 to continue there; or choose another --out"
+    assert capsys.readouterr().err == f"envelope: {tmp_path}: {said}\n"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from skytether.lab.faults import (
     RANGES,
     SHORTEST_NS,
-    Kind,
+    FaultKind,
     ScheduledFault,
     Trial,
     dumps,
@@ -34,8 +34,8 @@ def test_the_same_seed_draws_the_same_schedule() -> None:
 def test_every_kind_is_drawn_everywhere_within_its_range() -> None:
     """Each kind at each place, and each that has a sign with either."""
     faults = [fault for drawn in DRAWN for fault in drawn]
-    assert set(RANGES) == set(Kind)
-    places = {(kind, where) for kind in Kind for where in RANGES[kind].where}
+    assert set(RANGES) == set(FaultKind)
+    places = {(kind, where) for kind in FaultKind for where in RANGES[kind].where}
     assert {(fault.kind, fault.where) for fault in faults} == places
     for fault in faults:
         bounds = RANGES[fault.kind]
@@ -72,7 +72,7 @@ def test_a_schedule_is_one_line_and_comes_back_as_it_was() -> None:
         (dumps(Trial(1, DRAWN[0])).replace(DRAWN[0][0].kind, "rain"), "Invalid enum value 'rain'"),
         (dumps(Trial(1, (replace(DRAWN[0][0], start_ns=-1),))), ">= 0"),
         (
-            dumps(Trial(1, (ScheduledFault(Kind.FREEZE, "both", 0, 1, 1.0),))),
+            dumps(Trial(1, (ScheduledFault(FaultKind.FREEZE, "both", 0, 1, 1.0),))),
             "got 'both', expected server or client",
         ),
     ],
@@ -108,7 +108,7 @@ def test_what_fails_whatever_happens_shrinks_to_nothing() -> None:
 
 def test_shrinking_asks_seldom() -> None:
     """For two culprits among 1000 faults, less than a tenth as often as one by one."""
-    many = tuple(ScheduledFault(Kind.STEP, "server", start, 0, 1.0) for start in range(1000))
+    many = tuple(ScheduledFault(FaultKind.STEP, "server", start, 0, 1.0) for start in range(1000))
     asked = []
 
     def fails(faults: tuple[ScheduledFault, ...]) -> bool:

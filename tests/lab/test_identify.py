@@ -456,7 +456,7 @@ def test_what_is_identified_flies_at_once(
     changed = ["--vehicle.tau-s", "0.4", "--vehicle.dead-time-s", "0.2", "--vehicle.gain", "0.8"]
     changed += ["--duration", "20", "--vehicle.wind", "0", "--repeats", "1"]
     assert command.main(identify, ["simulated", *changed], "identify") == 0
-    assert "no fence is given" in capsys.readouterr().err
+    assert "no fence: the vehicle stays" in capsys.readouterr().err
     written = reading.load("identified/scenario.toml")
     assert written.duration == 20.0
     assert written.model.tau_s == pytest.approx((0.4, 0.4), rel=1e-3)

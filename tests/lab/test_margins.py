@@ -18,8 +18,8 @@ from skytether.lab.margins import (
     clocked_trigger,
     growth_of,
     limit,
-    looks_at_state,
     margin,
+    uses_state,
 )
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.gain import regulator
@@ -116,9 +116,9 @@ def test_a_vehicle_that_is_not_reached_is_not_stable() -> None:
 def test_only_what_looks_at_the_clock_sends_after_a_weak_push() -> None:
     """Any other trigger is replaced by a period that sends as often."""
     for trigger in ("always", "periodic(7)", "periodic(7) | silence(1)", "always & budget(5, 2)"):
-        assert not looks_at_state(demo_with(control__trigger=trigger))
+        assert not uses_state(demo_with(control__trigger=trigger))
     for trigger in ("cost_gap", "deviation(0.1) | silence(1)", "state_gap(3.6, 1.5)"):
-        assert looks_at_state(demo_with(control__trigger=trigger))
+        assert uses_state(demo_with(control__trigger=trigger))
     rare = clocked_trigger(demo_with(control__trigger="cost_gap(1e9) | silence(1)", duration=20.0))
     name, period = rare.rstrip(")").split("(")
     assert name == "periodic"

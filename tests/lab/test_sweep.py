@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from helpers import refusal, refused_before_writing, until
 from skytether.__main__ import main
 from skytether.lab import figures
-from skytether.lab.journal import Journal, sealed
+from skytether.lab.journal import StudyJournal, sealed
 from skytether.lab.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, parse_axis
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
@@ -220,16 +220,16 @@ OTHERS = {
 }
 
 
-def journal_of(plan: Sweep, folder: Path) -> Journal[Runs]:
+def journal_of(plan: Sweep, folder: Path) -> StudyJournal[Runs]:
     """The journal of a sweep."""
-    return Journal(folder, plan.settings(), Runs)
+    return StudyJournal(folder, plan.settings(), Runs)
 
 
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
 def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
     journal_of(ONE, tmp_path).close()
     told = refusal(lambda: journal_of(other, tmp_path))
-    assert told == f"{tmp_path}: {said}, to go on there; or another --out"
+    assert told == f"{tmp_path}: {said} to continue there; or choose another --out"
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,7 +277,7 @@ def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:
         journal.add("one", ())
     with (tmp_path / "journal.jsonl").open("ab") as file:
         file.write(sealed(b'["one", {}]'))
-    said = r"journal.jsonl: line 2 is not what was written: Expected `array`, got `object`"
+    said = r"journal.jsonl: line 2 has been altered: Expected `array`, got `object`"
     with pytest.raises(ConfigError, match=said):
         journal_of(ONE, tmp_path)
 
@@ -292,7 +292,7 @@ def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
     whole = file.read_bytes()
     for place in range(len(whole) - 1):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
-        with pytest.raises(ConfigError, match=r"line \d is not what was written"):
+        with pytest.raises(ConfigError, match=r"line \d has been altered"):
             journal_of(ONE, tmp_path)
 
 
@@ -306,7 +306,7 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     file.write_text(file.read_text().replace('"steps":40', '"steps":41'))
     capsys.readouterr()
     assert main([*argv, "--out", str(tmp_path)]) == 2
-    said = f"sweep: {file}: line 1 is not what was written: its checksum is wrong\n"
+    said = f"sweep: {file}: line 1 has been altered: its checksum is wrong\n"
     assert capsys.readouterr().err == said
 
 
@@ -559,4 +559,4 @@ def test_without_dask_a_scheduler_is_refused(
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "tcp://h:1"]
     assert main(argv) == 2
     said = "distributed is not installed, expected it: pip install 'skytether[cluster]'"
-    assert capsys.readouterr().err.strip() == f"sweep: {said}"
+    assert capsys.readouterr().err.startswith(f"sweep: {said}")

@@ -25,7 +25,7 @@ import skytether.shared.wire.channel
 from helpers import interpreted
 from skytether.__main__ import main
 from skytether.client.failsafe import LOCKING, TABLE
-from skytether.lab.faults import RANGES, Kind, ScheduledFault, Trial, dumps, loads
+from skytether.lab.faults import RANGES, FaultKind, ScheduledFault, Trial, dumps, loads
 from skytether.lab.invariants import Violation, check_bounds
 from skytether.lab.torture import (
     CLOCK_NS,
@@ -57,7 +57,7 @@ Patch = Callable[[pytest.MonkeyPatch], None]
 
 
 def fault(
-    kind: Kind, where: str, start_s: float, length_s: float, amount: float = 1.0
+    kind: FaultKind, where: str, start_s: float, length_s: float, amount: float = 1.0
 ) -> ScheduledFault:
     """A fault, in seconds."""
     return ScheduledFault(
@@ -122,28 +122,28 @@ def test_what_has_failed_once_fails_no_more(line: str) -> None:
 
 
 EFFECTS = [
-    (fault(Kind.LOSS, "both", 5, 4, 0.9), "packets: loss"),
-    (fault(Kind.BURST, "uplink", 5, 4, 10.0), "packets: burst"),
-    (fault(Kind.DUPLICATES, "both", 5, 4, 0.9), "packets: duplicates"),
-    (fault(Kind.REORDERING, "both", 5, 4, 2.0), "packets: reordering"),
-    (fault(Kind.PARTITION, "both", 5, 4), f"brake: {Reason.LOST}"),
-    (fault(Kind.PARTITION, "both", 5, 14), f"land: {Reason.ALONE}"),
-    (fault(Kind.RESTART, "server", 5, 0.05), f"brake: {Reason.LOST}"),
-    (fault(Kind.RESTART, "client", 5, 1.0), "lives of client"),
-    (fault(Kind.RESTART, "netem", 5, 1.5), f"brake: {Reason.LOST}"),
-    (fault(Kind.FREEZE, "client", 5, 1.0), f"brake: {Reason.STALLED}"),
-    (fault(Kind.FREEZE, "server", 5, 2.0), f"brake: {Reason.LOST}"),
-    (fault(Kind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
-    (fault(Kind.OVERLOAD, "server", 5, 6, 20.0), f"brake: {Reason.LOST}"),
-    (fault(Kind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
-    (fault(Kind.DELAY, "uplink", 5, 6, 3.0), f"brake: {Reason.LOST}"),
-    (fault(Kind.CORRUPTION, "both", 5, 4, 0.9), f"brake: {Reason.LOST}"),
-    (fault(Kind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
-    (fault(Kind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
-    (fault(Kind.COPY, "both", 5, 6), "packets: copy"),
-    (fault(Kind.KEYS, "server", 5, 3), f"brake: {Reason.LOST}"),
-    (fault(Kind.CROWD, "netem", 5, 6, 200.0), "packets: crowd"),
-    (fault(Kind.PORT, "client", 5, 0), "faults: port"),
+    (fault(FaultKind.LOSS, "both", 5, 4, 0.9), "packets: loss"),
+    (fault(FaultKind.BURST, "uplink", 5, 4, 10.0), "packets: burst"),
+    (fault(FaultKind.DUPLICATES, "both", 5, 4, 0.9), "packets: duplicates"),
+    (fault(FaultKind.REORDERING, "both", 5, 4, 2.0), "packets: reordering"),
+    (fault(FaultKind.PARTITION, "both", 5, 4), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.PARTITION, "both", 5, 14), f"land: {Reason.ALONE}"),
+    (fault(FaultKind.RESTART, "server", 5, 0.05), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.RESTART, "client", 5, 1.0), "lives of client"),
+    (fault(FaultKind.RESTART, "netem", 5, 1.5), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.FREEZE, "client", 5, 1.0), f"brake: {Reason.STALLED}"),
+    (fault(FaultKind.FREEZE, "server", 5, 2.0), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
+    (fault(FaultKind.OVERLOAD, "server", 5, 6, 20.0), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
+    (fault(FaultKind.DELAY, "uplink", 5, 6, 3.0), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.CORRUPTION, "both", 5, 4, 0.9), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.FLOOD, "server", 5, 2, 500.0), "packets: flood"),
+    (fault(FaultKind.FLOOD, "client", 5, 2, 500.0), "packets: flood"),
+    (fault(FaultKind.COPY, "both", 5, 6), "packets: copy"),
+    (fault(FaultKind.KEYS, "server", 5, 3), f"brake: {Reason.LOST}"),
+    (fault(FaultKind.CROWD, "netem", 5, 6, 200.0), "packets: crowd"),
+    (fault(FaultKind.PORT, "client", 5, 0), "faults: port"),
 ]
 
 
@@ -162,7 +162,9 @@ def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: 
     assert outcome.counts[effect] > 0
 
 
-SIEGE = Trial(1, (fault(Kind.CROWD, "netem", 3, 12, 200.0), fault(Kind.PORT, "client", 8, 0)))
+SIEGE = Trial(
+    1, (fault(FaultKind.CROWD, "netem", 3, 12, 200.0), fault(FaultKind.PORT, "client", 8, 0))
+)
 """An observer takes netem's places, and the vehicles' ports change."""
 
 
@@ -188,13 +190,13 @@ def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
     """Nobody brakes for it, whichever clock it is."""
     braked = f"brake: {Reason.STALLED}"
     for where in ("client", "server"):
-        outcome = fly(Trial(1, (fault(Kind.STEP, where, 5, 0, amount),)))
+        outcome = fly(Trial(1, (fault(FaultKind.STEP, where, 5, 0, amount),)))
         assert not outcome.failure
         assert braked not in outcome.counts
 
 
 def test_every_kind_of_fault_is_tried() -> None:
-    assert {one.kind for one, _ in EFFECTS} | {Kind.STEP, Kind.SKEW} == set(RANGES)
+    assert {one.kind for one, _ in EFFECTS} | {FaultKind.STEP, FaultKind.SKEW} == set(RANGES)
 
 
 # -- what is found ---------------------------------------------------------------------------
@@ -319,27 +321,31 @@ def violated(trial: Trial, ablate: Patch, patch: pytest.MonkeyPatch) -> str:
 
 ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
     (no_clamp, "slew", ()),
-    (no_window, "once", (fault(Kind.REPLAY, "downlink", 5, 2, 0.5),)),
-    (no_window, "once", (fault(Kind.DUPLICATES, "uplink", 5, 2, 0.9),)),
-    (no_tag, "authentic", (fault(Kind.CORRUPTION, "both", 5, 2, 0.9),)),
-    (no_tag, "authentic", (fault(Kind.FLOOD, "server", 5, 2, 500.0),)),
-    (no_age, "expired", (fault(Kind.LOSS, "downlink", 5, 5),)),
-    (no_brake_without_link, "brakes", (fault(Kind.PARTITION, "both", 5, 3),)),
-    (no_lock_at_restart, "good link", (fault(Kind.RESTART, "server", 5, 0.05),)),
-    (no_stall, "asleep", (fault(Kind.FREEZE, "client", 5, 0.6),)),
-    (no_lock, "good link", (fault(Kind.PARTITION, "both", 5, 3),)),
+    (no_window, "once", (fault(FaultKind.REPLAY, "downlink", 5, 2, 0.5),)),
+    (no_window, "once", (fault(FaultKind.DUPLICATES, "uplink", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(FaultKind.CORRUPTION, "both", 5, 2, 0.9),)),
+    (no_tag, "authentic", (fault(FaultKind.FLOOD, "server", 5, 2, 500.0),)),
+    (no_age, "expired", (fault(FaultKind.LOSS, "downlink", 5, 5),)),
+    (no_brake_without_link, "brakes", (fault(FaultKind.PARTITION, "both", 5, 3),)),
+    (no_lock_at_restart, "good link", (fault(FaultKind.RESTART, "server", 5, 0.05),)),
+    (no_stall, "asleep", (fault(FaultKind.FREEZE, "client", 5, 0.6),)),
+    (no_lock, "good link", (fault(FaultKind.PARTITION, "both", 5, 3),)),
     (no_good_link, "good link", ()),
-    (no_steady, "recovers", (fault(Kind.STEP, "client", 5, 0, -3600.0),)),
-    (no_steady, "recovers", (fault(Kind.STEP, "server", 5, 0, -3600.0),)),
-    (no_latch, "table", (fault(Kind.PARTITION, "both", 5, 14),)),
-    (no_home, "recovers", (fault(Kind.COPY, "both", 3, 20), fault(Kind.COPY, "both", 5, 15))),
+    (no_steady, "recovers", (fault(FaultKind.STEP, "client", 5, 0, -3600.0),)),
+    (no_steady, "recovers", (fault(FaultKind.STEP, "server", 5, 0, -3600.0),)),
+    (no_latch, "table", (fault(FaultKind.PARTITION, "both", 5, 14),)),
+    (
+        no_home,
+        "recovers",
+        (fault(FaultKind.COPY, "both", 3, 20), fault(FaultKind.COPY, "both", 5, 15)),
+    ),
     (
         no_second_try,
         "recovers",
         (
-            fault(Kind.COPY, "both", 4, 20),
-            fault(Kind.RESTART, "server", 6, 0.5),
-            fault(Kind.LOSS, "both", 6, 3, 0.7),
+            fault(FaultKind.COPY, "both", 4, 20),
+            fault(FaultKind.RESTART, "server", 6, 0.5),
+            fault(FaultKind.LOSS, "both", 6, 3, 0.7),
         ),
     ),
 ]
@@ -353,7 +359,7 @@ def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch)
         if make_scenario(seed)[0].control.scheme == "committed"
         and make_scenario(seed)[0].control.feedback
     )
-    trial = Trial(seed, (fault(Kind.LOSS, "downlink", 5, 8),))
+    trial = Trial(seed, (fault(FaultKind.LOSS, "downlink", 5, 8),))
     assert violated(trial, no_feedback_at_the_end, monkeypatch) == "follows"
 
 
@@ -404,7 +410,7 @@ def no_end(patch: pytest.MonkeyPatch) -> None:
     ("wrong", "invariant", "faults"),
     [
         (no_disturbance, "follows", ()),
-        (no_end, "follows", (fault(Kind.LOSS, "downlink", 5, 8),)),
+        (no_end, "follows", (fault(FaultKind.LOSS, "downlink", 5, 8),)),
     ],
 )
 def test_a_rule_of_trajectories_that_is_broken_is_caught(
@@ -417,7 +423,7 @@ def test_a_rule_of_trajectories_that_is_broken_is_caught(
 
 
 def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
-    counts = fly(Trial(FOLLOWS, (fault(Kind.SOLVER, "server", 5, 4),))).counts
+    counts = fly(Trial(FOLLOWS, (fault(FaultKind.SOLVER, "server", 5, 4),))).counts
     assert counts["steps along trajectories"] > 100
     assert not any(name.startswith("brake") for name in counts)
 
@@ -442,20 +448,20 @@ def test_two_hours_go_well() -> None:
 def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five faults shrink to the one that the guard is there for; it fails again from its JSON."""
     no_stall(monkeypatch)
-    culprit = fault(Kind.FREEZE, "client", 6, 1.0)
+    culprit = fault(FaultKind.FREEZE, "client", 6, 1.0)
     others = (
-        fault(Kind.DUPLICATES, "both", 3, 2, 0.5),
-        fault(Kind.SKEW, "server", 3, 9, 200.0),
-        fault(Kind.REPLAY, "both", 4, 4, 1.0),
+        fault(FaultKind.DUPLICATES, "both", 3, 2, 0.5),
+        fault(FaultKind.SKEW, "server", 3, 9, 200.0),
+        fault(FaultKind.REPLAY, "both", 4, 4, 1.0),
         culprit,
-        fault(Kind.FLOOD, "client", 9, 1, 100.0),
+        fault(FaultKind.FLOOD, "client", 9, 1, 100.0),
     )
     failed = fly(Trial(1, others))
     assert failed.invariant == "asleep"
     short = shrunk(failed)
     assert short.failure
     (left,) = short.trial.faults
-    assert (left.kind, left.start_ns) == (Kind.FREEZE, culprit.start_ns)
+    assert (left.kind, left.start_ns) == (FaultKind.FREEZE, culprit.start_ns)
     assert left.length_ns < culprit.length_ns
     assert fly(loads(dumps(short.trial))) == short
 
@@ -524,7 +530,7 @@ def test_a_failure_is_printed_with_its_schedule_and_flies_again(
 ) -> None:
     no_stall(monkeypatch)
     file = tmp_path / "seeds.txt"
-    frozen = Trial(1, (fault(Kind.FREEZE, "client", 5, 0.6),))
+    frozen = Trial(1, (fault(FaultKind.FREEZE, "client", 5, 0.6),))
     file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
     for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
         with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:

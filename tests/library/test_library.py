@@ -13,12 +13,13 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import skytether
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
 from skytether.cli import processes
 from skytether.shared.core.events import NoAnswer, ReferenceTooFast
-from skytether.shared.telemetry.summary import summarise
+from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
@@ -226,17 +227,34 @@ def test_a_flight_that_failed_says_why_and_comes_back(tmp_path: Path) -> None:
 def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
     one, other = fly_batch("demo", np.array([1, 5]), **SHORT)
     assert one.record.trace_hash() == flown.record.trace_hash()
-    alone = fly("demo", seed=5, **SHORT).summary
-    assert alone.drops is not None
-    assert other.summary == msgspec.structs.replace(alone, drops=None)
+    assert other.summary == fly("demo", seed=5, **SHORT).summary
     assert (other.scenario.seed, other["plan.input_mps"].shape) == (5, (0, 2, 80))
 
 
+def test_each_flight_of_a_batch_has_its_own_drops() -> None:
+    damaged = "paper(0.1, 0.02, 2.0) & corrupt(0.3) & loss(0.1)"
+    keys = {**SHORT, "network.uplink": damaged, "network.downlink": damaged}
+    together = [each.summary.drops for each in fly_batch("demo", range(1, 4), **keys)]
+    assert together == [fly("demo", seed=seed, **keys).summary.drops for seed in range(1, 4)]
+    assert all(drops and drops.keys() == {"server", "netem", "client"} for drops in together)
+
+
 def test_a_flight_is_drawn(flown: skytether.Flight) -> None:
-    plane, sent = flown.plot().axes
-    assert plane.get_title() == "demo, seed 1"
+    plane, packets = flown.plot().axes
+    assert plane.get_title().startswith("demo, seed 1")
     assert np.array_equal(plane.lines[1].get_xydata(), flown["position_m"])
-    assert "sent at" in sent.get_xlabel()
+    for way, stairs in enumerate(packets.patches):
+        counts, edges_s, _ = stairs.get_data()
+        assert counts.sum() == (flown["netem.direction"] == way).sum()
+        assert set(np.diff(edges_s)) == {1.0}
+
+
+def test_a_flights_path_is_drawn_on_axes_that_are_given(flown: skytether.Flight) -> None:
+    figure = Figure(figsize=(3.4, 3.0))
+    left, right = figure.subplots(1, 2)
+    assert flown.plot(ax=right) is figure
+    assert not left.lines
+    assert np.array_equal(right.lines[1].get_xydata(), flown["position_m"])
 
 
 def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
@@ -255,12 +273,29 @@ def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
     assert "input_x_mps_79" in flown.to_pandas("plan")
 
 
+def test_flights_are_rows_of_a_table(flown: skytether.Flight) -> None:
+    pytest.importorskip("pandas")
+    swept = skytether.Swept({"control.trigger": "always"}, flown.scenario, (flown.summary,) * 2)
+    for table, rows in ((skytether.table([flown]), 1), (swept.to_pandas(), 2)):
+        assert list(table["rmse_xy"]) == [flown.summary.rmse_xy] * rows
+        assert table["seed"].dtype.kind == "i"
+    assert swept.to_pandas().columns[0] == "control.trigger"
+    assert set(skytether.table([flown]).columns) == set(Summary.__struct_fields__) - {
+        "modes",
+        "drops",
+    }
+
+
 def test_without_pandas_it_says_what_to_install(
     flown: skytether.Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"^pandas is not installed, .*'skytether\[pandas\]'$"):
         flown.to_pandas()
+    with pytest.raises(ImportError, match=r"'skytether\[pandas\]'$"):
+        skytether.table([flown])
+    with pytest.raises(ImportError, match=r"'skytether\[pandas\]'$"):
+        skytether.Swept({}, flown.scenario, ()).to_pandas()
 
 
 def test_a_server_of_ones_own_is_flown() -> None:

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 import skytether.server.mpc.hierarchical
 from bench.problems import gradients, listening, solving
 from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import FIGURES, Figures, Foresight, foresight
+from skytether.server.common.scheme import FIGURES, Figures, Foresight, empty_foresight
 from skytether.server.controller import BLOCK
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
 from skytether.server.mpc.exact import ExactSolver, RiccatiWorkspace
@@ -111,7 +111,7 @@ def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Pl
 
 def seen(estimates: Array) -> Foresight:
     """Foresight of vehicles that are known to be there; shape (n, axes, 2)."""
-    found = foresight(len(estimates), 2, H, H)
+    found = empty_foresight(len(estimates), 2, H, H)
     found.start[:] = estimates
     return found
 
@@ -289,7 +289,7 @@ def test_batch_is_planned_as_its_singles(solver: str) -> None:
 def crowd(rng: np.random.Generator, ahead: Indices) -> Foresight:
     """Foresight of vehicles beside the circle, told this and that, and blown about."""
     n = len(ahead)
-    found = foresight(n, 2, H, H)
+    found = empty_foresight(n, 2, H, H)
     found.ahead[:] = ahead
     found.start[:] = START + rng.normal(scale=2.0, size=found.start.shape)
     for field in (found.committed, found.held):
@@ -344,11 +344,11 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
         doubted=rng.uniform(-1.0, 1.0, size=(1, 2, 2, H)),
         doubted_start=np.zeros((1, 2, 2, 2)),
     )
-    found.doubted_start[:] = found.start[:, None]
+    found.start_if_lost[:] = found.start[:, None]
     made = plan(planner, rows, np.array([41]), found)
     target, told = made.states[0], shift(before.tracked[0], 1)
     best = cost_of(found, target, told, made.tracked[0])
-    gaps = [cost_of(found, target, told, inputs) - best for inputs in found.doubted[0]]
+    gaps = [cost_of(found, target, told, inputs) - best for inputs in found.inputs_if_lost[0]]
     (figures,) = made.figures
     expected = (1.0 - sum(shares)) * figures["cost_gap"] + np.dot(shares, gaps)
     assert figures["expected_gap"] == pytest.approx(expected, rel=1e-4)
@@ -363,7 +363,7 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
         doubted=rng.uniform(-1.0, 1.0, size=(1, 1, 2, H)),
         doubted_start=np.zeros((1, 1, 2, 2)),
     )
-    found.flown[:] = flown
+    found.usable[:] = flown
 
     def figures() -> Any:
         planner = make()
@@ -371,11 +371,11 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
         return plan(planner, rows, np.array([41]), found).figures[0]
 
     before = figures()
-    for told in (found.held, found.doubted):
+    for told in (found.held, found.inputs_if_lost):
         told[..., flown:] += 0.5
     assert figures() == before
     if flown:
-        for told in (found.held, found.doubted):
+        for told in (found.held, found.inputs_if_lost):
             told[..., 0] += 0.5
         assert figures()["cost_gap"] != before["cost_gap"]
         assert figures()["expected_gap"] != before["expected_gap"]
@@ -451,7 +451,7 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
         ahead = rng.integers(0, H + 1, len(rows))
         found = crowd(rng, ahead)
         found.start[rng.random(len(rows)) < 0.05, rng.integers(2), 0] = np.nan
-        other = Foresight(*(field.copy() for field in found[:-1]), found.told)
+        other = Foresight(*(field.copy() for field in found[:-1]), found.splines)
         one = plan(compiled, rows, starts[rows] - ahead, found)
         same(one, plan(around, rows, starts[rows] - ahead, other))
         unsolved += np.count_nonzero(~one.figures["solved"])
@@ -547,7 +547,9 @@ def test_vehicles_hours_apart_are_planned_for_as_if_alone() -> None:
             found = crowd(rng, np.zeros(BLOCK, dtype=np.int64))
             made = plan(together, rows, step, found)
             for row, single in singles.items():
-                one = Foresight(*(field[row : row + 1].copy() for field in found[:-1]), found.told)
+                one = Foresight(
+                    *(field[row : row + 1].copy() for field in found[:-1]), found.splines
+                )
                 alone = plan(single, np.array([0]), step[row : row + 1], one)
                 np.testing.assert_array_equal(made.inputs[:, row], alone.inputs[:, 0])
                 np.testing.assert_array_equal(made.states[row], alone.states[0])

@@ -18,7 +18,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.grammar import Call, GrammarError
-from skytether.shared.scenario.registry import IMPAIRMENTS
+from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 
 SEEDS = range(10)
 SAMPLES = 3000
@@ -57,6 +57,27 @@ LAWS = {
     "gamma(0.02, 0.05, 0.06)": gamma(0.02, 0.05, 0.06),
     "gamma(0, 0.5, 0.005)": gamma(0, 0.5, 0.005),
 }
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("constant(50ms)", "constant(0.05)"),
+        ("normal(mean_s=20ms, sd_s=500us)", "normal(0.02, 0.0005)"),
+        ("gilbert_elliott(7%, 2s)", "gilbert_elliott(0.07, 2)"),
+        ("rate(1.5Mbit, queue=9000)", "rate(187500, 9000)"),
+    ],
+)
+def test_a_number_may_have_the_unit_of_its_parameter(text: str, plain: str) -> None:
+    assert IMPAIRMENTS.calls(text) == IMPAIRMENTS.calls(plain)
+
+
+@pytest.mark.parametrize("text", ["loss(50ms)", "constant(10%)", "rate(10%)", "rate(1ms)"])
+def test_a_unit_of_something_else_is_refused(text: str) -> None:
+    with pytest.raises(GrammarError):
+        IMPAIRMENTS.calls(text)
+    with pytest.raises(GrammarError):
+        TRIGGERS.parse("budget(5ms)")
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -20,13 +20,17 @@ import pytest
 
 from helpers import packaged
 from skytether.__main__ import main
+from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.scenario.air.traces import recorded_in
+from skytether.shared.scenario.air.recorded import recorded_in
+from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
+from skytether.shell.command import parse
 from skytether.shell.udp import leads_back
 from skytether.view import traffic
 
@@ -186,10 +190,10 @@ def test_changes_and_recordings(
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--uplink", "los(1)"], "network.uplink: got 'los(1)'"),
-        (["--downlink", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
+        (["--to-client", "los(1)"], "network.uplink: got 'los(1)'"),
+        (["--to-server", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
         (
-            ["--downlink", "trace(none.csv)"],
+            ["--to-server", "trace(none.csv)"],
             "none.csv', expected a file that can be read (No such file",
         ),
     ],
@@ -201,6 +205,32 @@ def test_a_wrong_direction_is_told_in_a_line(
     told = capsys.readouterr().err
     assert said in told
     assert told.count("\n") == 1
+
+
+def directed(**given: str) -> Scenario:
+    """Scenario of netem with these options."""
+    return _with_directions(parse(NetemOptions(**given), [], "netem", None, is_final=False)).config
+
+
+def test_without_a_scenario_netem_changes_nothing() -> None:
+    scenario = directed()
+    assert scenario.network.mtu == 65_507
+    for path in (scenario.uplink, scenario.downlink):
+        assert [name for name, _ in path.impairments] == ["none"]
+        assert path.queue is None
+
+
+def test_each_flag_changes_its_own_direction_of_the_scenario() -> None:
+    network, demo = directed(scenario="demo", to_client="loss(10%)").network, load("demo").network
+    assert (network.uplink, network.downlink) == ("loss(10%)", demo.downlink)
+    assert directed(to_server="loss(0.2)").downlink.loss == 0.2
+
+
+@pytest.mark.parametrize("text", ["constant(100)", "loss(1)"])
+def test_a_network_that_nobody_could_fly_over_is_for_other_programs(text: str) -> None:
+    scenario = directed(to_client=text)
+    proxy = Proxy(scenario, server=("server", 1))
+    Running(proxy, scenario).change({"network.downlink": text}, now_ns=0)
 
 
 def test_a_change_shows_at_once_and_a_wrong_one_changes_nothing() -> None:

@@ -15,7 +15,7 @@ from skytether.netem.places import EARNED_NS, EXCHANGES, HOST_FLOWS, IDLE_NS, Fl
 from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram, host_of
-from skytether.shared.core.events import FlowOpened, Returned
+from skytether.shared.core.events import FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 
@@ -448,7 +448,24 @@ def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
     hear(proxy, bytes(1301), SERVER, socket)
     assert proxy.outbox() == []
     assert (proxy.downlink.counts.oversized, proxy.uplink.counts.oversized) == (1, 1)
+    told = [event for event in proxy.events() if isinstance(event, TooLong)]
+    assert told == [TooLong(size=1301, most=1300)]
     assert pass_on(proxy, b"?", ALICE) == socket
+
+
+def test_a_server_that_is_gone_is_told_each_time_it_goes() -> None:
+    proxy = make_proxy()
+    socket = ask(proxy, ALICE)
+    for _ in range(2):
+        for _ in range(3):
+            pass_on(proxy, b"?", ALICE)
+            proxy.undelivered(socket, "Connection refused")
+        ask(proxy, ALICE)
+    proxy.undelivered(0, "Connection refused")
+    told = [event for event in proxy.events() if isinstance(event, Unreachable)]
+    assert told == [Unreachable(host=SERVER[0], port=SERVER[1], reason="Connection refused")] * 2
+    links = proxy.downlink.counts, proxy.uplink.counts
+    assert [(counts.forwarded, counts.undelivered) for counts in links] == [(3, 6), (2, 1)]
 
 
 def test_without_delay_packets_are_forwarded_as_they_arrive() -> None:
@@ -505,7 +522,7 @@ def test_the_figures_name_every_statistic() -> None:
     hear(proxy, b"!", SERVER, 1, at=3 * ms)
     hear(proxy, b"!", BOB, 1, at=3 * ms)
     proxy.wake(now_ns=21 * ms)
-    counts = "forwarded", "lost", "reordered", "oversized", "overflowed"
+    counts = "forwarded", "undelivered", "lost", "reordered", "oversized", "overflowed"
     nothing = dict.fromkeys((*counts, "dropped", "duplicated", "corrupted"), 0)
     nothing |= dict.fromkeys(("queueing_ms_p50", "queueing_ms_p99"), 0.0)
     nothing |= dict.fromkeys(("delay_ms_p50", "delay_ms_p99"), 0.0)

@@ -19,6 +19,7 @@ from scipy import stats
 from helpers import refused
 from skytether.__main__ import main
 from skytether.client.link import PlainLink
+from skytether.figures.probing import drawn
 from skytether.netem.proxy import Proxy
 from skytether.probe import analysis, fits
 from skytether.probe.listener import HOLD_NS, IDLE_NS, SESSIONS_MAX, Listener
@@ -289,6 +290,16 @@ def test_every_packet_is_measured_as_it_was() -> None:
     assert both.uplink.loss_low < 0.1 < both.uplink.loss_high
     assert both.downlink.loss_low < 0.3 < both.downlink.loss_high
     assert both.unreported == 0
+
+
+def test_gaps_of_a_picture_are_the_trains() -> None:
+    """A grey span for each, and none where nothing is measured but delays."""
+    text = "gamma(0.05, 0.09, 0.03) & loss(0.1)"
+    for seconds, trains in ((35.0, 3), (4.0, 0)):
+        measured, _ = measure(text, text, seconds=seconds)
+        figure = drawn(outcome(measured, "x", secure=False))
+        for over_time in figure.axes[::2]:
+            assert len(over_time.patches) == trains
 
 
 def test_a_clock_that_drifts_is_found_out() -> None:

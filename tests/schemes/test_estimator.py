@@ -1,4 +1,6 @@
-"""Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state flown on by the known inputs."""
+"""Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state flown on by the known
+inputs.
+"""
 
 from typing import Any
 
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, foresight
+from skytether.server.common.scheme import Foresight, empty_foresight
 from skytether.server.controller import Controller
 from skytether.server.schemes.predictive import Estimator
 from skytether.shared.core.stopwatch import Stopwatch
@@ -62,7 +64,7 @@ def scenario(scheme: str, **control: Any) -> Scenario:
 
 def computed(inputs: Array) -> Foresight:
     """Horizons that begin with these inputs [m/s; shape (n, axes)]."""
-    found = foresight(len(inputs), 2, H, 1)
+    found = empty_foresight(len(inputs), 2, H, 1)
     found.horizons[:] = inputs[:, :, None]
     return found
 
@@ -75,7 +77,7 @@ def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
 
 def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
     """Estimates x̂(step), which are where planning starts: d is 0."""
-    found = foresight(len(rows), 2, H, 1)
+    found = empty_foresight(len(rows), 2, H, 1)
     estimator.foresee(rows, step, found)
     np.testing.assert_array_equal(found.start, found.estimate)
     assert not found.ahead.any()
@@ -273,7 +275,7 @@ def watch(
     estimator: Estimator, wind: Array, every: int = 1, *, steps: int = 200, row: int = 0
 ) -> Array:
     """Disturbance learned of a vehicle that flies about in steady wind, seen now and then."""
-    x, found = np.zeros((2, 2)), foresight(1, 2, H, 1)
+    x, found = np.zeros((2, 2)), empty_foresight(1, 2, H, 1)
     for step in range(steps):
         u = 0.2 * np.array([np.sin(0.1 * step), np.cos(0.1 * step)])
         if step % every == 0:
@@ -326,7 +328,7 @@ def test_the_disturbance_is_flown_on_with_every_input() -> None:
 
 
 def test_what_was_learned_is_forgotten_with_the_vehicle() -> None:
-    estimator, found = learning(), foresight(2, 2, H, 1)
+    estimator, found = learning(), empty_foresight(2, 2, H, 1)
     for row in (0, 1):
         watch(estimator, WIND, row=row)
     estimator.forget(0)
@@ -343,7 +345,7 @@ def test_without_compensation_nothing_is_learned() -> None:
 def test_feedback_leads_on_from_where_the_vehicle_is_now() -> None:
     """From x̂(k), with the disturbance and the gain."""
     firm: dict[str, Any] = {"feedback": True, "input_weight": 0.01}
-    estimator, found = learning(**firm), foresight(1, 2, H, 1)
+    estimator, found = learning(**firm), empty_foresight(1, 2, H, 1)
     w = watch(estimator, WIND)
     estimator.observe(0, told(199, np.ones((2, 2)), np.zeros(2)))
     estimator.foresee(ROW, np.array([203]), found)

@@ -197,22 +197,22 @@ WRONG = {
     ),
     "no class": (
         "from skytether.plugin_scheme import scheme\n@scheme\ndef mine(fleet):\n    pass\n",
-        "test: control.scheme: got 'mine', expected a class of skytether.plugin_scheme",
+        "got 'mine', expected a class that extends one of skytether.plugin_scheme",
     ),
     "no scheme": (
         (
             "from skytether.plugin_scheme import scheme\n@scheme\nclass mine:\n"
             "    def __init__(self, fleet):\n        pass\n"
         ),
-        "test: control.scheme: got 'mine', expected a class of skytether.plugin_scheme",
+        "got 'mine', expected a class that extends one of skytether.plugin_scheme",
     ),
     "no such flight": (
         CHASE.replace('"predictive"', '"sideways"'),
-        "expected flown_as of committed, predictive, trajectory, none, and figures of state_gap",
+        "expected flown_as from committed, predictive, trajectory, none",
     ),
     "no such figure": (
         CHASE.replace('"predictive"', '"predictive", figures=("worth",)'),
-        "and figures of state_gap, cost_gap, expected_gap, deviation_m",
+        "and figures from state_gap, cost_gap, expected_gap, deviation_m",
     ),
 }
 
@@ -237,7 +237,7 @@ def test_what_is_no_scheme_is_refused_before_a_flight(
         (
             '"predictive")',
             '"trajectory")',
-            "TypeError: flown as 'trajectory', it is no InputScheme",
+            "TypeError: a scheme with flown_as='trajectory' must not extend InputScheme",
         ),
     ],
 )
@@ -262,9 +262,9 @@ BAD_PLAN = "super().plan(*given)\nfound.horizons[rows == 1, :, :80] = {}"
         ("observe", "raise RuntimeError('no')", "RuntimeError: no"),
         ("foresee", "raise RuntimeError('no')", "RuntimeError: no"),
         ("plan", "raise RuntimeError('no')", "RuntimeError: no"),
-        ("plan", BAD_PLAN.format("np.nan"), "ValueError: got inputs that are not within"),
-        ("plan", BAD_PLAN.format("9.0"), "ValueError: got inputs that are not within"),
-        ("plan", "found.ahead[:] = 1", "ValueError: got other delay bounds than 0 … 0"),
+        ("plan", BAD_PLAN.format("np.nan"), "ValueError: expected inputs within ±model.u_max"),
+        ("plan", BAD_PLAN.format("9.0"), "ValueError: expected inputs within ±model.u_max"),
+        ("plan", "found.ahead[:] = 1", "ValueError: expected delay bounds from 0 to 0"),
         ("remember", "raise RuntimeError('no')", "RuntimeError: no"),
         ("encode", "raise RuntimeError('no')", "RuntimeError: no"),
     ],
@@ -277,7 +277,7 @@ def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
     flight = fly(scenario("chase"), vehicles=2)
     (told,) = faults(flight)
     assert told.startswith(f"the scheme chase: {said}")
-    assert told.endswith("; where it fails, its vehicle has no plan at that step")
+    assert told.endswith("; a vehicle for which it fails is sent no plan at that step")
     assert flight.figures["server"]["counts"]["scheme_errors"] > 10
     last = {int(row["vehicle"]): row["mode"] for row in flight.client}
     assert [mode == Mode.TRACK for mode in last.values()].count(True) == 1

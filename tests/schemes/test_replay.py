@@ -8,10 +8,10 @@ import pytest
 from helpers import packaged
 from skytether.client.compensator import Compensator
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, foresight
+from skytether.server.common.scheme import Foresight, empty_foresight
 from skytether.server.mpc.hierarchical import Planner
 from skytether.server.schemes.committed import Replay
-from skytether.server.schemes.sent import LEARNED
+from skytether.server.schemes.sent import LOSS_WEIGHT
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.gain import feedback_gain
@@ -81,7 +81,7 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
     memory, brake = replay._memory, replay._settings.brake
     bounds = replay._settings.laws["bound"].tolist()
     plans = memory.sent.plans["step"][0].tolist()
-    for slot, made_for in enumerate(plans[: int(memory.sent.heard["sent"][0])]):
+    for slot, made_for in enumerate(plans[: int(memory.sent.delivery["sent"][0])]):
         length, speed = memory.horizons[0, slot].tolist()
         if made_for == in_force:
             stage = step - made_for
@@ -98,7 +98,7 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
 
 def foresee(replay: Replay, step: int) -> Foresight:
     """Predicted state of the one vehicle at a step."""
-    found = foresight(1, 2, H, MOST)
+    found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
 
@@ -107,7 +107,7 @@ def send(replay: Replay, step: int, inputs: Array, feedback: Array | None = None
     """A horizon of d + H inputs is sent, from an observation of before [inputs: (axes, d + H)]."""
     if replay.observed_step[0] < 0:
         see(replay, step - 1, np.zeros((2, 2)), NO_HORIZON)
-    found, length = foresight(1, 2, H, MOST), inputs.shape[1]
+    found, length = empty_foresight(1, 2, H, MOST), inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, inputs
     if feedback is not None:
         found.feedback[0] = feedback
@@ -149,8 +149,8 @@ def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int)
         see(replay, 103, np.array([[1.0, 0.2], [-1.0, 0.1]]), 100)
         for number, inputs in enumerate(given[1 : count + 1]):
             send(replay, 103 + number, inputs)
-        replay._memory.sent.heard["loss"] = loss / (1.0 - LEARNED)  # one has come since
-        found = foresight(1, 2, H, MOST, doubts=3)
+        replay._memory.sent.delivery["loss"] = loss / (1.0 - LOSS_WEIGHT)  # one has come since
+        found = empty_foresight(1, 2, H, MOST, loss_cases=3)
         replay.foresee(ROW, np.array([110]), found)
         return found
 
@@ -158,11 +158,13 @@ def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int)
     expected = [loss ** (j + 1) * (1.0 - loss) for j in range(min(under_way, cases))]
     if expected:
         expected[-1] = loss ** len(expected)
-    assert found.doubt[0].tolist() == pytest.approx(expected + [0.0] * (cases - len(expected)))
+    assert found.loss_probability[0].tolist() == pytest.approx(
+        expected + [0.0] * (cases - len(expected))
+    )
     for j in range(len(expected)):
         without = foreseen(under_way - j - 1)
-        np.testing.assert_array_equal(found.doubted[0, j], without.held[0])
-        np.testing.assert_array_equal(found.doubted_start[0, j], without.start[0])
+        np.testing.assert_array_equal(found.inputs_if_lost[0, j], without.held[0])
+        np.testing.assert_array_equal(found.start_if_lost[0, j], without.start[0])
 
 
 def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:

@@ -19,11 +19,11 @@ from skytether.client.navigation import Navigation
 from skytether.lab.sweep import summaries
 from skytether.server.common.clock import ClockMap
 from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import Fleet, Foresight, foresight
+from skytether.server.common.scheme import Fleet, Foresight, empty_foresight
 from skytether.server.mpc.nominal import make_nominal, plan_nominal
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.knots import fewest_knots
-from skytether.server.schemes.sent import LOSS
+from skytether.server.schemes.sent import FIRST_LOSS
 from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import plain
@@ -262,7 +262,7 @@ class Server:
             print,
         )
         self.scheme = Guidance(fleet)
-        self.found: Foresight = foresight(capacity, 2, 1, 1, splines=True)
+        self.found: Foresight = empty_foresight(capacity, 2, 1, 1, splines=True)
 
     def observe(
         self, step: int, *, in_force: int = NO_HORIZON, since: int = 0, takes: int = 1
@@ -301,7 +301,7 @@ def test_target_is_sent_as_one_knot() -> None:
     server = Server(scenario())
     server.observe(7)
     server.at(8, (1.0, 0.5), (-2.0, -0.25), send=True)
-    told = server.found.told
+    told = server.found.splines
     assert told.number.tolist() == [1]
     np.testing.assert_array_equal(told.knots[0, :, :2], [[1.0, 0.5], [-2.0, -0.25]])
 
@@ -311,7 +311,7 @@ def test_a_target_faster_than_the_bound_is_sent_at_the_bound() -> None:
     server = Server(scenario(model={"u_max": [1.5]}))
     server.observe(0)
     server.at(1, (0.0, 2.0), (0.0, -3.0), send=True)
-    assert server.found.told.knots[0, :, 1].tolist() == [1.5, -1.5]
+    assert server.found.splines.knots[0, :, 1].tolist() == [1.5, -1.5]
     away = server.at(11, (2.0, 2.0), (-3.0, -3.0))
     assert away["deviation_m"] == pytest.approx(np.hypot(0.5, 1.5))
 
@@ -327,7 +327,7 @@ def test_gap_is_the_mean_over_what_may_be_followed() -> None:
     assert not held["fresh"]
     assert held["cost_gap"] == pytest.approx(0.0, abs=1e-9)
     hovering = known(flown, server, 0.1, 1.0)
-    assert held["expected_gap"] == pytest.approx(LOSS * hovering, rel=1e-6)
+    assert held["expected_gap"] == pytest.approx(FIRST_LOSS * hovering, rel=1e-6)
 
 
 def test_gap_of_what_is_in_force_is_certain() -> None:
@@ -374,7 +374,7 @@ def test_the_longer_an_observation_knows_nothing_of_it_the_less_likely_it_comes(
         server.observe(made + 1 + delay, in_force=made + 1, since=made + 1 + delay)
         made += 1 + delay
     server.at(made + 1)
-    loss = float(server.scheme._memory.sent.heard["loss"][0])
+    loss = float(server.scheme._memory.sent.delivery["loss"][0])
     bound = server.scheme._memory.sent.bound
     for since, later in ((0, 4), (1, 4), (2, 2), (4, 1), (8, 0)):
         share = (1.0 - loss) * ((later + 1) / 5 if since else 1.0)
@@ -644,7 +644,7 @@ def flown_and_kept(flown: Scenario) -> tuple[Record, Kept]:
     def spy(self: Guidance, rows: Indices, step: Indices, found: Foresight, event: Any) -> None:
         inner(self, rows, step, found, event)
         for i in np.flatnonzero(event):
-            slot = (self._memory.sent.heard["sent"][rows[i]] - 1) % trajectory.ROOM
+            slot = (self._memory.sent.delivery["sent"][rows[i]] - 1) % trajectory.RING
             sent = self._memory.trajectories[rows[i], slot]
             knots = self._memory.knots[rows[i], slot, :, : 2 * sent["count"]].copy()
             kept[int(step[i])] = (int(sent["spacing"]), knots)
@@ -769,8 +769,8 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
                 inner = Guidance.observe
 
                 def observe(self: Guidance, row: int, told: Observation) -> bool:
-                    sent = self._memory.sent.heard["sent"][row]
-                    newest = self._memory.sent.plans["step"][row, (sent - 1) % trajectory.ROOM]
+                    sent = self._memory.sent.delivery["sent"][row]
+                    newest = self._memory.sent.plans["step"][row, (sent - 1) % trajectory.RING]
                     made = int(newest) if sent and told.takes else NO_HORIZON
                     return inner(self, row, told._replace(in_force=made, since=made + 1))  # noqa: B023
 

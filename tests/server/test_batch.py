@@ -15,7 +15,7 @@ from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import NoAnswer, SessionEnded
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode
@@ -198,7 +198,7 @@ def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
     """Vehicles report every few seconds, and the server forgets a session after three."""
     monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
     table = reading.to_table(reading.load(name)) | {"duration": 20.0, "settle": 0.0}
-    lay({"network.downlink.loss": 0.97}, table)
+    set_keys({"network.downlink.loss": 0.97}, table)
     table["link"]["connect_s"] = 1000.0
     flights = assert_as_alone(reading.check(table, "test"), range(1, 6))
     assert sum(event == SessionEnded(vehicle=1) for run in flights for *_, event in run.events) >= 3

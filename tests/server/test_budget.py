@@ -19,7 +19,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import lay
+from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim.flight import fly, fly_batch
 
@@ -239,7 +239,7 @@ def crowd(keys: Mapping[str, Any], network: str = AIR) -> Scenario:
     """The scenario `crowd` for 25 s."""
     table = reading.to_table(reading.load("crowd"))
     table["network"] = {"uplink": network, "downlink": network}
-    lay({"duration": 25.0, "settle": 12.0, **keys}, table)
+    set_keys({"duration": 25.0, "settle": 12.0, **keys}, table)
     return reading.check(table, "test")
 
 

@@ -11,11 +11,11 @@ from skytether.netem.fate import Fates
 from skytether.server.schemes import delay_bound as delay
 from skytether.server.schemes.delay_bound import (
     DelayBound,
-    acknowledge,
-    at_least,
-    begin,
+    add_sample,
     delay_bound,
     forget,
+    raise_to,
+    set_first,
 )
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario.air.path import path
@@ -33,9 +33,9 @@ def estimated(capacity: int = 1, most: int = MOST) -> DelayBound:
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     """Delay d after each sample of one vehicle."""
     bound, steps = estimated(most=most), []
-    begin(bound, 0, first)
+    set_first(bound, 0, first)
     for sample in delays:
-        delay.acknowledge(bound, 0, sample)
+        delay.add_sample(bound, 0, sample)
         steps += bound.steps.tolist()
     return steps
 
@@ -59,14 +59,14 @@ def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps
     """From 1 to the most there is room for, and whatever is guessed or seen."""
     bound = delay_bound(3, dt_s, MOST, fixed_s)
     for row, guess in enumerate((5, 20, 90)):
-        begin(bound, row, guess)
+        set_first(bound, row, guess)
     assert bound.steps.tolist() == [steps] * 3
     for row, sample in enumerate((1, 30, 90)):
         for _ in range(50):
-            acknowledge(bound, row, sample)
+            add_sample(bound, row, sample)
     assert bound.steps.tolist() == [steps] * 3
     forget(bound, 1)
-    begin(bound, 1, 7)
+    set_first(bound, 1, 7)
     assert bound.steps.tolist() == [steps] * 3
 
 
@@ -76,26 +76,26 @@ def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps
 def test_before_any_sample_it_is_the_guess() -> None:
     bound = estimated(4)
     for row, guess in ((3, 11), (0, 0), (1, 90)):
-        begin(bound, row, guess)
+        set_first(bound, row, guess)
     assert bound.steps.tolist() == [1, MOST, 0, 11]
 
 
 def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
     """Acknowledged or not, up to the most; a delay that is not known is as good as none."""
     bound, steps = estimated(), []
-    begin(bound, 0, 11)
+    set_first(bound, 0, 11)
     for delay_now in (-(2**40), 0, 10, 11, 12, 30, 12, 90):
-        at_least(bound, 0, delay_now)
+        raise_to(bound, 0, delay_now)
         steps += bound.steps.tolist()
     assert steps == [11, 11, 11, 11, 12, 30, 30, MOST]
 
 
 def test_what_was_raised_falls_step_by_step() -> None:
     bound, steps = estimated(), []
-    begin(bound, 0, 9)
-    at_least(bound, 0, 14)
+    set_first(bound, 0, 9)
+    raise_to(bound, 0, 14)
     for _ in range(22):
-        acknowledge(bound, 0, 9)
+        add_sample(bound, 0, 9)
         steps += bound.steps.tolist()
     assert steps == [14] * 15 + [13, 12, 11, 10] + [9] * 3
 
@@ -123,7 +123,7 @@ def test_either_reason_to_stay_is_needed(
 ) -> None:
     """Ablation: without it, d falls soon after a late horizon, into the next one."""
     guarded = known(delays)
-    monkeypatch.setattr(delay, "acknowledge", acknowledge.py_func)
+    monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
     assert known(delays) == guarded
     monkeypatch.setattr(delay, name, value)
     bare = known(delays)
@@ -166,12 +166,12 @@ def test_every_vehicle_has_a_bound_of_its_own() -> None:
     rng, vehicles = np.random.default_rng(2), 6
     bound, heard = estimated(vehicles), [list[int]() for _ in range(vehicles)]
     for row in range(vehicles):
-        begin(bound, row, 12)
+        set_first(bound, row, 12)
     for _ in range(500):
         some = rng.permutation(vehicles)[: rng.integers(vehicles + 1)]
         delays = 8 + some + rng.poisson(0.5, len(some))
         for row, sample in zip(some.tolist(), delays.tolist(), strict=True):
-            acknowledge(bound, row, sample)
+            add_sample(bound, row, sample)
             heard[row].append(sample)
     expected = [known(delays, first=12)[-1] for delays in heard]
     assert bound.steps.tolist() == expected
@@ -182,12 +182,12 @@ def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
     bound = estimated(2)
     for row in (0, 1):
         for _ in range(200):
-            acknowledge(bound, row, 30)
+            add_sample(bound, row, 30)
     forget(bound, 0)
     assert bound.steps.tolist() == [0, 30]
-    begin(bound, 0, 14)
+    set_first(bound, 0, 14)
     for _ in range(20):
-        acknowledge(bound, 0, 9)
+        add_sample(bound, 0, 9)
     assert bound.steps.tolist() == [9, 30]
 
 
@@ -216,14 +216,14 @@ def flown(
         if not fate.lost:
             arrivals.setdefault(made - (-fate.delay_ns // dt_ns), []).append(made)
     bound = delay_bound(1, dt_s, round(2.0 / dt_s) - 1, None)
-    begin(bound, 0, round(0.4 / dt_s) + 2)
+    set_first(bound, 0, round(0.4 / dt_s) + 2)
     in_force, bounds, late = -1, [], []
     for step in range(steps):
         made = max(arrivals.get(step, [-1]))
         if made > in_force:
             in_force = made
             late.append(step - made > bounds[made])
-            delay.acknowledge(bound, 0, step - made)
+            delay.add_sample(bound, 0, step - made)
         bounds += bound.steps.tolist()
     return bounds, float(np.mean(late))
 
@@ -252,7 +252,7 @@ def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int, seed: int
 def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ablation: five times the changes, and five times the late."""
     steps, late = flown(0.02, 1, seed=0)
-    monkeypatch.setattr(delay, "acknowledge", acknowledge.py_func)
+    monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
     monkeypatch.setattr(delay, "RECENT", 1)
     monkeypatch.setattr(delay, "LATE", 1.0)
     bare_steps, bare_late = flown(0.02, 1, seed=0)

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from skytether.client.link import AGAIN_NS
 from skytether.client.secure import ATTEMPT_NS, SecureLink
 from skytether.server import secure as server_secure
-from skytether.server.gate import Call
+from skytether.server.gate import GateCall
 from skytether.server.secure import COOKIE_NS, FORMS, HANDSHAKES, OUT_MAX, PENDING_MAX
 from skytether.server.secure import SecureGate as Gate
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -57,7 +57,7 @@ def link(seed: int = 2, key: VehicleKey = KEYS[1, 5]) -> SecureLink:
     return SecureLink(key, entropy=random.Random(seed).randbytes)
 
 
-def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> Call:
+def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> GateCall:
     """Content of a datagram that the server accepts."""
     call = server.open(Datagram(datagram, peer), now_ns=now_ns)
     assert call is not None

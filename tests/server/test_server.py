@@ -15,7 +15,7 @@ from helpers import packaged
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import PlainGate
 from skytether.server.secure import SecureGate
-from skytether.server.sessions import WELCOME_NS, Sessions
+from skytether.server.sessions import WELCOME_NS, Session, Sessions
 from skytether.server.tick import Grid
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -48,6 +48,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     Refusal,
+    Time,
     Welcome,
     decode,
     encode,
@@ -596,6 +597,69 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
             assert not keeps or kept.setdefault(session.row, session.vehicle) == session.vehicle
         assert len(sessions) + len(sessions.welcomed_vehicles) <= 3
         assert len(sessions.rows) == len(sessions)
+
+
+def test_a_time_of_day_that_was_under_way_for_2_s_narrows_a_clock_by_2_ms_less() -> None:
+    bounds_ms = []
+    for late_ns in (0, 2 * SECOND_NS):
+        vehicles = Vehicles(scenario())
+        welcome, epoch_ns = vehicles.open(), vehicles.now_ns
+        vehicles.epochs_ns[welcome.session] = epoch_ns
+        slow_us = stamp_us(200 * MILLISECOND_NS - epoch_ns)  # a round trip of 200 ms
+        vehicles.say(vehicles.told(welcome, 0)._replace(backward_us=slow_us))
+        vehicles.now_ns += late_ns
+        vehicles.server.learn_time(vehicles.now_ns, 0, now_ns=vehicles.now_ns)
+        vehicles.say(Time(1, welcome.session, 0, stamp_us(epoch_ns), error_us=1000))
+        vehicles.tick()
+        bounds_ms.append(vehicles.server.figures()["by_vehicle"]["1"]["clock_bound_ms"])
+    assert bounds_ms[0] < 2.0
+    assert bounds_ms[1] - bounds_ms[0] == pytest.approx(2.0, abs=0.1)
+
+
+def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
+    """Sessions, of which that of vehicle 1 was opened by run 5 of its client at DAY_NS."""
+    ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
+    sessions = Sessions(capacity, stream(1, "entropy").bytes, SILENCE_NS, ear)
+    welcomed = sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS)
+    told = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+    session = sessions.begin(Observation(1, welcomed.number, *told), DAY_NS)
+    session.heard_ns = DAY_NS
+    return sessions, session
+
+
+def hello(vehicle: int, boot_id: int) -> Hello:
+    return Hello(vehicle, boot_id, scenario().terms())
+
+
+def test_a_session_ends_once_its_vehicle_has_been_silent_for_longer_than_session_ns() -> None:
+    sessions, session = with_session()
+    assert sessions.expire(DAY_NS + SESSION_NS) == []
+    assert sessions.expire(DAY_NS + SESSION_NS + 1) == [session]
+
+
+def test_a_number_is_held_until_its_vehicle_has_been_silent_for_longer_than_the_time_out() -> None:
+    sessions, session = with_session()
+    assert sessions.holder(hello(1, 6), DAY_NS + SILENCE_NS) is session
+    assert sessions.holder(hello(1, 6), DAY_NS + SILENCE_NS + 1) is None
+
+
+def test_a_place_is_kept_for_welcome_ns_after_the_newest_hello() -> None:
+    sessions, _ = with_session(capacity=2)
+    for again_ns in (0, SECOND_NS):
+        sessions.welcome(hello(2, 5), HERE, LINE, DAY_NS + again_ns)
+    last_ns = DAY_NS + SECOND_NS + WELCOME_NS
+    assert sessions.is_full(hello(3, 5), last_ns)
+    assert not sessions.is_full(hello(3, 5), last_ns + 1)
+
+
+def test_a_heartbeat_is_due_as_soon_as_the_vehicle_has_asked_for_it() -> None:
+    sessions, session = with_session()
+    assert sessions.heartbeats_due(DAY_NS + SECOND_NS) == []  # it has asked for no bound
+    session.asked_ns = SECOND_NS
+    assert sessions.heartbeats_due(DAY_NS + SECOND_NS - 1) == []
+    assert sessions.heartbeats_due(DAY_NS + SECOND_NS) == [session]
+    session.number_next(DAY_NS + SECOND_NS)
+    assert sessions.heartbeats_due(DAY_NS + SECOND_NS) == []
 
 
 def test_two_vehicles_fly_as_each_would_alone() -> None:

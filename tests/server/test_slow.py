@@ -193,7 +193,7 @@ def forget_late(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: what every packet takes just now is not known: no `at_least`, no `Idle.DELAY`."""
+    """Ablation: what every packet takes just now is not known: no `raise_to`, no `Idle.DELAY`."""
     observe = ClockMap.observe
 
     def deaf(self: ClockMap, row: int, *ways_ns: int, heard: int, **told: Any) -> Contradiction:

@@ -18,8 +18,8 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.triggers import (
     Combined,
     Compared,
-    KnownArrays,
     Situation,
+    SituationArrays,
     Trigger,
     Verdict,
     _column,
@@ -53,7 +53,7 @@ def figures_of(
     return figures
 
 
-KNOWN = KnownArrays(
+KNOWN = SituationArrays(
     model=discretise((0.84, 0.84), 0.1),
     dt_s=0.1,
     planned=3,
@@ -230,7 +230,7 @@ def test_heartbeat_sends_where_one_is_due() -> None:
     both = np.array([0, 1])
     known = KNOWN._replace(sent_step=np.array([40, 40]))
     for fresh, events in ((False, [False, True]), (True, [True, True])):
-        asked = facing(both, figures_of(2, step=41, fresh=fresh))._replace(known=known)
+        asked = facing(both, figures_of(2, step=41, fresh=fresh))._replace(arrays=known)
         assert sent.test(asked).event.tolist() == events
 
 

@@ -12,6 +12,7 @@ from skytether.lab import keys_document
 from skytether.netem.__main__ import emulate
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import GOALS, POINT, TRIGGER, ZONES
+from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
 from skytether.shared.scenario.schema import Scenario, Section, Strength
@@ -59,9 +60,9 @@ def test_help_has_the_sentences_of_the_page(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
-        emulate(["--help"])
+        emulate(["--help-keys"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for name in ("control", "vehicle", "sensor", "link"):
-        sentences = keys_document.sentences(typing.get_type_hints(Scenario)[name])
+        sentences = meanings(typing.get_type_hints(Scenario)[name])
         for key, sentence in sentences.items():
             assert sentence in shown, f"{name}.{key}"

@@ -26,6 +26,9 @@ def test_drops_are_by_end_and_reason() -> None:
         "netem": {"downlink dropped": 6, "uplink lost": 5, "refused": 3},
         "client": {"too old": 8},
     }
+    figures["client"]["others_dropped"] = {"type": 2}
+    assert drops(figures, 1)["client"] == {"too old": 8}
+    assert drops(figures)["client"] == {"type": 11, "too old": 8}
     assert drops({"server": {"dropped": {}}}, 1) == {}
 
 

@@ -218,7 +218,7 @@ def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path
     plug(tmp_path, "@trigger\ndef look(now):\n    return now.held[:, 0, 0] > 0.0\n")
     (said,) = faults(flown("look", scheme="predictive"))
     known = "held: expected control.scheme = 'committed'"
-    assert said == f"the trigger look: ValueError: {known}; where it fails, it sends"
+    assert said == f"the trigger look: ValueError: {known}; when it fails, a horizon is sent"
 
 
 @pytest.mark.parametrize("scheme", ["predictive", "none", "trajectory"])
@@ -535,7 +535,7 @@ def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_p
     """A packet too many costs bytes, one too few the flight."""
     plug(tmp_path, f"@trigger\ndef bad(now):\n    {body}\n")
     flight, always = flown("bad"), flown("always")
-    assert faults(flight) == [f"the trigger bad: {said}; where it fails, it sends"]
+    assert faults(flight) == [f"the trigger bad: {said}; when it fails, a horizon is sent"]
     np.testing.assert_array_equal(flight.server["event"], always.server["event"])
     assert flight.client.tobytes() == always.client.tobytes()
     assert faults(always) == []
@@ -574,7 +574,7 @@ def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> 
     """It ends with what the trigger's mistake is."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
     said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
-    assert said == "the trigger bad: RuntimeError: no; where it fails, it sends"
+    assert said == "the trigger bad: RuntimeError: no; when it fails, a horizon is sent"
 
 
 # -- references ------------------------------------------------------------------------------------
@@ -830,7 +830,7 @@ def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + bad)
     plugged = f"{SHORT} --plugin mine.py --record flight.mcap"
     said = run(f"fly demo --page 127.0.0.1:0 {plugged} --control.trigger bad", folder=tmp_path)
-    assert said.count("the trigger bad: RuntimeError: no; where it fails, it sends") == 1
+    assert said.count("the trigger bad: RuntimeError: no; when it fails, a horizon is sent") == 1
     assert "goes on without a page" not in said
     run("report flight.mcap --plugin mine.py", folder=tmp_path)
 

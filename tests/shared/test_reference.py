@@ -208,26 +208,37 @@ def test_file_for_space_can_be_flown_in_the_plane() -> None:
     assert sample(desired, 0.5) == ([1.0, 2.0], [2.0, 4.0])
 
 
-FINITE = "expected at least two lines of finite numbers"
-RISING = "column t must start at 0 and rise from line to line"
+COLUMNS = "line 1: expected the columns t, x, y, got "
+TWO = "expected at least two lines of finite numbers"
 BAD_FILES = [
-    ("", "line 1: expected the columns t, x, y"),
-    ("t,x\n0,0\n1,1\n", "line 1: expected the columns t, x, y"),
-    ("0,0,0\n1,1,1\n", "line 1: expected the columns t, x, y"),
-    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 numbers"),
+    ("", COLUMNS + "nothing"),
+    ("t,x\n0,0\n1,1\n", COLUMNS + "'t', 'x'"),
+    ("t;x;y\n0;0;0\n1;1;1\n", COLUMNS + "'t;x;y'"),
+    ("0,0,0\n1,1,1\n", COLUMNS + "'0', '0', '0'"),
+    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 finite numbers, got 1, one, 1"),
     # Empty lines count too: the line named is the one that an editor shows.
-    ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 numbers"),
-    ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 numbers"),
-    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 numbers"),
-    ("t,x,y\n0.1,0,0\n1,1,1\n", RISING),
-    ("t,x,y\n0,0,0\n2,1,1\n1,2,2\n", RISING),
-    ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", RISING),
-    ("t,x,y\n", FINITE),
-    ("t,x,y\n0,0,0\n", FINITE),
-    ("t,x,y\n0,0,0\n1,nan,1\n", FINITE),
-    ("t,x,y\n0,0,0\ninf,1,1\n", FINITE),
-    ("t,x,y\n0,0,0\n1,1e999,1\n", FINITE),
+    ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 finite numbers, got 1, one, 1"),
+    ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 finite numbers, got 1, 1, nothing"),
+    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 finite numbers, got 1, nothing, 1"),
+    ("t,x,y\n0.1,0,0\n1,1,1\n", "line 2: expected t = 0 as the first time, got 0.1"),
+    ("t,x,y\n0,0,0\n\n2,1,1\n1,2,2\n", "line 5: expected t above 2, got 1"),
+    ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", "line 4: expected t above 1, got 1"),
+    ("t,x,y\n", TWO),
+    ("t,x,y\n0,0,0\n", TWO),
+    ("t,x,y\n0,0,0\n1,nan,1\n", "line 3: expected 3 finite numbers, got 1, nan, 1"),
+    ("t,x,y\n0,0,0\ninf,1,1\n", "line 3: expected 3 finite numbers, got inf, 1, 1"),
+    ("t,x,y\n0,0,0\n1,1e999,1\n", "line 3: expected 3 finite numbers, got 1, 1e999, 1"),
 ]
+
+
+def test_a_header_may_have_spaces_and_a_byte_order_mark() -> None:
+    flown = reference.from_csv(b"\xef\xbb\xbft , x , y \n0,0,0\n1,2,4\n", 2)
+    assert sample(flown, 0.5) == ([1.0, 2.0], [2.0, 4.0])
+
+
+def test_text_in_another_encoding_is_named_with_its_line() -> None:
+    with pytest.raises(ValueError, match=r"^line 2: expected text in UTF-8$"):
+        reference.from_csv(b"t,x,y\n0,0,\xff\n", 2)
 
 
 @pytest.mark.parametrize(("text", "message"), BAD_FILES)
@@ -252,5 +263,5 @@ def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> Non
         check({"reference": {"shape": "csv", "file": str(path)}}, "mine.toml")
     assert str(caught.value) == (
         f"mine.toml: reference.file: got {str(path)!r}, "
-        "expected a table of the trajectory (line 3: expected 3 numbers)"
+        "expected a table of the trajectory (line 3: expected 3 finite numbers, got 1, one, 1)"
     )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skytether.client.compensator import Compensator
 from skytether.server.common import compiled as law
 from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, foresight
+from skytether.server.common.scheme import Foresight, empty_foresight
 from skytether.server.schemes.committed import Replay
 from skytether.shared.base.kernel import part
 from skytether.shared.law import rule
@@ -216,7 +216,7 @@ def make_horizon(rng: np.random.Generator, step: int, d: int, near: Array, gain:
 
 def send(replay: Replay, horizon: Horizon) -> None:
     """The server remembers that it has sent a horizon."""
-    found, length = foresight(1, 2, H, MOST), horizon.inputs.shape[1]
+    found, length = empty_foresight(1, 2, H, MOST), horizon.inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, horizon.inputs
     if horizon.feedback.size:
         found.feedback[0] = horizon.feedback
@@ -225,7 +225,7 @@ def send(replay: Replay, horizon: Horizon) -> None:
 
 def foresee(replay: Replay, step: int) -> Foresight:
     """Foresight of the server at a step."""
-    found = foresight(1, 2, H, MOST)
+    found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
 

@@ -17,7 +17,7 @@ from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import KEYS, TERMS, differences, keys_of
-from skytether.shared.scenario.dotted import flat, lay
+from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import InFlight, Owner
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
@@ -100,7 +100,7 @@ ALL = dict(flat(reading.to_table(HERE)))
 def with_(key: str, value: Any) -> Scenario:
     """The scenario with one key changed."""
     table = reading.to_table(HERE)
-    lay({key: value}, table)
+    set_keys({key: value}, table)
     if key == "model.axes":
         table["reference"]["points_m"] = ()
     return reading.check(table, "there")
@@ -123,7 +123,7 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
         ), with_(key, 3)
     if key.startswith("mission."):
         table = reading.to_table(ON_MISSION)
-        lay({key: MISSION[key]}, table)
+        set_keys({key: MISSION[key]}, table)
         return ON_MISSION, reading.check(table, "there")
     value = OTHER.get(key)
     if value is None:

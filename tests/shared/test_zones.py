@@ -226,25 +226,36 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
         (geojson([polygon(SQUARE)], origin=[10, 50]), "at most 100000 m from the origin"),
         (geojson([polygon([[0, 0], [0, 89], [1, 89]])], origin=[0, 84]), "longitude and latitude"),
         (geojson([polygon(SQUARE)], crs={"type": "name"}), "no crs, for RFC 7946 has degrees"),
-        (geojson([{"geometry": None}]), "a Polygon, a MultiPolygon or a Point, got None"),
-        (geojson([{"properties": {}}]), "feature 1 as RFC 7946 has it"),
-        (shape("GeometryCollection", []), "feature 1 with a Polygon, a MultiPolygon or a Point"),
-        (shape("LineString", SQUARE), "or a Point, got LineString"),
-        (shape("Polygon", []), "feature 1 with coordinates, got none"),
-        (shape("Polygon", [[]]), "feature 1 with coordinates, got none"),
-        (shape("MultiPolygon", []), "feature 1 with coordinates, got none"),
-        (shape("Point", [], radius_m=1), "feature 1 with coordinates of two numbers"),
+        (geojson([{"geometry": None}]), "a Point with radius_m, not a None"),
+        (geojson([{"properties": {}}]), "feature 1', expected a feature with a geometry"),
+        (
+            shape("GeometryCollection", []),
+            "feature 1', expected a Polygon, a MultiPolygon or a Point with",
+        ),
+        (shape("LineString", SQUARE), "or a Point with radius_m, not a LineString"),
+        (shape("Polygon", []), "feature 1', expected coordinates, got none"),
+        (shape("Polygon", [[]]), "feature 1', expected coordinates, got none"),
+        (shape("MultiPolygon", []), "feature 1', expected coordinates, got none"),
+        (shape("Point", [], radius_m=1), "feature 1', expected coordinates of two numbers"),
+        (shape("Point", [0, 0], radius=5), "the property radius_m in metres, not with radius"),
+        (shape("Polygon", [SQUARE], kind=["fence"]), "keep_out or fence, got \"['fence']\""),
         (shape("Point", [0, 0], radius_m="5"), "radius_m a number, got '5'"),
         (shape("Point", [0, 0], radius_m=float("inf")), "radius_m above 0, at most 1e+06"),
-        (shape("MultiPolygon", [[SQUARE], [SQUARE]], kind="fence"), "feature 1 with one polygon"),
+        (
+            shape("MultiPolygon", [[SQUARE], [SQUARE]], kind="fence"),
+            "feature 1', expected one polygon",
+        ),
         (geojson([polygon([[0, 0, 5], [1, 1, 5], [0, 1, 5]])]), "no heights in its coordinates"),
         (geojson([polygon(SQUARE, low_m=30, high_m=0)]), "low_m below high_m, got 30 and 0"),
         (geojson([polygon(SQUARE, high_m=float("nan"))]), "high_m a number, got 'nan'"),
-        (geojson([polygon([[0, 0], [1, 1]])]), "feature 1 with at least 3 corners"),
+        (geojson([polygon([[0, 0], [1, 1]])]), "feature 1', expected at least 3 corners"),
         (geojson([polygon([[0, 0], [True, 1], [0, 1]])]), "coordinates a number, got 'True'"),
         (geojson([polygon([[0, 0], [1e9, 1], [0, 1]])]), "at most 1e+06 m"),
         (geojson([polygon(BOW_TIE)]), "a border that does not cross itself"),
-        (geojson([polygon([[0, 0], [1, 1], [0, 1]], kind="danger")]), "KeyError: 'danger'"),
+        (
+            geojson([polygon([[0, 0], [1, 1], [0, 1]], kind="danger")]),
+            "keep_out or fence, got 'danger'",
+        ),
     ],
 )
 def test_a_wrong_map_is_told(content: str, said: str, tmp_path: Path) -> None:
@@ -299,7 +310,7 @@ def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
     ("text", "goals", "said"),
     [
         ("box(3, 5, -1, 1)", "", "none within 0.23 m of the goal (4, 0) of vehicle 1"),
-        ("fence(-1, 3, -1, 5)", "", "of the goal (4, 0) of vehicle 1"),
+        ("fence(-1, 3, -1, 5)", "", "a fence 0.23 m around the goal (4, 0) of vehicle 1"),
         ("box(9, 9.0004, 9, 9.0003)", "", "at least mission.tube_m = 0.2 m; this is 0.0004 m long"),
         ("geojson(missing.json)", "", "a file that can be read"),
         ("", "1,0,0,0\n2,0,0.5,0\n", "at most 0.5 m, as the goals of vehicles 1 and 2 at 0 s"),
@@ -308,6 +319,18 @@ def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
 def test_goals_that_cannot_be_reached(text: str, goals: str, said: str, tmp_path: Path) -> None:
     table = with_goals(tmp_path, goals or "1,0,0,0\n1,2,4,0\n2,0,0,4\n", zones=text)
     assert said in refusal(lambda: reading.check(table, "mission"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"), [("fence", "feature 1, hole 1"), ("keep_out", "feature 1, with its holes")]
+)
+def test_a_goal_in_a_hole_is_refused_with_the_hole(kind: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "map.geojson"
+    outer = [[-9, -9], [9, -9], [9, 9], [-9, 9]]
+    hole = [[-5, -5], [5, -5], [5, 5], [-5, 5]]
+    file.write_text(shape("Polygon", [outer, hole], kind=kind))
+    table = with_goals(tmp_path, "1,0,0,0\n1,2,4,0\n2,0,0,4\n", zones=f'geojson("{file}")')
+    assert f"{said}, expected none within" in refusal(lambda: reading.check(table, "mission"))
 
 
 def test_zones_are_of_missions_alone() -> None:

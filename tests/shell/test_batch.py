@@ -20,7 +20,7 @@ from skytether.shell.batch import (
     BATCH_MAX,
     SEGMENTS_MAX,
     SIZE_MAX,
-    Batch,
+    DatagramBatch,
     Segments,
     pack_address,
     unpack_address,
@@ -63,7 +63,10 @@ def test_datagrams_arrive_whole_in_order_and_with_their_senders(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
     here, there = ends
-    batch, payloads = Batch(FAMILIES[host]), [b"", b"a", bytes(range(256)) * 255, b"z" * 1200]
+    batch, payloads = (
+        DatagramBatch(FAMILIES[host]),
+        [b"", b"a", bytes(range(256)) * 255, b"z" * 1200],
+    )
     for payload in payloads:
         there.sendto(payload, here.getsockname())
     before_ns = time.monotonic_ns()
@@ -80,8 +83,8 @@ def test_the_kernel_tells_when_each_came(
 ) -> None:
     """However late they are read; sizes of one call are not those of the next."""
     here, there = ends
-    batch = Batch(FAMILIES[host])
-    Batch.stamp(here)
+    batch = DatagramBatch(FAMILIES[host])
+    DatagramBatch.stamp(here)
 
     def is_stamped_on_arrival() -> bool:
         there.sendto(b"-", here.getsockname())
@@ -112,7 +115,7 @@ def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
 ) -> None:
     """Timers and other sockets have their turn in between."""
     here, there = ends
-    batch, numbered = Batch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
+    batch, numbered = DatagramBatch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
     assert batch.send(there, numbered[BATCH_MAX:], [raw_of(here)] * 3) == 3
     assert batch.receive(here)[0] == numbered[:BATCH_MAX]
@@ -123,7 +126,7 @@ def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
     """Also after a batch of other sizes and peers: nothing of it is left in the arrays."""
     with ExitStack() as stack:
         socks = [stack.enter_context(open_socket((host, 0))) for _ in range(5)]
-        batch, payloads = Batch(FAMILIES[host]), [b"%d" % i * (i + 1) for i in range(4)]
+        batch, payloads = DatagramBatch(FAMILIES[host]), [b"%d" % i * (i + 1) for i in range(4)]
         assert batch.send(socks[4], [b"x" * SIZE_MAX] * 4, [raw_of(socks[0])] * 4) == 4
         assert batch.send(socks[4], payloads, [raw_of(sock) for sock in socks[:4]]) == 4
         assert received(socks[0]) == [b"x" * SIZE_MAX] * 4 + payloads[:1]
@@ -133,7 +136,11 @@ def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
 def test_sending_stops_at_the_first_that_fails() -> None:
     """Datagrams that went are counted from the first on; nobody can have port 0."""
     with open_socket(("127.0.0.1", 0)) as here, open_socket(("127.0.0.1", 0)) as there:
-        batch, good, bad = Batch(socket.AF_INET), raw_of(there), pack_address(("127.0.0.1", 0))
+        batch, good, bad = (
+            DatagramBatch(socket.AF_INET),
+            raw_of(there),
+            pack_address(("127.0.0.1", 0)),
+        )
         assert batch.send(here, [b"1", b"2", b"3", b"4"], [good, good, bad, good]) == 2
         assert batch.send(here, [b"3", b"4"], [bad, good]) == 0
         assert received(there) == [b"1", b"2"]
@@ -142,7 +149,7 @@ def test_sending_stops_at_the_first_that_fails() -> None:
 def test_nothing_is_sent_that_is_too_long_or_of_another_family() -> None:
     """The plain call of the socket sends it, or says why it cannot."""
     with open_socket(("127.0.0.1", 0)) as here:
-        batch, own = Batch(socket.AF_INET), raw_of(here)
+        batch, own = DatagramBatch(socket.AF_INET), raw_of(here)
         assert batch.send(here, [b"1", b"2" * (SIZE_MAX + 1)], [own, own]) == 0
         assert batch.send(here, [b"1", b"2"], [own, pack_address(("::1", 1))]) == 0
         assert batch.send(here, [b"1", b"2"], [own, b""]) == 0
@@ -263,7 +270,7 @@ def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     """Whether the system has the calls for batches; where it has none, the plain ones serve."""
     if not request.param:
 
-        def missing(_: int) -> Batch:
+        def missing(_: int) -> DatagramBatch:
             raise OSError("this system has no such calls")
 
         monkeypatch.setattr(driver, "Batch", missing)
@@ -388,14 +395,14 @@ class Crowd:
         self.endpoint = endpoint
         self.read: list[int] = []
         """Number of datagrams that each call for a batch has read."""
-        real = Batch.receive
+        real = DatagramBatch.receive
 
-        def receive(batch: Batch, sock: socket.socket) -> Any:
+        def receive(batch: DatagramBatch, sock: socket.socket) -> Any:
             found = real(batch, sock)
             self.read.append(len(found[0]))
             return found
 
-        monkeypatch.setattr(Batch, "receive", receive)
+        monkeypatch.setattr(DatagramBatch, "receive", receive)
 
     def send(self, counts: Sequence[int]) -> None:
         """Send so many datagrams at once, one time after the other, and end once all are heard."""
@@ -499,7 +506,7 @@ def test_who_loses_the_core_between_two_clocks_reads_them_again(
 ) -> None:
     """Else what came 30 ms ago would seem to come in the future."""
     here, there = ends
-    batch, real, slept = Batch(FAMILIES[host]), time.time_ns, iter([0.03])
+    batch, real, slept = DatagramBatch(FAMILIES[host]), time.time_ns, iter([0.03])
 
     def late() -> int:
         time_ns = real()
@@ -507,7 +514,7 @@ def test_who_loses_the_core_between_two_clocks_reads_them_again(
             time.sleep(slept_s)
         return time_ns
 
-    Batch.stamp(here)
+    DatagramBatch.stamp(here)
     before_ns = time.monotonic_ns()
     there.sendto(b"a", here.getsockname())
     sent_ns = time.monotonic_ns()
@@ -524,13 +531,13 @@ def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
 
     Their times are those of reading, and what is read next may have come before.
     """
-    received = Batch.receive
+    received = DatagramBatch.receive
 
-    def earlier(batch: Batch, sock: socket.socket) -> Any:
+    def earlier(batch: DatagramBatch, sock: socket.socket) -> Any:
         payloads, raws, came_ns = received(batch, sock)
         return payloads, raws, [each_ns - 50_000_000 for each_ns in came_ns]
 
-    monkeypatch.setattr(Batch, "receive", earlier)
+    monkeypatch.setattr(DatagramBatch, "receive", earlier)
     with ExitStack() as stack:
         endpoint = Answering(31, lambda _: [])
         endpoint.patience_ns = 20_000_000

@@ -226,19 +226,22 @@ def test_at_the_end_only_its_own_socket_is_removed(tmp_path: Path) -> None:
     assert path.read_text() == "precious"
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [("none/netem", "No such file or directory"), ("n" * 200, "AF_UNIX path too long")],
-)
 def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
-    name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from skytether.netem.__main__ import emulate
 
-    path = tmp_path / name
+    path = tmp_path / ("n" * 200)
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--control", str(path)], "netem")
-    said = f"netem: --control: {path}: no socket can be made: {reason}\n"
+    said = f"netem: --control: {path}: no socket can be made: AF_UNIX path too long\n"
     assert (code, capsys.readouterr().err) == (2, said)
+
+
+def test_the_folder_of_a_socket_is_made_for_its_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "air" / "netem"
+    with closing(Control(path, running())):
+        assert path.is_socket()
+    assert path.parent.stat().st_mode & 0o777 == 0o700
 
 
 # -- skytether set ---------------------------------------------------------------------------------

@@ -448,9 +448,10 @@ def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
 ) -> None:
     from skytether.netem.__main__ import emulate
 
-    path = tmp_path / "none" / "feed"
+    path = tmp_path / "file" / "feed"
+    path.parent.touch()
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--feed", str(path)], "netem")
-    said = f"netem: --feed: {path}: no socket can be made: No such file or directory\n"
+    said = f"netem: --feed: {path}: no socket can be made: File exists\n"
     assert (code, capsys.readouterr().err) == (command.CONFIGURATION, said)
 
 

@@ -34,10 +34,16 @@ from chromium import (
     status,
     until,
 )
+from skytether.figures.page import Table, rendered
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
 PICTURES = Path("page-test")
+RANGES = """() => Object.values(window.__viserTestpoints.uplots).slice(0, 2).map(({chart}) =>
+    [chart.data[0].at(-1) - chart.scales.x.max, chart.scales.y.max - chart.scales.y.min])"""
+"""Of the plots of x and y: newest time beyond the shown ones [s], and height of the range [m]."""
+WIDTHS = (("narrow", 2), ("wide", 9))
+"""Tables of a report and their numbers of columns."""
 
 pytestmark = [
     pytest.mark.browser,
@@ -96,7 +102,11 @@ def test_the_loss_slider_changes_the_measured_loss(
     with opened(browser, flight) as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")
         assert max(measured()) < 35
+        slider = page.get_by_text("Loss [%]")
+        place = slider.bounding_box()
         put(page, "Loss [%]", 60)
+        until(lambda: page.get_by_text("network.uplink is").count(), "it is answered")
+        assert slider.bounding_box() == place, "the answer has moved the controls"
         until(lambda: min(measured()) > 40, "the measured loss follows")
         put(page, "Loss [%]", 10)
         until(lambda: max(measured()) < 35, "the measured loss follows back")
@@ -185,7 +195,7 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
     browser: "sync_api.Browser", tmp_path: Path
 ) -> None:
     """Netem alone, with two sockets in place of a client and a server."""
-    netem = [sys.executable, "-P", "-m", "skytether", "netem", "--downlink", "constant(0.02)"]
+    netem = [sys.executable, "-P", "-m", "skytether", "netem", "--to-server", "constant(0.02)"]
     folder, client = tmp_path / "air", socket.socket(type=socket.SOCK_DGRAM)
     folder.mkdir()
     with client, socket.socket(type=socket.SOCK_DGRAM) as server:
@@ -289,6 +299,38 @@ def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", fligh
         until(
             lambda: scheme.get_attribute("data-mantine-color-scheme") == "light", "it becomes light"
         )
+    with opened(browser, flight, prefers="light") as page:
+        scheme = page.locator("html")
+        until(
+            lambda: scheme.get_attribute("data-mantine-color-scheme") == "light", "it is preferred"
+        )
+
+
+def test_a_phone_finds_plots_beside_the_words(browser: "sync_api.Browser", flight: str) -> None:
+    with opened(browser, flight, "narrow") as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        assert plotted_s(page) == 0.0
+        page.get_by_role("tab", name="Flight").click()
+        until(lambda: plotted_s(page) > 1, "a plot is drawn")
+        plot = page.locator(".u-wrap").first.bounding_box()
+        assert plot
+        assert plot["x"] >= 0.0
+        assert plot["x"] + plot["width"] <= 420.0
+
+
+def test_a_wide_table_of_a_report_fits_the_window(browser: "sync_api.Browser") -> None:
+    heading = [f"a long heading {number}" for number in range(9)]
+    tables = [Table(name, name, "", "", heading[:count], [["0"] * count]) for name, count in WIDTHS]
+    drawn: dict[str, object] = dict.fromkeys(("title", "about", "verdict", "toml"), "")
+    drawn |= {"tables": tables, "pictures": [], "events": [], "untold": 0, "made": {}}
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.set_content(rendered("view/report.html.jinja", drawn=drawn))
+    boxes = [page.locator(f"#{name}").bounding_box() for name, _ in WIDTHS]
+    hidden = "box => box.scrollWidth - box.clientWidth"
+    assert [each.evaluate(hidden) for each in page.locator(".wide").all()] == [0, 0, 0]
+    assert boxes[1]
+    assert boxes[1]["width"] > 56 * 16
+    page.close()
 
 
 def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
@@ -331,14 +373,17 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         picture(page, PICTURES / "replay-dark-wide.png")
 
 
-def test_a_duel_shows_both(browser: "sync_api.Browser") -> None:
-    names = "demo", "demo-no-compensation"
+def test_a_duel_shows_all(browser: "sync_api.Browser") -> None:
+    names = "demo", "demo-paper", "demo-no-compensation"
     with (
         served("duel", *names, "--virtual", "--page", "127.0.0.1:0") as address,
         opened(browser, address) as page,
     ):
-        until(lambda: min(flown_s(page, 0), flown_s(page, 1)) > 15, "both fly")
+        until(lambda: flown_s(page, 2) > 15, "all fly")
         for place, name in enumerate(names):
             assert status(page, place).startswith(name)
             assert page.locator(".u-legend").first.get_by_text(name, exact=True).count() == 1
+        (late_s, x_m), (_, y_m) = page.evaluate(RANGES)
+        assert abs(late_s) < 1.0, "the times are those of the newest data"
+        assert y_m == pytest.approx(x_m, rel=0.2)
         picture(page, PICTURES / "duel-dark-wide.png")

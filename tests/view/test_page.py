@@ -15,7 +15,7 @@ import viser
 
 from helpers import until
 from skytether.cli import page_process
-from skytether.cli.duel import DuelOptions, both, titles
+from skytether.cli.duel import DuelOptions, titles, together
 from skytether.shared.core.change import Answer, Running
 from skytether.shared.scenario import reading, registry, schema
 from skytether.shared.scenario.schema import Scenario
@@ -212,7 +212,10 @@ def test_a_player_shows_any_time_of_a_flight() -> None:
     player.plays = False
     second_ns = 1_000_000_000
     player.seek(0)
+    shown_ns = set()
+    flight.take = lambda *frame: shown_ns.add(player.at_ns) or PageFlight.take(flight, *frame)  # type: ignore[method-assign, func-returns-value]
     player.advance(6 * second_ns)
+    assert shown_ns == {0}, "a time is shown before its frames are"
     forwards = flight.state.vehicles[1].trail()
     player.seek(9 * second_ns)
     assert len(flight.state.vehicles[1].trail()) > len(forwards)
@@ -224,12 +227,15 @@ def test_a_player_shows_any_time_of_a_flight() -> None:
 
 
 def test_a_duel_is_on_the_same_network_and_seed() -> None:
-    one, other = both(DuelOptions("demo", "paper-no-compensation", duration=12.0, seed=7))
-    assert one.network == other.network
-    assert (one.seed, other.seed, one.duration, other.duration) == (7, 7, 12.0, 12.0)
-    assert other.control.scheme == "none"
-    assert titles("demo", "a/paper.toml") == ("demo", "paper")
-    assert len(set(titles("a/demo.toml", "demo"))) == 2
+    names = ("demo", "paper", "paper-no-compensation")
+    flights = together(DuelOptions(names, duration=12.0, seed=7))
+    assert {(each.seed, each.duration) for each in flights} == {(7, 12.0)}
+    assert all(each.network == flights[0].network for each in flights)
+    assert [each.control.scheme for each in flights] == ["trajectory", "predictive", "none"]
+    assert titles(["demo", "a/paper.toml"]) == ["demo", "paper"]
+    assert titles(["a/demo.toml", "paper", "demo"]) == ["demo 1", "paper", "demo 3"]
+    with pytest.raises(CommandError, match="two or more"):
+        together(DuelOptions(("demo",)))
 
 
 def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
@@ -247,6 +253,16 @@ def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
     assert isinstance(drawn[0], np.ndarray), "what has no gap goes as it is"
 
 
+def test_plots_of_positions_have_ranges_of_the_same_width() -> None:
+    nan = np.nan
+    wide, narrow = (
+        [np.array([nan, -2.0, 1.0]), np.array([2.0, nan, 0.0])],
+        [np.array([99.0, 100.0])],
+    )
+    assert plots.spans([wide, narrow]) == [(-2.0, 2.0), (97.5, 101.5)]
+    assert plots.spans([[np.array([nan])]]) == [(0.0, 0.0)]
+
+
 def test_a_plot_with_gaps_reaches_a_browser() -> None:
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
@@ -254,9 +270,7 @@ def test_a_plot_with_gaps_reaches_a_browser() -> None:
         shown = plots.Plots(server.gui, [""], [plot])
         nothing = np.empty(0)
         time_s, age_s = np.arange(3.0), np.array([1.0, np.nan, 3.0])
-        curves = Curves(
-            time_s, nothing, nothing, nothing, nothing, nothing, age_s=age_s, solve_ms=nothing
-        )
+        curves = Curves(time_s, nothing, nothing, nothing, nothing, age_s=age_s, solve_ms=nothing)
         shown.draw([plots.Look(State(), curves, 0)])
         sent = list(server._websock_server.get_message_buffer().message_from_id.values())[-1]
         data = sent.as_serializable_dict([])["updates"]["data"]

@@ -39,7 +39,7 @@ from skytether.figures.tables import to_csv
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.core.aboard import AutopilotText
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.feed import Figures, Opened, Rows, described, pack
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
@@ -142,6 +142,11 @@ def test_a_flight_comes_back_to_the_last_bit(recording: Path) -> None:
     assert back.frames == list(of_flight(SCENARIO, "demo", flown()))
     (attached,) = (each for each in records(recording.read_bytes()) if is_named(each, "summary"))
     assert json.loads(attached.data) == msgspec.to_builtins(back.summary)
+
+
+def test_a_network_that_nobody_could_fly_over_is_recorded(tmp_path: Path) -> None:
+    slow = msgspec.structs.replace(SCENARIO, network=NetworkConfig(uplink="constant(100)"))
+    assert read(record(tmp_path / "slow.mcap", slow, flown())).scenario == slow
 
 
 def test_frames_of_a_flight_are_in_the_order_of_their_times() -> None:
@@ -947,7 +952,9 @@ def test_a_process_that_begins_thousands_of_times_is_checked_once(
         found += [found[next(iter(frames_of(found, "Opened")))]] * 2000
 
     checked: list[str] = []
-    monkeypatch.setattr(recorded, "check", lambda _, source: checked.append(source) or SCENARIO)
+    monkeypatch.setattr(
+        recorded, "check", lambda _, source, **__: checked.append(source) or SCENARIO
+    )
     recorded._check_begun.cache_clear()
     back = read(changed(recording, tmp_path / "it.mcap", repeat))
     assert sum(isinstance(frame, Opened) for *_, frame in back.frames) == 2003

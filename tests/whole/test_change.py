@@ -12,7 +12,7 @@ import pytest
 from helpers import Idle, packaged
 from skytether.client.endpoint import Client
 from skytether.client.failsafe import TABLE
-from skytether.client.fleet import Fleet
+from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.vehicle import simulated
 from skytether.client.simulated.weather import Weather
@@ -144,7 +144,7 @@ def test_the_trajectory_s_file_is_not_read_again(
     file.unlink()
     probe(scenario)[1].change(FORGOTTEN, now_ns=5)
     check = reading.check
-    monkeypatch.setattr(reading, "check", lambda raw, known: check(raw))  # noqa: ARG005
+    monkeypatch.setattr(reading, "check", lambda raw, **_: check(raw))
     with pytest.raises(ConfigError, match="a file that can be read"):
         probe(scenario)[1].change(FORGOTTEN, now_ns=5)
 
@@ -179,7 +179,7 @@ def test_a_request_may_be_so_long_and_no_longer() -> None:
     assert longer.refused == "got more than 4096 B, expected a shorter request"
 
 
-@pytest.mark.parametrize("kind", [Server, Proxy, Client, Fleet])
+@pytest.mark.parametrize("kind", [Server, Proxy, Client, ClientFleet])
 def test_what_may_change_is_a_key_of_the_scenario(kind: type[Endpoint]) -> None:
     endpoint = make(kind)
     values = answer(Running(endpoint, DEMO), b"{}").values
@@ -194,7 +194,7 @@ def make(kind: type[Endpoint]) -> Endpoint:
     if kind is Proxy:
         return Proxy(DEMO, server=("server", 0))
     client = Client(DEMO, simulated(DEMO, 1), server=("netem", 0), vehicle=1, boot_id=1)
-    return Fleet([client]) if kind is Fleet else client
+    return ClientFleet([client]) if kind is ClientFleet else client
 
 
 # -- in flight -------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, FlowOpened, HostFound, HostMissing
+from skytether.shared.core.events import Event, FlowOpened, HostFound, HostMissing, Unreachable
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
@@ -141,6 +142,33 @@ async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
                 answer, _ = await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5)
     assert answer == b"still there?"
     assert driver.send_errors >= 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel tells of ICMP errors on Linux")
+@of_either_family
+async def test_packets_to_a_closed_port_are_not_forwarded_and_told_once(
+    loopback: Address, family: socket.AddressFamily
+) -> None:
+    with socket.socket(family, socket.SOCK_DGRAM) as gone:
+        gone.bind(loopback)
+        host, port = gone.getsockname()[:2]
+    scenario, events = reading.load("transparent"), list[Event]()
+    proxy = Proxy(scenario, server=(host, port))
+    driver = Shell(proxy, loopback, [(host, port)])
+    counts, loop = proxy.downlink.counts, asyncio.get_running_loop()
+    task = asyncio.create_task(driver.run(events.append))
+    with socket.socket(family, socket.SOCK_DGRAM) as client:
+        client.setblocking(False)
+        client.bind(loopback)
+        for size in (65_507, *range(19)):
+            await loop.sock_sendto(client, bytes(size), driver.address)
+        async with asyncio.timeout(10):
+            while counts.undelivered < 20:
+                await asyncio.sleep(0.01)
+    task.cancel()
+    assert (counts.packets, counts.forwarded, counts.undelivered) == (20, 0, 20)
+    told = [event for event in events if isinstance(event, Unreachable)]
+    assert told == [Unreachable(host=host, port=port, reason="Connection refused")]
 
 
 class Asker(Echo):

@@ -1,1 +1,1 @@
-"""Impairments of the network: what delays, loses and changes packets, one small class each."""
+"""Impairments of the network, which delay, lose or change packets: one small class each."""

@@ -1,8 +1,8 @@
-"""Laws of the delay. Delays of several in one direction add up.
+"""Impairments that delay packets by a random distribution. Several in one direction add up.
 
-Each is made of its quantile function: a uniform number becomes a delay. With `correlation_s` that
-number stays for a while (`Draws.lasting`), so that the autocorrelation of delays falls to 1/e in
-that time, and each is still distributed as the law says.
+A uniform random number becomes a delay by the distribution's quantile function. With
+`correlation_s` the random number is kept for a random time (`Draws.lasting`): the autocorrelation
+of the delays falls to 1/e in that time, and their distribution does not change.
 """
 
 from bisect import bisect_right
@@ -21,7 +21,8 @@ from skytether.shared.scenario.air.impairment import Impairment, Time, impairmen
 
 _NORMAL = NormalDist()
 _TAIL = 2.0**-54
-"""Half of the smallest step of a uniform number: nothing lies further out."""
+"""Smallest probability at which the normal quantile is evaluated: half the resolution of a uniform
+number."""
 
 
 class Delay(Impairment):
@@ -33,7 +34,11 @@ class Delay(Impairment):
         self._correlation_s = correlation_s
 
     def quantile_ns(self, share: float) -> int:
-        """Delay that a share of packets does not exceed [ns]."""
+        """Quantile of the delay [ns].
+
+        Args:
+            share: probability, from 0 to 1.
+        """
         raise NotImplementedError
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
@@ -88,7 +93,7 @@ class Paper(Delay):
 
 @impairment(name="uniform")
 class Uniform(Delay):
-    """Delays by a time from low_s to high_s, each as likely."""
+    """Delays by a uniformly distributed time from low_s to high_s."""
 
     def __init__(self, low_s: Time, high_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -104,7 +109,7 @@ class Uniform(Delay):
 
 @impairment(name="normal")
 class Normal(Delay):
-    """Delays by a normally distributed time, and not at all where that is negative."""
+    """Delays by a normally distributed time; negative values become 0."""
 
     def __init__(self, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -121,7 +126,7 @@ class Normal(Delay):
 
 @impairment(name="lognormal")
 class Lognormal(Delay):
-    """Delays by least_s and a lognormally distributed time; mean and deviation of the whole."""
+    """Delays by least_s plus a lognormal time; mean_s and sd_s are those of the total."""
 
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -139,7 +144,7 @@ class Lognormal(Delay):
 
 @impairment(name="gamma")
 class Gamma(Delay):
-    """Delays by least_s and a gamma-distributed time; mean and deviation of the whole."""
+    """Delays by least_s plus a gamma-distributed time; mean_s and sd_s are those of the total."""
 
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -160,11 +165,12 @@ class Gamma(Delay):
 
 
 def interpolated(at: float, places: Sequence[float], values: Sequence[float]) -> float:
-    """Value between those at places, on a straight line; the outermost beyond them.
+    """Linear interpolation; beyond the ends, the first or last value.
 
     Args:
-        places: rising.
-        values: as many.
+        at: place of the result.
+        places: rising places.
+        values: values at these places.
     """
     after = bisect_right(places, at)
     if after == 0 or after == len(places):
@@ -180,10 +186,10 @@ def _standard(share: float) -> float:
 
 
 def _over(least_s: float, mean_s: float) -> float:
-    """Mean delay beyond the least [s].
+    """Mean minus smallest delay [s].
 
     Raises:
-        ValueError: there is none.
+        ValueError: it is negative.
     """
     if mean_s < least_s:
         raise ValueError(f"mean_s to be at least least_s = {least_s:g}")
@@ -192,17 +198,17 @@ def _over(least_s: float, mean_s: float) -> float:
 
 @lru_cache(maxsize=64)
 def _poisson(mean: float) -> tuple[int, Sequence[float]]:
-    """Cumulative probabilities of a Poisson law, as far as they differ from 0 and from 1.
+    """Cumulative probabilities of a Poisson distribution, without those near 0 and near 1.
 
     Returns:
-        The number that the first of them is of, and the probabilities of no more than each number.
+        number that the first probability belongs to, and the probabilities P(N ≤ number), P(N ≤
+        number + 1), …
     """
-    if mean == 0.0:
-        # log(0) would fail, and no slot is added in any case.
+    if mean == 0.0:  # log(0) would fail
         return 0, (1.0,)
     wide = 10.0 * sqrt(mean) + 20.0
     numbers = range(max(0, floor(mean - wide)), floor(mean + wide))
-    # By logarithms: mean^m and m! overflow for large means. With m! in place of the printed m (E1).
+    # In logarithms, as mean^m and m! overflow for large means. The paper prints m for m! (E1).
     logs = [number * log(mean) - mean - lgamma(number + 1.0) for number in numbers]
     cumulative = np.cumsum(np.exp(logs))
     return numbers[0], (cumulative / cumulative[-1]).tolist()
@@ -210,10 +216,10 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
 
 @lru_cache(maxsize=64)
 def _gamma(shape: float) -> tuple[Sequence[float], Sequence[float]]:
-    """Cumulative probabilities of a gamma law of scale 1, and the values they belong to.
+    """Cumulative probabilities of a gamma distribution of scale 1, and the values they belong to.
 
-    The density is integrated over x^shape, on which it is bounded, however small the shape, and
-    for large shapes over x.
+    The density is integrated over x^shape if shape < 1, where it is unbounded in x, and over x
+    otherwise.
     """
     power = min(shape, 1.0)
     low = max(0.0, shape - 9.0 * sqrt(shape)) ** power

@@ -1,9 +1,9 @@
-"""Random numbers of packets, which follow from names and from where a packet enters, alone.
+"""Random numbers of packets, as functions of the seed and the packet's time.
 
 The fate of a packet depends on the seed, its direction, its flow and the slot of SLOT_NS in which
-it enters, counted from when the flow began, and on nothing that was sent before. So two controllers
-meet the same network, however often each of them sends. Packets that enter in one slot differ by
-their rank among them.
+it enters, counted from the start of the flow. It does not depend on earlier packets. So two
+controllers meet the same network, however often each of them sends. Packets of one flow in one slot
+are numbered by rank.
 """
 
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from struct import Struct
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 SLOT_NS = MILLISECOND_NS
-"""Length of a slot [ns]: shorter than any step, so that no two horizons and no two observations
+"""Length of a slot [ns]: shorter than any step, so that two horizons or two observations never
 share one."""
 SLOT_S = SLOT_NS / SECOND_NS
 _PLACE = Struct("<qq")
-"""Place of a draw: slot and rank, or cell and number."""
+"""Input of the hash: slot and rank, or cell and number."""
 _DRAWN = Struct("<QQ")
-"""Layout of what is drawn at one place."""
+"""Output of the hash: two random integers."""
 
 
 @dataclass(slots=True)
@@ -29,47 +29,53 @@ class Fate:
     """Fate of one packet; impairments write into it, one after the other."""
 
     slot: int = 0
-    """Slot in which it enters, counted from when its flow began."""
+    """Slot in which the packet enters, counted from the start of its flow."""
     rank: int = 0
-    """Number of the packets of its flow that have entered in that slot before it."""
+    """Number of packets of its flow that entered in the same slot before it."""
     delay_ns: int = 0
-    """Delay [ns], drawn for a lost packet, too."""
+    """Delay [ns], also drawn for a lost packet."""
     lost: bool = False
-    """Whether it is lost."""
+    """Whether the packet is lost."""
     copies: int = 0
-    """Number of copies that arrive beside it."""
+    """Number of extra copies that arrive."""
     flipped: float | None = None
-    """Place of a bit that is flipped, as a share of the packet's length below 1; None: of none."""
+    """Position of a flipped bit, as a fraction below 1 of the packet's length; None if no bit is
+    flipped."""
 
     @property
     def time_s(self) -> float:
-        """Time at which it enters, counted from when its flow began [s]."""
+        """Time at which the packet enters, counted from the start of its flow [s]."""
         return self.slot * SLOT_NS / SECOND_NS
 
 
 class Stream:
-    """Pairs of uniform numbers that follow from names and a place alone.
+    """Pairs of uniform random numbers, as a hash of names and a place.
 
     Args:
         names: seed, direction, flow and purpose.
     """
 
     def __init__(self, *names: str | int) -> None:
-        # A hash and no generator: the number of any place is found without drawing those before it.
+        # A hash and not a generator: any place can be drawn without drawing those before it.
         self._seeded = blake2b(repr(names).encode(), digest_size=_DRAWN.size)
         self._at, self._number, self._pair = -1, -1, (0.0, 0.0)
-        """Place and number of the pair that was drawn last, and the pair."""
+        """Arguments and result of the last call of `pair`."""
 
     def pair(self, place: int, number: int) -> tuple[float, float]:
-        """Two numbers below 1."""
+        """Two random numbers from 0 to below 1.
+
+        Args:
+            place: slot or cell.
+            number: rank or number within it.
+        """
         if place == self._at and number == self._number:
             return self._pair
-        # Copying the seeded state hashes the names once per stream and not once per packet.
+        # The copy saves hashing the names again for each packet.
         drawn = self._seeded.copy()
         drawn.update(_PLACE.pack(place, number))
         one, other = _DRAWN.unpack(drawn.digest())
         self._at, self._number = place, number
-        # 53 bits, as many as a float in [0, 1) has.
+        # 53 bits, the precision of a float.
         self._pair = pair = (one >> 11) * 2.0**-53, (other >> 11) * 2.0**-53
         return pair
 
@@ -78,33 +84,34 @@ class Draws:
     """Random numbers of one impairment for the packets of one flow in one direction.
 
     Args:
-        packets: a pair of numbers for each packet.
-        which: which number of the pair is this impairment's.
-        names: names of its other stream.
+        packets: stream with a pair of numbers for each packet, shared by two impairments.
+        which: index of this impairment's number in the pair, 0 or 1.
+        names: names of the stream for `lasting`.
     """
 
     def __init__(self, packets: Stream, which: int, names: tuple[str | int, ...]) -> None:
         self._pair, self._which, self._names = packets.pair, which, names
 
     @cached_property
-    def _moments(self) -> Stream:
+    def _events(self) -> Stream:
         return Stream(*self._names)
 
     def uniform(self, fate: Fate) -> float:
-        """Number below 1, another for each packet."""
+        """Random number below 1, independent for each packet."""
         return self._pair(fate.slot, fate.rank)[self._which]
 
     def lasting(self, fate: Fate, mean_s: float) -> float:
-        """Number below 1 that stays for a while, and is drawn anew at moments that come by chance.
+        """Random number below 1 that is redrawn at the events of a Poisson process.
 
-        Moments come at a constant rate, so that the number keeps its distribution and its
-        autocorrelation falls exponentially. It follows from the newest moment alone, and is found
-        from the time, however far that has jumped. There is one moment in a cell of `mean_s` in
-        the mean, and none in a share of 1/e of them.
+        Its distribution is uniform and its autocorrelation falls exponentially. It depends on the
+        newest event only, which is found by drawing the events of a cell of length `mean_s` after
+        the other, backwards from the packet's time. A cell has one event on average, and none with
+        probability 1/e.
 
         Args:
-            mean_s: mean time from one moment to the next [s]. Where it is no longer than a slot,
-                each packet has a number of its own.
+            fate: the packet.
+            mean_s: mean time between two events [s]. If it is not longer than a slot, each packet
+                has an independent number.
         """
         mean_ns = mean_s * SECOND_NS
         if mean_ns <= SLOT_NS:
@@ -112,15 +119,14 @@ class Draws:
         time = fate.slot * SLOT_NS / mean_ns
         cell = floor(time)
         while True:
-            moment, number, state = float(cell), 0, None
+            event, number, state = float(cell), 0, None
             while True:
-                gap, drawn = self._moments.pair(cell, number)
-                moment -= log1p(-gap)
-                if moment > time or moment > cell + 1.0:
+                gap, drawn = self._events.pair(cell, number)
+                event -= log1p(-gap)
+                if event > time or event > cell + 1.0:
                     break
                 state, number = drawn, number + 1
             if state is not None:
                 return state
-            # No moment in this cell before the time: the state is that of the newest moment of an
-            # earlier cell.
+            # No event in this cell before the packet: continue with the cell before.
             cell -= 1

@@ -1,4 +1,4 @@
-"""Impairments: their type, and the annotations of their arguments.
+"""Base class of impairments, and types of their arguments.
 
 @impairment
 class Fading(Impairment):
@@ -20,30 +20,33 @@ from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.registry import IMPAIRMENTS
 
 impairment = IMPAIRMENTS
-"""Decorator of an impairment: a class whose numbers a scenario writes."""
+"""Decorator of an impairment: a class whose arguments are written in the scenario."""
 
 Time = Annotated[float, Meta(ge=0, le=3600)]
-"""Time from nothing to an hour [s]."""
+"""Time from 0 to an hour [s]."""
 Share = Annotated[float, Meta(ge=0, le=1)]
 """Share from 0 to 1."""
 
 
 class Impairment:
-    """Base of the effects of a network on packets. None keeps anything from packet to packet."""
+    """Base class of an effect of the network on packets. It must not store anything between
+    packets.
+    """
 
     kind: Literal["delay", "loss", "other"] = "other"
-    """Delays and losses of a direction keep their random numbers when another is added."""
+    """Kind of effect. Adding an impairment of another kind does not change the random numbers of
+    delays and losses."""
     least_s: float = 0.0
-    """Smallest delay that it adds [s]."""
+    """Smallest delay that the impairment adds [s]."""
     mean_s: float = 0.0
-    """Mean delay that it adds [s]."""
+    """Mean delay that the impairment adds [s]."""
     loss: float = 0.0
-    """Mean share of the packets that it loses."""
+    """Mean share of packets that the impairment loses."""
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
         """Change the fate of a packet that enters.
 
         Args:
-            fate: what becomes of it, by the impairments before this one.
+            fate: fate of the packet after the impairments before this one.
             draws: random numbers of this impairment.
         """

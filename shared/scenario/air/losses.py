@@ -1,4 +1,4 @@
-"""Impairments that lose packets, and others that change or double them."""
+"""Impairments that lose, duplicate or corrupt packets."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ from skytether.shared.scenario.air.impairment import Impairment, Share, Time, im
 
 @impairment(name="none")
 class Nothing(Impairment):
-    """Passes every packet at once, as it came."""
+    """Passes every packet at once and unchanged."""
 
 
 @impairment(name="loss")
@@ -39,12 +39,13 @@ class GilbertElliott(Impairment):
     ) -> None:
         self._share, self._bad, self._good = share, loss_bad, loss_good
         self.loss = share * loss_bad + (1.0 - share) * loss_good
-        # A bad channel that is drawn anew stays bad with the share: so burst_s in the mean.
+        # A redrawn state is bad again with the probability `share`, so bursts last burst_s on
+        # average.
         self._cell_s = burst_s * (1.0 - share)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
         """See `Impairment`."""
-        if self._cell_s <= SLOT_S:  # each packet meets a state of its own
+        if self._cell_s <= SLOT_S:  # the state is independent for each packet
             fate.lost |= draws.uniform(fate) < self.loss
             return
         bad = draws.lasting(fate, self._cell_s) < self._share

@@ -1,8 +1,8 @@
-"""Direction of the network as a scenario writes it: `constant(0.05) & loss(0.1)`.
+"""Impairments of one direction of the network, from a text such as `constant(0.05) & loss(0.1)`.
 
-`shared.scenario.grammar` has the grammar. Every packet goes through the queue of `rate` or
-`deliveries` first, where there is one, and all else acts on it with the time at which it has
-entered: delays add up, and what one impairment loses is lost.
+Every packet first passes the queue of `rate` or `deliveries`, if there is one. Then the other
+impairments act on it, with random numbers of the time at which it entered: delays add up, and a
+packet lost by one is lost.
 """
 
 from functools import lru_cache
@@ -14,7 +14,7 @@ from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, Entry, Files
 
 TEXT_MAX = 1000
-"""Largest number of characters of a direction."""
+"""Largest number of characters of a direction's text."""
 PARTS_MAX = 16
 """Largest number of impairments of a direction."""
 
@@ -23,49 +23,49 @@ class Path:
     """Impairments of one direction.
 
     Args:
-        calls: its impairments.
-        files: those that they name.
+        calls: calls of the impairments.
+        files: files that they name.
 
     Raises:
-        GrammarError: an impairment cannot have these arguments, or there are two queues.
+        GrammarError: an impairment refuses its arguments, or there are two queues.
     """
 
     def __init__(self, calls: tuple[Call, ...] = (), files: Files = ()) -> None:
-        made = [_made(call, files) for call in calls]
+        impairments = [_make(call, files) for call in calls]
         self.impairments: tuple[tuple[str, Impairment], ...] = tuple(
             (call.name, each)
-            for call, each in zip(calls, made, strict=True)
+            for call, each in zip(calls, impairments, strict=True)
             if not isinstance(each, Ordered | Queued)
         )
         """Impairments that act on packets one by one, with their names."""
-        self.is_ordered = any(isinstance(each, Ordered) for each in made)
-        """Whether no packet of a flow overtakes another."""
-        finite = [each for each in made if isinstance(each, Queued)]
+        self.is_ordered = any(isinstance(each, Ordered) for each in impairments)
+        """Whether packets of a flow stay in order."""
+        finite = [each for each in impairments if isinstance(each, Queued)]
         if len(finite) > 1:
             raise GrammarError(
                 " & ".join(each.text for each in calls), "one rate or deliveries in a direction"
             )
         self.queue: Queued | None = finite[0] if finite else None
-        """Finite rate, with its queue."""
-        self.least_s = sum(each.least_s for each in made)
-        """Smallest delay, an empty queue's [s]."""
-        self.mean_s = sum(each.mean_s for each in made)
-        """Mean delay, an empty queue's [s]."""
+        """Finite rate with its queue, if there is one."""
+        self.least_s = sum(each.least_s for each in impairments)
+        """Smallest delay, with an empty queue [s]."""
+        self.mean_s = sum(each.mean_s for each in impairments)
+        """Mean delay, with an empty queue [s]."""
         self.loss = 0.0
-        for each in made:
+        for each in impairments:
             self.loss += each.loss * (1.0 - self.loss)
-        """Mean share of the packets that are lost, with a queue that loses none."""
+        """Mean share of packets that are lost, not counting the queue's losses."""
 
 
 def path(text: str, files: Files = ()) -> Path:
-    """The direction that a text describes; an empty one changes nothing.
+    """Parse the impairments of a direction; an empty text has none.
 
     Args:
-        text: impairments.
-        files: those that it names, with their contents.
+        text: impairments joined by &.
+        files: files that the text names, with their contents.
 
     Raises:
-        GrammarError: with the part of the text that is wrong.
+        GrammarError: a part of the text is invalid.
     """
     calls = tuple(IMPAIRMENTS.calls(text))
     if len(calls) > PARTS_MAX:
@@ -80,9 +80,9 @@ def _path(calls: tuple[Call, ...], files: Files, _: tuple[Entry, ...]) -> Path:
     return Path(calls, files)
 
 
-def _made(call: Call, files: Files) -> Impairment:
+def _make(call: Call, files: Files) -> Impairment:
     try:
-        made: Impairment = IMPAIRMENTS.made(call, files)
+        impairment: Impairment = IMPAIRMENTS.make(call, files)
     except ValueError as error:
         raise GrammarError(call.text, str(error)) from None
-    return made
+    return impairment

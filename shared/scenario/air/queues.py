@@ -1,4 +1,4 @@
-"""Impairments that depend on what else is sent: finite rates with their queues, and order."""
+"""Impairments that depend on other packets: finite rates with queues, and order."""
 
 from typing import Annotated, Literal
 
@@ -9,22 +9,22 @@ from skytether.shared.scenario.air.traces import DELIVERY_BYTES, deliveries_in
 from skytether.shared.scenario.registry import File
 
 QUEUE_BYTES = 64_000
-"""Room in a queue unless another is given [B]."""
+"""Default capacity of a queue [B]."""
 
 Bytes = Annotated[int, Meta(ge=1, le=67_108_864)]
 Drop = Literal["tail", "codel"]
 """Drop policy of a queue: tail drop, or CoDel, which keeps queues short (RFC 8289)."""
 Served = Literal["first", "fair"]
-"""Whose packet goes next: who came first, or each flow in turn by as many bytes."""
+"""Order of service: first in, first out; or fair: flows in turn, with equal shares of bytes."""
 
 
 @impairment(name="ordered")
 class Ordered(Impairment):
-    """Lets no packet overtake another of its flow: it waits for those before it."""
+    """Keeps packets of a flow in order: a packet waits for those before it."""
 
 
 class Queued(Impairment):
-    """Finite rate with a queue, through which packets of all flows go one after the other."""
+    """Finite rate with a queue that packets of all flows share."""
 
     def __init__(self, queue: int, drop: Drop, serve: Served) -> None:
         self.room_bytes = queue
@@ -39,7 +39,7 @@ class Queued(Impairment):
 
 @impairment(name="rate")
 class Rate(Queued):
-    """Lets so many bytes a second pass, IP and UDP headers included; others wait in a queue."""
+    """Limits the rate to bytes_per_s, IP and UDP headers included; other packets queue."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Rate(Queued):
 
 @impairment(name="deliveries")
 class Deliveries(Queued):
-    """Lets packets pass at the times in a file of mahimahi, over and over, from a queue."""
+    """Sends queued packets at the times in a mahimahi trace file, which is repeated."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Deliveries(Queued):
             self.times_s = deliveries_in(file)
         except ValueError as error:
             raise ValueError(f"a file of mahimahi ({error})") from None
-        """Times at which packets of DELIVERY_BYTES may go [s]; the last is also the period."""
+        """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period."""
 
     @property
     def bytes_per_s(self) -> float:

@@ -1,4 +1,4 @@
-"""`skytether adversary`: a search for what brings vehicles of a mission together."""
+"""`skytether adversary`: search for events that bring vehicles of a mission together."""
 
 import shlex
 from argparse import ArgumentParser
@@ -16,7 +16,7 @@ from skytether.lab.adversary import (
     Approach,
     Climb,
     Climbed,
-    Kind,
+    MoveKind,
     Moves,
     climb,
     dumps,
@@ -52,7 +52,7 @@ class Kept(msgspec.Struct, frozen=True):
 ATTACK_BYTES_MAX = 16_000_000
 """Largest size of a file of moves [B]."""
 OWN = ("with", "tries", "moves", "first", "workers", "out", "json")
-"""Options with a value that are about the search, and not about a flight."""
+"""Options with a value that concern the search, not a flight."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,13 @@ class AdversaryOptions:
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
     out: Path | None = None
-    """Folder that keeps the climbs of a search: after Ctrl-C, or with more tries, the same command
-    goes on there."""
+    """Folder for the results of the search: after Ctrl-C, or with more tries, the same command
+    continues there."""
     attack: Annotated[str | None, Argument(metavar="JSON|FILE")] = None
     """Moves to fly once: as printed by a search, or the file of its --json."""
     json: Path | None = None
-    """File for the moves that brought vehicles nearest, and for what was left of the distances
-    asked for in each flight."""
+    """File for the moves that brought vehicles nearest, and for the spare distance of each
+    flight."""
     plugin: command.Plugins = ()
     config: ScenarioFlags = Scenario()
 
@@ -88,15 +88,15 @@ class AdversaryOptions:
 def adversary(argv: Sequence[str]) -> None:
     """Search for delays, losses, restarts, goals and zones that bring vehicles together.
 
-    The adversary has the network of a mission in his hands: packets of each vehicle are delayed,
-    lost and copied as he likes, each way; if asked, server and clients die and begin anew, and
-    goals and zones change. The search climbs towards the flight in which two vehicles are nearest,
-    or a vehicle is nearest to a zone. If a distance that is asked for is not kept, the exit code is
-    1, and the fewest moves with which it is not are printed; --attack flies them again.
+    The adversary controls the network of a mission: it delays, loses and copies packets of each
+    vehicle, in each direction. If asked for, server and clients restart, and goals and zones
+    change. The search is a hill climb towards the flight in which two vehicles are nearest, or a
+    vehicle is nearest to a zone. If a required distance is violated, the exit code is 1, and the
+    shortest moves that violate it are printed; --attack flies them again.
     """
     options = command.parse(AdversaryOptions(), argv, "skytether adversary", adversary.__doc__)
-    if not isinstance(options.config.given_reference(), Mission):
-        said = f"{options.scenario}: got no mission, expected one, such as swap"
+    if not isinstance(options.config.unallocated_reference(), Mission):
+        said = f"{options.scenario}: expected a mission, such as swap"
         raise CommandError(said, command.CONFIGURATION)
     title = f"{options.scenario}, seed {options.config.seed}"
     if options.attack is not None:
@@ -174,16 +174,16 @@ def _moves(text: str) -> Moves:
         raise ConfigError(f"--attack: {text}: {error}") from None
 
 
-def _kinds(text: str) -> tuple[Kind, ...]:
+def _kinds(text: str) -> tuple[MoveKind, ...]:
     """Kinds that a text names.
 
     Raises:
         CommandError: it names something else.
     """
     try:
-        return tuple(map(Kind, dict.fromkeys(text.split(","))))
+        return tuple(map(MoveKind, dict.fromkeys(text.split(","))))
     except ValueError:
-        expected = f"expected some of {','.join(Kind)}"
+        expected = f"expected some of {','.join(MoveKind)}"
         raise CommandError(f"--with: got {text}, {expected}", command.CONFIGURATION) from None
 
 
@@ -194,10 +194,10 @@ def _finish(
     found: Approach,
     spares_m: Sequence[float],
 ) -> None:
-    """Write and print what was found.
+    """Write and print the result of the search.
 
     Raises:
-        CommandError: a distance was not kept.
+        CommandError: a required distance was violated.
     """
     if options.json is not None:
         command.write(options.json, msgspec.json.encode(Kept(found, spares_m)))
@@ -206,9 +206,9 @@ def _finish(
     rows: list[tuple[str, object]] = []
     if spares_m:
         rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
-        rows.append(("in which a distance was not kept", failed))
+        rows.append(("with a violated distance", failed))
     # With all digits: the same moves give the same distance.
-    rows.append(("least separation, asked for [m]", f"{apart.away_m!r}, {asked_m:g}"))
+    rows.append(("least separation, required [m]", f"{apart.away_m!r}, {asked_m:g}"))
     rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
     if clear.vehicles:
         rows.append(("least distance from a zone [m]", clear.distance_m))
@@ -221,7 +221,7 @@ def _finish(
             fewest = shrunk(options.config, found)
             again = shlex.join(["adversary", *_of_flight(argv), "--attack", dumps(fewest.moves)])
             print(f"fewest moves, {fewest.apart.distance_m!r} m:\n    skytether {again}")
-        raise CommandError("a distance that is asked for was not kept")
+        raise CommandError("a required distance was violated")
 
 
 def _of_flight(argv: Sequence[str]) -> list[str]:

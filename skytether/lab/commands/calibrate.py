@@ -13,7 +13,7 @@ import tyro
 
 from skytether.figures.page import as_text
 from skytether.lab import calibration
-from skytether.lab.calibration import HERE, Rmse, SearchLimits, Table1
+from skytether.lab.calibration import ONLY, Rmse, SearchLimits, Table1
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
@@ -39,8 +39,7 @@ class CalibrateOptions:
     """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
     xy."""
     packets: float = 0.1
-    """Largest share of steps that may send; with the objective rmse, and a trigger that looks at
-    the state."""
+    """Largest event ratio; with the objective rmse, and a trigger that uses the state."""
     effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""
@@ -118,7 +117,7 @@ def calibrate(argv: Sequence[str]) -> None:
 def _print_rmse(points: Sequence[SearchPoint]) -> None:
     """Print the best point of a search for the smallest error."""
     found = best(points)
-    here = found.values[HERE]
+    here = found.values[ONLY]
     rows = [
         ("score", f"{found.score:.4f}"),
         ("RMSE xy [m]", as_text(here["rmse_xy"], ".4f")),

@@ -10,11 +10,11 @@ import tyro
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
 from skytether.lab.budgets import Plan
-from skytether.lab.calibration import HERE, Rmse, SearchLimits
+from skytether.lab.calibration import ONLY, Rmse, SearchLimits
 from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, Found
+from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
 from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
 from skytether.lab.search import Search, best
 from skytether.shared.base import files
@@ -145,13 +145,13 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
             folder = options.out / "searches" / name
             *_, points = flyers.search(search, folder, scale.generations, f"{name}: ")
             point = best(points)
-            here = point.values[HERE]
+            here = point.values[ONLY]
             says = (
                 f"RMSE xy {as_text(here['rmse_xy'], '.4f')} m at "
                 f"{as_text(here['event_ratio'], '.1%')} of the steps, effort "
                 f"{as_text(here['effort_mps'], '.3f')} m/s"
             )
-            found.append(Found(contender, case, search.scenario(point), says))
+            found.append(TunedWeights(contender, case, search.scenario(point), says))
             print(f"{name}: {says}")
     files.write(options.out / WEIGHTS, contenders.to_file(found, scale).encode())
     print(f"{options.out / WEIGHTS}: weights of {len(found)} contenders in their cases")

@@ -15,7 +15,7 @@ from skytether.lab import figures
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
-from skytether.lab.journal import Journal
+from skytether.lab.journal import StudyJournal
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
@@ -73,7 +73,7 @@ def crowd(argv: Sequence[str]) -> None:
     command.claim_folder("--out", options.out, "crowd.csv", "crowd.png")
     early: Interrupted | None = None
     with writing(options.out):
-        with closing(Journal(options.out, plan.settings(), CrowdPoint)) as journal:
+        with closing(StudyJournal(options.out, plan.settings(), CrowdPoint)) as journal:
             points = {(each.scheme, each.vehicles): each for each in journal.results.values()}
         try:
             with crew(

@@ -136,7 +136,7 @@ def identify(argv: Sequence[str]) -> None:
     _tell(options, scenario, flown)
     if why := flown[0].flight.why:
         code = command.INTERRUPTED if why == "interrupted" else command.RUN
-        raise CommandError(f"ended early: {why}; what was measured is in {options.out}", code)
+        raise CommandError(f"ended early: {why}; the measurements are in {options.out}", code)
     _write_scenario(options, scenario, flown[0])
 
 
@@ -194,7 +194,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
         raise CommandError(f"--set-parameters: {kind}", 2)
     within = fenced(scenario, plan)
     if within is not scenario:
-        _say(f"no fence is given: it stays within {within.fence.radius_m:g} m of where it began")
+        _say(f"no fence: the vehicle stays within {within.fence.radius_m:g} m of its start")
     flight = Identifying(within, flies, Experiment(within, plan))
     terminal.prepare(kernel.missing() if "skytether.shared.base.kernel" in sys.modules else [])
     title = f"identifying {scenario.vehicle.kind}"
@@ -216,7 +216,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
 
 
 def _doing(flight: Identifying) -> str:
-    """Present activity of a flight, in words."""
+    """Present activity of the flight, in words."""
     if not flight.flown_s:
         return "on its way into the air"
     return f"{len(flight.experiment.steps)} steps" if not flight.is_over else "landing"
@@ -341,7 +341,9 @@ def _show_costs(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -
     for one, cost in zip(flown, costs, strict=True):
         of = ", ".join(f"{axis.speed:g}" for axis in one.axes)
         rows.append((of, *(f"{each:.1%}" for each in cost.values())))
-    title = "What a wrong size costs, as the largest difference from steps of the first row's:"
+    title = (
+        "Error of models identified at other sizes: largest difference from the first row's steps"
+    )
     tables.show(title, ("model of [m/s]", *costs[0]), rows)
 
 
@@ -362,5 +364,5 @@ def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlo
     try:
         reading.load(str(file))
     except ConfigError as error:
-        raise CommandError(f"what was identified cannot be flown as it is: {error}") from None
+        raise CommandError(f"the identified model cannot be flown: {error}") from None
     print(f"The scenario is {file}, the picture {options.out / PICTURE}.")

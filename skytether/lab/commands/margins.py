@@ -16,7 +16,7 @@ from skytether.lab import margins as lab
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
 from skytether.lab.maps import Box, MapPoint
-from skytether.lab.margins import Limit, Margin
+from skytether.lab.margins import Margin, MarginLimit
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -67,12 +67,12 @@ def margins(argv: Sequence[str]) -> None:
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
     other rows the vehicle differs as stated. The second table has limits, found by bisection: how
     far one quantity may differ, relative to the model, before the loop is no longer stable. With a
-    trigger that looks at the state, pushes are flown with a periodic one that sends as often,
-    because a weak push stays below every threshold.
+    trigger that uses the state, pushes are flown with a periodic one at the same mean rate, because
+    a weak push stays below every threshold.
 
     With --maps FOLDER every vehicle of a box is flown as well, without wind: FOLDER/points.csv has
     a row for each, FOLDER/maps.png shows where the flight ends in a limit cycle, and the RMSE. The
-    box of 72 vehicles takes some minutes; --tau, --gain, --dead-time and --burst set another.
+    box of 72 vehicles takes some minutes; --tau, --gain, --dead-time and --burst change it.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)
     command.check_count("--runs", options.runs, 1000)
@@ -92,17 +92,17 @@ def margins(argv: Sequence[str]) -> None:
         ) as flyers:
             (trigger,) = flyers.map(lab.clocked_trigger, [scenario])
             flyers.advance(1)
-            parts: list[Callable[[], Margin | Limit]] = [
+            parts: list[Callable[[], Margin | MarginLimit]] = [
                 partial(lab.margin, each, name, trigger, options.runs)
                 for name, each in vehicles.items()
             ]
             runs = min(options.runs, lab.LIMIT_RUNS)
             parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
             results = flyers.study(_fly, dict(enumerate(parts))).values()
-    except Interrupted as interrupted:  # nothing is kept of what was flown
+    except Interrupted as interrupted:  # results are not stored
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
     flown = [each for each in results if isinstance(each, Margin)]
-    limits = [each for each in results if isinstance(each, Limit)]
+    limits = [each for each in results if isinstance(each, MarginLimit)]
     if options.json is not None:
         about = {"scenario": options.scenario, "trigger": trigger}
         content = msgspec.json.encode(about | {"margins": flown, "limits": limits})
@@ -113,7 +113,7 @@ def margins(argv: Sequence[str]) -> None:
         _map(options, options.maps, trigger)
 
 
-def _fly(part: Callable[[], Margin | Limit]) -> Margin | Limit:
+def _fly(part: Callable[[], Margin | MarginLimit]) -> Margin | MarginLimit:
     """Result of a part; called in a worker."""
     return part()
 
@@ -189,8 +189,8 @@ def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> Non
         title += f", noise {noises[0]:g} m and {noises[1]:g} m/s"
     if trigger != scenario.control.trigger:
         print(
-            f"control.trigger: {scenario.control.trigger!r} looks at the state; pushes are flown "
-            f"with {trigger!r}, which sends as often"
+            f"control.trigger: {scenario.control.trigger!r} uses the state; pushes are flown with "
+            f"{trigger!r}, at the same mean rate"
         )
     rms_headings = [f"RMS {axis} [m]" for axis in "xyz"[: scenario.model.axes]]
     rows = []
@@ -215,7 +215,7 @@ def _with_interval(value: float | None, half: float | None) -> str:
     return f"{value:.4f}" + ("" if half is None else f" ± {half:.4f}")
 
 
-def _show_limits(limits: Sequence[Limit]) -> None:
+def _show_limits(limits: Sequence[MarginLimit]) -> None:
     """Print a row for each limit."""
     rows = []
     for each in limits:

@@ -1,9 +1,9 @@
-"""Core of every study: cells are flown in workers, and their results kept in a journal.
+"""Core of every study: workers fly its cells, and a journal stores the results.
 
-A study is data and one judge: cells, and a function that flies and judges one (`Crew.study`). What
-is kept is not flown again, Ctrl-C ends in order, and a bar shows how far it is. A sweep is a study
+A study is a list of cells and a function that flies and evaluates one (`Crew.study`). Stored
+results are not flown again, Ctrl-C stops cleanly, and a bar shows the progress. A sweep is a study
 of its tasks, a search one of its points, generation by generation. The workers are processes of
-this machine, or a Dask cluster.
+this machine, or of a Dask cluster.
 """
 
 import multiprocessing
@@ -32,7 +32,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 import skytether.lab.sweep
-from skytether.lab.journal import Journal, name_of
+from skytether.lab.journal import StudyJournal, name_of
 from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.shared.base import kernel
@@ -67,7 +67,7 @@ class Flags:
         command.Plugins,
         tyro.conf.arg(
             metavar="FILE",
-            help="Python file with triggers or references of one's own; may come several times.",
+            help="Python file with own triggers or references; may be repeated.",
         ),
         tyro.conf.UseAppendAction,  # `read` tells tyro of the outermost record's annotations alone
     ] = ()
@@ -136,20 +136,20 @@ class Crew:
         """Results of all cells of a study, in order, after flying the missing ones.
 
         Args:
-            fly: flies a cell, and judges the flight; called in a worker.
-            cells: what is flown, each with the key of its result in the journal.
-            kind: type of a result; needed with a folder alone.
-            settings: all that the results follow from, but for the cells.
-            out: folder of the journal; None: nothing is kept.
-            size: amount of work that a cell is, in the unit.
-            tell: text of the bar, from all results so far.
+            fly: flies a cell, and evaluates the flight; called in a worker.
+            cells: the cells, by the key of the result in the journal.
+            kind: type of a result; only needed with a folder.
+            settings: all settings that determine the results, besides the cells.
+            out: folder of the journal; None: results are not stored.
+            size: amount of work of a cell, in the unit of the bar.
+            tell: returns the text of the bar, from all results so far.
 
         Raises:
             CommandError: interrupted (with the results so far), or a worker has died.
             ConfigError: the folder has the results of other settings.
             OSError: the folder cannot be written.
         """
-        with closing(Journal(out, settings, kind)) as journal:
+        with closing(StudyJournal(out, settings, kind)) as journal:
             names = {key: name_of(key) for key in cells}
             results = {
                 k: journal.results[name] for k, name in names.items() if name in journal.results
@@ -174,7 +174,7 @@ class Crew:
         return {key: results[key] for key in cells}
 
     def map(self, fly: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """Results of a function for all items, in order, which count as no work."""
+        """Results of a function for all items, in order; the progress bar does not count them."""
         return list(self.study(fly, dict(enumerate(items)), size=lambda _: 0.0).values())
 
     def sweep(self, plan: Sweep, out: Path, text: str = "") -> Results:
@@ -278,7 +278,7 @@ def study(
 
     Args:
         cells: what is flown, each its own key; the same folder may be given more later.
-        title, unit: for the bar.
+        title, unit: title and unit of the bar.
 
     Raises:
         CommandError: interrupted, a worker has died, or the folder cannot be written.
@@ -290,7 +290,7 @@ def study(
 
 @contextmanager
 def writing(out: Path | None) -> Iterator[None]:
-    """Turn an OSError within the block into one line that names the file or folder.
+    """Within the block, replace an OSError by a one-line message with the file or folder.
 
     Raises:
         CommandError: the block raised an OSError.
@@ -303,7 +303,7 @@ def writing(out: Path | None) -> Iterator[None]:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Start workers with SIGINT ignored: Ctrl-C is for the command alone."""
+    """Start workers with SIGINT ignored, so that Ctrl-C reaches only the command."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

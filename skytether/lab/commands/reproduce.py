@@ -16,7 +16,7 @@ from skytether.lab import report, studies
 from skytether.lab.commands import delays, report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.journal import Journal
+from skytether.lab.journal import StudyJournal
 from skytether.lab.plates import Samples
 from skytether.lab.report import Reproduction
 from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
@@ -85,7 +85,7 @@ def _measure(
     total += maps.flights + periods.flights
     sweeps = options.out / "sweeps"
     # A folder of another reproduction is refused before anything is flown.
-    Journal(sweeps / table.name, table.first().settings(), Runs).close()
+    StudyJournal(sweeps / table.name, table.first().settings(), Runs).close()
     terminal.prepare(kernel.missing())
     # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)

@@ -5,6 +5,7 @@ Each browser has a panel of its own; one that may only look gets no controls.
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from skytether.shared.scenario.mission import given, written
+from skytether.shared.scenario.mission import format_goals, parse_goals
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.controls import (
@@ -56,6 +57,13 @@ NARROW = 800
 """Window width up to which panels lie over the scene, not beside it [pixels]."""
 MOVED_M = 0.05
 """Distance of the target from its handle above which the handle follows [m]."""
+LIGHT = "Light page"
+AS_PREFERRED = f"""<img hidden src="data:," onerror="
+const label = [...document.querySelectorAll('label')].find(each => each.textContent === '{LIGHT}');
+const prefers = matchMedia('(prefers-color-scheme: light)').matches;
+if (prefers && !label.control.checked) label.control.click();
+">"""
+"""HTML that makes the page light in a browser that prefers it; only the browser knows."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
@@ -88,11 +96,28 @@ class Panel:
         gui = client.gui
         self._dress(light=False)
         gui.set_panel_label("Skytether")
-        if client.camera.image_width > NARROW:
+        # On a narrow window another panel would lie closed below everything in this one.
+        tabs = gui.add_tab_group() if client.camera.image_width <= NARROW else None
+        if tabs is None:
             gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
+        self._scene = scene
+        self._aimed = scene.camera(WIDE)[0]
+        """Position at which the panel has put the camera."""
+        with tabs.add_tab("Now") if tabs else nullcontext():
+            self._add_words(more if may_play else None, may_play=may_play)
+        self._plots: list[Plots] = []
+        self._add_plots(tabs or gui.add_panel())
+
+    def _add_words(self, more: More | None, *, may_play: bool) -> None:
+        """Add what is said of the flights, and the controls."""
+        gui, flights = self._client.gui, self._flights
         self._status = [gui.add_html("") for _ in flights]
-        self._more = more(gui) if more and may_play else None
+        flying = [each for each in flights if each.state.flies]
+        if flying:
+            zoned = any(each.state.has_zones for each in flying)
+            gui.add_html(words.legend([each.title for each in flying], has_zones=zoned))
+        self._more = more(gui) if more else None
         numbers = sorted({number for each in flights for number in each.state.vehicles} or {1})
         self._vehicle = gui.add_dropdown(
             "Vehicle", tuple(map(str, numbers)), visible=len(numbers) > 1
@@ -102,11 +127,16 @@ class Panel:
             self._let_look()
         elif any(each.operator for each in flights):
             self._let_play()
-        light = gui.add_checkbox("Light page", initial_value=False)
+        light = gui.add_checkbox(LIGHT, initial_value=False)
+        gui.add_html(AS_PREFERRED)
 
         # viser's own grid takes a computer without a GPU 1 s to draw, lines nearly nothing.
-        ground = client.scene.add_line_segments(
-            "/ground", scene.ground, GROUND_RGB[False], thickness=1.0, thickness_units="screen"
+        ground = self._client.scene.add_line_segments(
+            "/ground",
+            self._scene.ground,
+            GROUND_RGB[False],
+            thickness=1.0,
+            thickness_units="screen",
         )
 
         @light.on_update
@@ -114,12 +144,13 @@ class Panel:
             self._dress(light=light.value)
             ground.colors = np.array(GROUND_RGB[light.value], np.uint8)
 
+    def _add_plots(self, panel: viser.GuiTabGroupHandle | viser.PanelHandle) -> None:
+        """Add plots and events, in tabs."""
+        gui, flights = self._client.gui, self._flights
         titles = [each.title for each in flights]
         scenarios = [each.state.scenario for each in flights]
         axes = max(each.model.axes for each in scenarios)
         solves = any(not each.control.properties.splines for each in scenarios)
-        panel = gui.add_panel()
-        self._plots = []
         flies = any(each.state.flies for each in flights)
         self._nobody = None if flies else VehicleTrack(0, scenarios[0])
         """Placeholder for a vehicle where only netem is known."""
@@ -133,12 +164,9 @@ class Panel:
             self._plots.append(Plots(gui, titles, of_air))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
-        if client.camera.image_width > NARROW:
+        if isinstance(panel, viser.PanelHandle):
             panel.dock_left()
-        panel.set_width(400 if flies else WIDE_PLOTS)
-        self._scene = scene
-        self._aimed = scene.camera(WIDE)[0]
-        """Position at which the panel has put the camera."""
+            panel.set_width(400 if flies else WIDE_PLOTS)
 
     def _dress(self, *, light: bool) -> None:
         self._client.gui.configure_theme(
@@ -430,8 +458,8 @@ class Controls:
             slider.show(values)
         self._cut.disabled = flight.is_cut or "netem" not in flight.values
         self._heal.disabled = not flight.is_cut
-        self._answer.content = "".join(
-            words.answer(flight.answer, refused=flight.refused) for flight in self._flights
+        self._answer.content = words.answers(
+            [(each.answer, each.refused) for each in self._flights]
         )
 
     def _show_flight(self, flight: PageFlight) -> None:
@@ -510,9 +538,9 @@ class _Mission:
     def _guide(self, place: NDArray[Any]) -> None:
         """Send the chosen vehicle to a place [m; shape (axes,) at least]."""
         values = self._flight.values.get("server", {})
-        goals = given(values.get(GUIDED, ""), self._axes)
+        goals = parse_goals(values.get(GUIDED, ""), self._axes)
         goals[self._vehicle()] = np.round(place[: self._axes], 2)
-        self._ask({GUIDED: written(goals)})
+        self._ask({GUIDED: format_goals(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
         """Take a corner of a box; the second corner completes it."""

@@ -92,11 +92,11 @@ class Player:
             self._go(min(self._at_ns + passed_ns, self.end_ns))
 
     def _go(self, at_ns: int) -> None:
-        self._at_ns = at_ns
         until = bisect_right(self._times_ns, at_ns)
         for _, place, process, frame in self._frames[self._next : until]:
             self._flights[place].take(process, frame)
         self._next = max(self._next, until)
+        self._at_ns = at_ns  # last: pages may be drawn meanwhile, and would call the link cut
 
     def _work(self) -> None:
         before_s = time.monotonic()

@@ -36,13 +36,13 @@ class Beacon(SplineScheme):
             self._state[row] = observation.state
         return newer
 
-    def foresee(self, rows: Indices, step: Indices, found: Foresight) -> None:  # noqa: ARG002
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
         """See `Scheme`: what was observed, as it is."""
-        found.estimate[:] = found.start[:] = self._state[rows]
+        foresight.estimate[:] = foresight.start[:] = self._state[rows]
 
-    def plan(self, rows: Indices, step: Indices, found: Foresight) -> None:
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`: a spline of one knot."""
-        now = self._desired.states(rows, step, found.ahead)[:, :, 0]
-        found.told.knots[:, :, :2] = now
+        now = self._desired.states(rows, step, foresight.ahead)[:, :, 0]
+        foresight.splines.knots[:, :, :2] = now
         away = np.linalg.norm(now[:, :, 0] - self._state[rows, :, 0], axis=1)
         self.figures["deviation_m"][: len(rows)] = away

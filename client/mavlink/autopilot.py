@@ -1,0 +1,278 @@
+"""The autopilot from its first heartbeat to a vehicle that can be flown: set-up, clock, launch.
+
+    heartbeat → flavour → parameters, streams and clock → ready → launch
+
+What the autopilot says goes to the part that it is for; what the parts ask for is sent by `port`.
+"""
+
+from typing import NamedTuple
+
+from skytether.client.mavlink.clock import BootClock
+from skytether.client.mavlink.condition import Condition
+from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
+from skytether.client.mavlink.launch import (
+    ACCEPTED,
+    IN_PROGRESS,
+    QUIET_NS,
+    RESULTS,
+    Launch,
+    Phase,
+)
+from skytether.client.mavlink.positions import Positions, given_origin, take_off_place
+from skytether.client.mavlink.safety import returns_below_m
+from skytether.client.mavlink.setup import Setup
+from skytether.client.mavlink.streams import SET_INTERVAL, Streams, rates
+from skytether.client.mavlink.texts import LoggedTexts
+from skytether.client.mavlink.timesync import Timesync
+from skytether.client.navigation import Leaps
+from skytether.client.vehicle import VehicleMemory
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.core.aboard import (
+    AboardFailure,
+    AutopilotMode,
+    AutopilotRefused,
+    NotTakenOff,
+)
+from skytether.shared.core.endpoint import Events
+from skytether.shared.scenario.schema import Scenario
+
+WARNING = int(dialect.MAV_SEVERITY_WARNING)
+
+
+class Parts(NamedTuple):
+    """What begins once it is known which autopilot it is."""
+
+    setup: Setup
+    launch: Launch
+    streams: Streams
+
+
+class Autopilot:
+    """One autopilot, as far as it has been heard.
+
+    Args:
+        scenario: scenario, with its keys of `mavlink`.
+        vehicle: number of the vehicle, for events.
+        altitude: take-off altitude [m].
+        events: list to which events are appended.
+    """
+
+    parts: Parts | None = None
+    """None until an autopilot is heard that can be flown."""
+    _unfit: NotTakenOff | None = None
+    """Event that an unsuitable or silent vehicle is not flown."""
+    _set_up_ns: int | None = None
+    """Time at which everything but the clock was ready."""
+    _began_ns: int | None = None
+
+    def __init__(self, scenario: Scenario, vehicle: int, altitude: float, events: Events) -> None:
+        self._scenario, self._vehicle, self._altitude = scenario, vehicle, altitude
+        self._patience_ns = seconds_to_ns(scenario.mavlink.patience_s)
+        self._events = events
+        self.clock = BootClock()
+        self.timesync = Timesync(self.clock, vehicle, events)
+        self.condition = Condition(scenario.mavlink.battery_min, scenario.mavlink.battery_min_v)
+        self.positions = Positions(
+            scenario.model.axes,
+            self.clock,
+            start=take_off_place(scenario, vehicle),
+            origin=given_origin(scenario),
+            leaps=Leaps(scenario),
+        )
+        """Measurements."""
+        self._texts = LoggedTexts(vehicle, events)
+        self.sets_parameters = False
+        """Whether unsafe parameters are changed."""
+        self.flavour: Flavour = ARDUPILOT
+        """Which autopilot it is, once `parts` are there."""
+        self._target = (0, 0)
+        """Numbers of its system and component."""
+        self._streams_refused = 0
+        """Number of refused requests for a stream."""
+        self._was_armed = False
+        """Whether a run of the client has armed it since an operator last allowed arming."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the autopilot is connected and configured safely."""
+        return self.parts is not None and self.parts.setup.is_done and self.clock.is_known
+
+    @property
+    def waits_for(self) -> str:
+        """What is missing before the vehicle can be flown, in words; empty if nothing is."""
+        if self.parts is None:
+            return f"a heartbeat of its autopilot at {self._scenario.vehicle.address}"
+        setup, launch, _ = self.parts
+        if not setup.is_done:
+            return setup.waits_for
+        return launch.waits_for if self.clock.is_known else self.timesync.fault
+
+    @property
+    def failure(self) -> AboardFailure | None:
+        """Event that makes the vehicle unusable."""
+        if self._unfit or self.parts is None:
+            return self._unfit
+        return self.parts.setup.failure or self.parts.launch.failure
+
+    def is_quiet(self, *, now_ns: int) -> bool:
+        """Whether the autopilot has been silent for a while."""
+        since_ns = self.condition.heard_ns or self._began_ns or now_ns
+        return now_ns - since_ns > QUIET_NS
+
+    def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
+        """Continue the take-off, see `Launch`."""
+        # If an earlier run has flown it since this boot, its parameters were safe.
+        may_fly = self.is_ready or self.positions.is_recalled
+        if self.parts is None or not may_fly or self.failure:
+            return False
+        return self.parts.launch.take_off(may_arm=may_arm and self.is_ready, now_ns=now_ns)
+
+    @property
+    def took_off(self) -> bool:
+        """Whether this run of the client has armed the autopilot."""
+        return self.parts is not None and self.parts.launch.took_off
+
+    def arm(self) -> None:
+        """Allow arming, as an operator said."""
+        if self.parts is None:
+            self._was_armed = False
+            return
+        launch = self.parts.launch
+        launch.arm()
+        self._was_armed = self._was_armed and bool(launch.why_not_armed)
+
+    def recall(self, saved: VehicleMemory) -> None:
+        """Restore state saved by an earlier run of the client."""
+        self._was_armed = saved.armed
+        self.positions.recall(saved)
+
+    @property
+    def frame(self) -> VehicleMemory:
+        """State that the next run of the client needs."""
+        return self.positions.frame(armed=self._was_armed or self.took_off)
+
+    def meet(self, heartbeat: Message, target: tuple[int, int]) -> None:
+        """Begin with the autopilot that sent a heartbeat, if it can be flown.
+
+        Args:
+            heartbeat: its first heartbeat.
+            target: numbers of its system and component.
+        """
+        if why := unfit(heartbeat):
+            self._fail("not flown", why)
+            return
+        self._target, self.flavour = target, FLAVOURS[heartbeat.autopilot]
+        self._set_up()
+
+    def restart(self) -> None:
+        """Check the parameters of a restarted autopilot again, unless it flies."""
+        if self.parts is not None and self.parts.launch.phase is Phase.GROUND:
+            self._set_up()
+
+    def _set_up(self) -> None:
+        """Start to check the parameters, and to request streams."""
+        keys, flavour = self._scenario.mavlink, self.flavour
+        self._set_up_ns = None
+        setup = Setup(
+            self._vehicle,
+            flavour,
+            self._target,
+            keys.system,
+            sets=self.sets_parameters,
+            returns_below_m=returns_below_m(self._scenario),
+            events=self._events,
+        )
+        launch = Launch(
+            self._vehicle,
+            flavour,
+            self._target,
+            altitude=self._altitude,
+            patience_ns=self._patience_ns,
+            from_takeoff=keys.origin == "takeoff",
+            condition=self.condition,
+            positions=self.positions,
+            events=self._events,
+        )
+        if self._was_armed:
+            launch.why_not_armed = "an earlier run of its client has armed it"
+        streams = Streams(rates(flavour, keys.positions_hz), self._target)
+        self.parts = Parts(setup, launch, streams)
+
+    def hear(self, message: Message, *, now_ns: int) -> None:
+        """Process a message of the autopilot; ignored from one that cannot be flown."""
+        if self.parts is None:
+            return
+        condition, (setup, launch, streams) = self.condition, self.parts
+        streams.hear(message.get_msgId())
+        before = condition.mode, condition.armed
+        condition.hear(message, now_ns=now_ns)
+        if (condition.mode, condition.armed) != before:
+            mode = self.flavour.mode_name(condition.mode)
+            self._events.append(
+                AutopilotMode(vehicle=self._vehicle, mode=mode, armed=condition.armed)
+            )
+        match message.get_type():
+            case "LOCAL_POSITION_NED":
+                self.positions.hear(message, now_ns=now_ns)
+            case "TIMESYNC":
+                if self.timesync.hear(message, now_ns=now_ns):
+                    self.restart()
+            case "STATUSTEXT":
+                text = self._texts.hear(message, now_ns=now_ns)
+                if text and message.severity <= WARNING:
+                    launch.hear_text(text)
+            case "COMMAND_ACK" if message.command == SET_INTERVAL:
+                self._hear_interval(message.result, streams.newest)
+            case "COMMAND_ACK":
+                launch.hear(message)
+            case _:
+                setup.hear(message)
+
+    def _hear_interval(self, result: int, stream: str) -> None:
+        """Count a refused stream, and report the first."""
+        if result in (ACCEPTED, IN_PROGRESS):
+            return
+        if not self._streams_refused:
+            asked = f"send {stream} at its rate"
+            answer = RESULTS.get(result, f"result {result}")
+            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+        self._streams_refused += 1
+
+    def ask(self, *, now_ns: int) -> list[Message]:
+        """Questions and commands that are due now."""
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        self._texts.tick(now_ns=now_ns)
+        if self.parts is None:
+            if now_ns - self._began_ns > self._patience_ns and not self._unfit:
+                why = "no heartbeat of an autopilot has come, see vehicle.address"
+                self._give_up("not heard", why)
+            return []
+        setup, launch, streams = self.parts
+        self._await_clock(setup, now_ns)
+        is_heard = self.condition.is_fresh(now_ns=now_ns)
+        return [
+            *self.timesync.ask(is_heard=is_heard, now_ns=now_ns),
+            *setup.ask(now_ns=now_ns),
+            *streams.ask(now_ns=now_ns),
+            *launch.ask(now_ns=now_ns),
+        ]
+
+    def _await_clock(self, setup: Setup, now_ns: int) -> None:
+        """Give up if everything but the clock has been ready for too long."""
+        if not setup.is_done or self.clock.is_known or self._unfit:
+            self._set_up_ns = None
+        elif self._set_up_ns is None:
+            self._set_up_ns = now_ns
+        elif now_ns - self._set_up_ns > self._patience_ns:
+            self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
+
+    def _give_up(self, doing: str, why: str) -> None:
+        """Fail because something did not arrive in time."""
+        self._fail(f"{doing} in {self._scenario.mavlink.patience_s:g} s", why)
+
+    def _fail(self, doing: str, why: str) -> None:
+        self._unfit = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
+        self._events.append(self._unfit)

@@ -1,0 +1,163 @@
+"""Connection to the autopilot: its address, its numbers, and whose messages a datagram brings.
+
+The first heartbeat of an autopilot decides whom we talk to. An autopilot that falls silent and is
+heard at another address has restarted: on a UDP line it is followed there if it stands disarmed.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from skytether.mavlink.codec import Codec, Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.core.aboard import AutopilotElsewhere, AutopilotMoved
+from skytether.shared.core.endpoint import Address, Datagram, Events
+from skytether.shared.core.events import address_text
+from skytether.shared.core.line import Line
+from skytether.shared.scenario.schema import Scenario
+
+ADDRESSES_REPORTED = 4
+"""Number of foreign addresses reported while the autopilot is silent."""
+AUTOPILOT_COMPONENT = int(dialect.MAV_COMP_ID_AUTOPILOT1)
+
+
+class Arrivals(NamedTuple):
+    """Messages of one datagram, by sender."""
+
+    heard: Sequence[Message] = ()
+    """The autopilot's, for us or for all."""
+    others: Sequence[Message] = ()
+    """Those of others than the autopilot and us, once the autopilot is known."""
+    met: Message | None = None
+    """Heartbeat by which the autopilot has just become known."""
+    moved: bool = False
+    """Whether the autopilot has restarted at a new address."""
+
+
+class Connection:
+    """Connection to one autopilot.
+
+    Args:
+        scenario: scenario, with its keys of `mavlink`.
+        vehicle: number of the vehicle, for events.
+        line: address of the autopilot.
+        events: list to which events are appended.
+    """
+
+    def __init__(self, scenario: Scenario, vehicle: int, line: Line, events: Events) -> None:
+        self._keys = keys = scenario.mavlink
+        self._vehicle, self._events = vehicle, events
+        self.line = scenario.vehicle.address
+        """Address of the autopilot, as given."""
+        self._may_move = line.kind == "udp"
+        self.peer: Address | None = line.peer
+        """Address of the autopilot; None while unknown."""
+        self.target: tuple[int, int] | None = None
+        """Numbers of the autopilot's system and component; None until it is heard."""
+        self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
+        self.counts: Counter[str] = Counter()
+        """Number of messages `heard`, `foreign` and `for_others`, and of datagrams from
+        `elsewhere`."""
+        self._elsewhere: list[Address] = []
+        """Other addresses from which something arrived while the autopilot was silent."""
+
+    def receive(self, datagram: Datagram, *, is_quiet: bool, armed: bool) -> Arrivals:
+        """Sort the messages of a datagram.
+
+        Args:
+            datagram: the datagram.
+            is_quiet: whether the autopilot has been silent for a while.
+            armed: whether it was armed when last heard.
+        """
+        if self.peer is not None and datagram.peer != self.peer:
+            self.counts["elsewhere"] += 1
+            return self._hear_elsewhere(datagram, armed) if is_quiet else Arrivals()
+        messages = self.codec.decode(datagram.payload)
+        arrivals = self._sorted(messages, datagram.peer)
+        if self.target is None and is_quiet and self._may_move:
+            self._report_elsewhere(datagram.peer, messages)
+        return arrivals
+
+    def _sorted(self, messages: Sequence[Message], peer: Address) -> Arrivals:
+        """Messages by sender; the autopilot is adopted by its first heartbeat."""
+        heard, others, met = [], [], None
+        for message in messages:
+            sender = _sender(message)
+            if self.target is None and self._is_autopilot(message):
+                self.target, self.peer, met = sender, peer, message
+            if sender != self.target:
+                self.counts["foreign"] += 1
+                if self.target is not None and sender != (self._keys.system, self._keys.component):
+                    others.append(message)
+            elif not self._is_for_us(message):
+                self.counts["for_others"] += 1
+            else:
+                self.counts["heard"] += 1
+                heard.append(message)
+        return Arrivals(heard, others, met)
+
+    def _is_autopilot(self, message: Message) -> bool:
+        """Whether a message is a heartbeat of the autopilot that the scenario asks for."""
+        system, component = _sender(message)
+        return (
+            message.get_type() == "HEARTBEAT"
+            and component == AUTOPILOT_COMPONENT
+            and self._keys.autopilot in (0, system)
+            and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
+        )
+
+    def _is_for_us(self, message: Message) -> bool:
+        """Whether a message is for us or for all."""
+        system = getattr(message, "target_system", 0)
+        component = getattr(message, "target_component", 0)
+        return system in (0, self._keys.system) and component in (0, self._keys.component)
+
+    def _hear_elsewhere(self, datagram: Datagram, armed: bool) -> Arrivals:
+        """Follow the autopilot to a new address if that is allowed; otherwise report what
+        arrived.
+        """
+        messages = Codec(self._keys.system, self._keys.component).decode(datagram.payload)
+        for message in messages:
+            same = _sender(message) == self.target and message.get_type() == "HEARTBEAT"
+            if not (same and self._may_move and not armed):
+                continue
+            if not message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED:
+                self._move(datagram.peer)
+                arrivals = self._sorted(self.codec.decode(datagram.payload), datagram.peer)
+                return arrivals._replace(moved=True)
+        self._report_elsewhere(datagram.peer, messages)
+        return Arrivals()
+
+    def _move(self, peer: Address) -> None:
+        """Continue at the autopilot's new address."""
+        assert self.peer is not None
+        before, after = address_text(*self.peer), address_text(*peer)
+        self._events.append(AutopilotMoved(vehicle=self._vehicle, before=before, after=after))
+        self.peer = peer
+        self._elsewhere.clear()
+
+    def _report_elsewhere(self, peer: Address, messages: Sequence[Message]) -> None:
+        """Report once per address that its datagrams are not from the autopilot."""
+        if peer in self._elsewhere or len(self._elsewhere) == ADDRESSES_REPORTED:
+            return
+        self._elsewhere.append(peer)
+        elsewhere = AutopilotElsewhere(
+            vehicle=self._vehicle,
+            came_from=address_text(*peer),
+            expected=address_text(*self.peer) if self.peer else self.line,
+            content=_content(messages),
+        )
+        self._events.append(elsewhere)
+
+
+def _sender(message: Message) -> tuple[int, int]:
+    """Numbers of a sender's system and component."""
+    return message.get_srcSystem(), message.get_srcComponent()
+
+
+def _content(messages: Sequence[Message]) -> str:
+    """Content of a datagram in words."""
+    if not messages:
+        return "what is no MAVLink"
+    system, component = _sender(messages[-1])
+    return f"{messages[-1].get_type()} of system {system}, component {component}"

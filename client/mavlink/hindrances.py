@@ -1,0 +1,147 @@
+"""Reasons on the vehicle's side that forbid following a plan, in order of precedence.
+
+disarmed → another mode → second commander → bad estimate → low battery → silence
+"""
+
+from skytether.client.mavlink.clock import BootClock
+from skytether.client.mavlink.condition import Condition
+from skytether.client.mavlink.obedience import Obedience
+from skytether.client.mavlink.positions import Positions, Vector
+from skytether.client.mavlink.rivals import Rivals
+from skytether.client.mavlink.texts import SAME_TEXT_NS
+from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
+from skytether.shared.core.aboard import (
+    AboardEvent,
+    PositionsDropped,
+    SecondCommander,
+    Strays,
+)
+from skytether.shared.core.endpoint import Events
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason
+
+FRESH_NS = 200 * MILLISECOND_NS
+"""Age up to which a velocity is compared with the command [ns]."""
+
+
+class Hindrances:
+    """Watches one autopilot in flight.
+
+    Args:
+        scenario: scenario of the flight.
+        vehicle: number of the vehicle, for events.
+        condition: status of the autopilot.
+        positions: its measurements.
+        clock: its clock.
+        events: list to which events are appended.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        vehicle: int,
+        *,
+        condition: Condition,
+        positions: Positions,
+        clock: BootClock,
+        events: Events,
+    ) -> None:
+        keys = scenario.mavlink
+        self._silence_ns = seconds_to_ns(keys.silence_s)
+        self._yields_to_others = keys.second_commander == "yield"
+        self._vehicle, self._condition, self._positions = vehicle, condition, positions
+        self._clock, self._events = clock, events
+        self.rivals, self._obedience = Rivals(), Obedience(scenario)
+        self._yields = False
+        """Whether a second commander has the vehicle, so that nothing is sent."""
+        self._was_disarmed = False
+        """Whether it was disarmed since it flew, so that it is not flown again."""
+        self._reported_ns: dict[Reason, int] = {}
+        """Times at which a second commander was reported, by how it was detected."""
+        self._reported_unusable = False
+        """Whether it was reported that positions cannot be used."""
+
+    @property
+    def bar_setpoints(self) -> bool:
+        """Whether no set-point may be sent: the vehicle was disarmed, or another one has it."""
+        return self._was_disarmed or self._yields
+
+    def command(self, velocity: Vector, *, now_ns: int) -> None:
+        """Compare the vehicle's velocity with its commands.
+
+        Args:
+            velocity: velocity commanded from now on, in our axes [m/s].
+            now_ns: time now.
+        """
+        came_ns = self._positions.came_ns
+        if came_ns is not None and now_ns - came_ns <= FRESH_NS:
+            self._obedience.step(velocity, self._positions.velocity, now_ns=now_ns)
+        else:
+            self._obedience.begin()
+
+    def reason(self, guided: int, *, now_ns: int) -> Reason | None:
+        """Reason that forbids following a plan now.
+
+        Args:
+            guided: number of the mode that follows set-points.
+            now_ns: time now.
+        """
+        condition = self._condition
+        if not condition.armed or self._was_disarmed:
+            self._was_disarmed = True
+            return Reason.DISARMED
+        self._yields = False
+        if condition.mode != guided:
+            self._obedience.begin()
+            return Reason.TAKEN
+        if rival := self._rival(now_ns):
+            self._yields = self._yields_to_others
+            return Reason.TAKEN if self._yields else rival
+        if condition.is_astray(now_ns=now_ns):
+            return Reason.ASTRAY
+        if condition.battery_is_low(now_ns=now_ns):
+            return Reason.BATTERY
+        return self._silence(now_ns)
+
+    def _rival(self, now_ns: int) -> Reason | None:
+        """How a second commander was detected; None if there is none."""
+        event: AboardEvent
+        if self.rivals.are_there(now_ns=now_ns):
+            system, component, content = self.rivals.newest
+            cause = Reason.RIVAL
+            event = SecondCommander(
+                vehicle=self._vehicle, system=system, component=component, said=content
+            )
+        elif self._obedience.strays(now_ns=now_ns):
+            cause = Reason.STRAYED
+            event = Strays(vehicle=self._vehicle, off_mps=self._obedience.off_mps)
+        else:
+            return None
+        if now_ns - self._reported_ns.get(cause, -SAME_TEXT_NS) >= SAME_TEXT_NS:
+            self._reported_ns[cause] = now_ns
+            self._events.append(event)
+        return cause
+
+    def _silence(self, now_ns: int) -> Reason | None:
+        """Reason why the autopilot sends nothing usable; None if it does."""
+        if not self._is_past(self._positions.came_ns, now_ns):
+            self._reported_unusable = False
+            return None if self._condition.is_fresh(now_ns=now_ns) else Reason.MUTE
+        if self._is_past(self._positions.heard_ns, now_ns):
+            return Reason.MUTE
+        self._report_unusable()
+        return Reason.UNUSABLE
+
+    def _is_past(self, came_ns: int | None, now_ns: int) -> bool:
+        """Whether something arrived longer ago than the autopilot may be silent."""
+        return came_ns is None or now_ns - came_ns > self._silence_ns
+
+    def _report_unusable(self) -> None:
+        """Report once why no position can be used."""
+        why = self._positions.fault
+        if self._reported_unusable or not why:
+            return
+        self._reported_unusable = True
+        if fault := self._clock.rate_fault:
+            why += f", and the speed of its clock is {fault}"
+        self._events.append(PositionsDropped(vehicle=self._vehicle, why=why))

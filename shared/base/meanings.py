@@ -1,0 +1,21 @@
+"""Meanings of the fields of a class, as its source has them, for help and documents."""
+
+import ast
+import inspect
+from contextlib import suppress
+from itertools import pairwise
+
+
+def meanings(of: type) -> dict[str, str]:
+    """Docstring of each field of a class, in one line."""
+    found: dict[str, str] = {}
+    for each in reversed(of.__mro__):
+        with suppress(TypeError, OSError):  # not a class of Python's own, or without its source
+            (definition,) = ast.parse(inspect.getsource(each)).body
+            assert isinstance(definition, ast.ClassDef)
+            found |= {
+                ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
+                for key, text in pairwise(definition.body)
+                if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
+            }
+    return found
