@@ -257,7 +257,7 @@ def test_what_may_end_a_flight_is_asked_once_more(
     flight, operator = PageFlight(), Asked()
     flight.state, flight.operator = flown.state, operator  # type: ignore[assignment]
     table = reading.to_table(flown.state.scenario)["network"]
-    keys = {f"network.{way}.{key}": each for way in table for key, each in _keys(table[way])}
+    keys = {f"network.{way}": table[way] for way in ("uplink", "downlink")}
     flight.values = {"netem": keys, "client": {"armed": True}}
     served = Page("127.0.0.1", 0, [flight], now_ns=lambda: flown.state.newest_ns)
     with closing(served), joined(served) as browser:
@@ -270,10 +270,6 @@ def test_what_may_end_a_flight_is_asked_once_more(
         send(browser, type="GuiUpdateMessage", uuid=meant, updates={"value": True})
         until(lambda: operator.asked)
     assert [process for process, _ in operator.asked] == [expected]
-
-
-def _keys(table: object) -> list[tuple[str, object]]:
-    return list(table.items()) if isinstance(table, dict) else []
 
 
 def test_an_upload_is_dropped_and_a_message_of_the_page_is_not(page: Page) -> None:
