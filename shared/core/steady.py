@@ -99,6 +99,10 @@ class Steady(Endpoint):
         """See `Endpoint`."""
         self._inner.tell(event)
 
+    def undelivered(self, socket: int, reason: str) -> None:
+        """See `Endpoint`."""
+        self._inner.undelivered(socket, reason)
+
     def figures(self) -> dict[str, Any]:
         """See `Endpoint`."""
         return self._inner.figures()

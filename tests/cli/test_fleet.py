@@ -189,7 +189,9 @@ def test_a_mission_that_cannot_be_read_is_refused_in_one_line(
     show = tmp_path / "show.csv"
     show.write_text("vehicle,t,x,y\n1,3,0,0\n")
     line = refused(["fleet", "--mission", str(show)], capfd)
-    assert line.startswith(f"fleet: --mission: {show}: vehicle 1: column t must start at 0 and")
+    assert line.startswith(
+        f"fleet: --mission: {show}: line 2: expected t = 0 as the first time, got"
+    )
 
 
 @pytest.mark.long

@@ -49,7 +49,7 @@ from skytether.lab.contenders import (
 )
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import whole
+from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reading import COMPARED
 from skytether.shared.scenario.registry import TRIGGERS
 from skytether.shared.scenario.schema import Scenario
@@ -113,9 +113,9 @@ def test_every_contender_in_every_case_comes_along() -> None:
         there = contenders.differences(start, case.plant)
         here = contenders.differences(scenario, case.plant)
         changed = {key for key, value in here.items() if value != there.get(key)}
-        assert changed <= {whole(key.key.removesuffix(".0").removesuffix(".1")) for key in free}, (
-            name
-        )
+        assert changed <= {
+            text_key(key.key.removesuffix(".0").removesuffix(".1")) for key in free
+        }, name
         assert scenario.control.state_weight[0] == PAPER.control.state_weight[0]
         assert scenario.title == f"{contender.title}, at its best: {case.title}"
     assert "compare" not in " ".join(reading.names())

@@ -1152,7 +1152,7 @@ def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("vehicle,x,y\n1,0,0\n", "expected the columns vehicle, t, x, y"),
-        ("vehicle,t,x,y\n1,1,0,0\n", "vehicle 1: column t must start at 0 and rise"),
+        ("vehicle,t,x,y\n1,1,0,0\n", "line 2: expected t = 0 as the first time, got 1"),
         ("vehicle,t,x,y\n0,0,0,0\n", "column vehicle: expected numbers from 1"),
         ("vehicle,t,x,y\n1,0,nan,0\n", "finite numbers"),
         ("vehicle,t,x,y\n1,0,1e9,0\n", "from the origin"),

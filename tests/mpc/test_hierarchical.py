@@ -340,9 +340,9 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
     rng, rows, planner = np.random.default_rng(7), np.array([0]), make()
     before = plan(planner, rows, np.array([40]), crowd(rng, np.array([0])))
     found = crowd(rng, np.array([0]))._replace(
-        doubt=np.array([shares]),
-        doubted=rng.uniform(-1.0, 1.0, size=(1, 2, 2, H)),
-        doubted_start=np.zeros((1, 2, 2, 2)),
+        loss_probability=np.array([shares]),
+        inputs_if_lost=rng.uniform(-1.0, 1.0, size=(1, 2, 2, H)),
+        start_if_lost=np.zeros((1, 2, 2, 2)),
     )
     found.start_if_lost[:] = found.start[:, None]
     made = plan(planner, rows, np.array([41]), found)
@@ -359,9 +359,9 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
     rng, rows = np.random.default_rng(7), np.array([0])
     first, found = crowd(rng, np.array([0])), crowd(rng, np.array([0]))
     found = found._replace(
-        doubt=np.array([[0.2]]),
-        doubted=rng.uniform(-1.0, 1.0, size=(1, 1, 2, H)),
-        doubted_start=np.zeros((1, 1, 2, 2)),
+        loss_probability=np.array([[0.2]]),
+        inputs_if_lost=rng.uniform(-1.0, 1.0, size=(1, 1, 2, H)),
+        start_if_lost=np.zeros((1, 1, 2, 2)),
     )
     found.usable[:] = flown
 
@@ -459,7 +459,7 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
     for mine, yours in zip(compiled._memory[:3], around._memory[:3], strict=True):
         np.testing.assert_array_equal(mine, yours)
     assert min(unsolved, fresh) > 0
-    assert all(len(listener.heard()[0][0]) > 0 for listener in listeners)
+    assert all(len(listener.recorded()[0][0]) > 0 for listener in listeners)
 
 
 class Faulty:

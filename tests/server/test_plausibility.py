@@ -314,8 +314,7 @@ def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     """RMSE within a tenth of that of a good cable; if all is believed it is several times that."""
     good, bad = rmse(flipped(0.0)), flipped(0.01)
     assert rmse(bad) == pytest.approx(good, rel=0.1)
-    dropped = bad[0].figures["server"]["dropped"]  # of all of them
-    assert dropped.get(Drop.IMPLAUSIBLE_HORIZON, 0) > 0
+    assert any(Drop.IMPLAUSIBLE_HORIZON in each.figures["server"]["dropped"] for each in bad)
     assert all(flight.failure is None for flight in bad)
     monkeypatch.setattr(Plausibility, "judge", believe)
     assert rmse(flipped(0.01)) > 2.0 * good

@@ -273,7 +273,7 @@ def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         def missing(_: int) -> DatagramBatch:
             raise OSError("this system has no such calls")
 
-        monkeypatch.setattr(driver, "Batch", missing)
+        monkeypatch.setattr(driver, "DatagramBatch", missing)
         monkeypatch.setattr(batch_module, "SEGMENT_BYTES_MAX", 0)
     return bool(request.param)
 

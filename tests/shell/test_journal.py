@@ -162,7 +162,7 @@ def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(journal.StudyJournal, "write", full)
+    monkeypatch.setattr(journal.Journal, "write", full)
     answers, events = driven(
         tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}).refused
     )
