@@ -550,7 +550,7 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
     for name in {row["contender"] for row in points}:
         assert BY_NAME[name].title in page
     assert "http" not in page
-    assert "floor" in page
+    assert "lower bound" in page
 
 
 @pytest.mark.long
