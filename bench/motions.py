@@ -152,9 +152,10 @@ def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> 
             lines.append(f"{vehicle},{leg * LEG_S:g},{x:g},{APART_M * place:g}")
     file = folder / f"fleet-{vehicles}-{near}.csv"
     files.write(file, "\n".join(lines).encode())
-    made = reading.load("swap")
-    reference = msgspec.structs.replace(made.reference, shape="mission", file=str(file))
-    return msgspec.structs.replace(made, duration=duration, settle=1.0, reference=reference)
+    table = reading.to_table(reading.load("swap"))
+    table |= {"duration": duration, "settle": 1.0}
+    table["reference"] |= {"shape": "mission", "file": str(file)}
+    return reading.check(table, "swap")
 
 
 @contextmanager

@@ -85,7 +85,7 @@ def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: 
 def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> None:
     """Nor many open files: no socket of its own is taken for a stream, in none of its processes."""
     file = tmp_path / "summary.json"
-    flags = ["--network.uplink.minimum-s", "0.03", "--network.downlink.minimum-s", "0.03"]
+    flags = ["--network.uplink", "constant(0.03)", "--network.downlink", "constant(0.03)"]
     fly = run(["fly", "demo", *SHORT, *flags, "--json", str(file)], "everything at once")
     assert fly.returncode == 0
     assert re.search(r'"steps": \d\d', file.read_text())

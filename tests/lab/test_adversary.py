@@ -175,7 +175,7 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
         ("delays", 0, certain),
         pytest.param("client", 1, forgetful, marks=pytest.mark.long),
         pytest.param("goals,losses", 5, newest, marks=pytest.mark.long),
-        pytest.param("server,cuts", 1, hasty, marks=pytest.mark.long),
+        pytest.param("server,cuts", 33, hasty, marks=pytest.mark.long),
         ("zones", 0, heedless),
     ],
 )

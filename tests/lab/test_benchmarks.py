@@ -234,7 +234,7 @@ def test_a_commit_is_compared_in_a_folder_that_goes_at_the_end() -> None:
     with versions.checkout("HEAD") as folder:
         assert (folder / "pyproject.toml").exists()
     assert not folder.exists()
-    expected = "nowhere-at-all: got no folder and no commit"
+    expected = "nowhere-at-all: expected a folder or a commit"
     with pytest.raises(ValueError, match=expected), versions.checkout("nowhere-at-all"):
         pass
 
