@@ -7,6 +7,7 @@ import contextlib
 import io
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import viser
@@ -27,6 +28,9 @@ MOVES_TO_A_DRAWING = 5
 
 STOPPED_S = 30.0
 """Time after which a server of viser that does not end is left alone [s]."""
+
+# A browser may leave while it is drawn for, which is no mistake.
+warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
