@@ -213,9 +213,11 @@ class MissionPlanner(SplineScheme):
                 + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
-                # Earliest step that the vehicle may be at.
-                k = self._state.now + self._state.ahead(row)
-                k -= max(math.ceil(self._state.error(row).late), 0)
+                # Earliest step that the vehicle may be at; before its first knot a motion rests
+                # there, so that a clock of which nothing is known makes no more of them.
+                late = max(self._state.error(row).late, 0.0)
+                step = self._state.now + self._state.ahead(row)
+                k = math.floor(max(step - late, motion.first))
                 points, _ = motion.at(pieces_of(k, motion.last), self._dt_s)
                 if comes_near(zones, points, clearance_m):
                     zone = zones.in_the_way(points, clearance_m)

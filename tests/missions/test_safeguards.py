@@ -266,3 +266,11 @@ def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
     vehicle.is_stuck(1, np.array([-4.0, 0.0]), 9.0)
     assert not vehicle.closed
     assert vehicle.detour is None
+
+
+@pytest.mark.parametrize("late", [0.0, 1e11, np.inf])
+def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
+    made = ready()
+    made.state.rows.late[0] = late
+    assert not made.objection(zones.parse("cylinder(0, 9, 0.5)", 2))
+    assert "vehicle 1 hovers in" in made.objection(zones.parse("cylinder(4, 0, 0.5)", 2))
