@@ -30,6 +30,8 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 NEARER_M = 1e-3
 """Tolerance for motions that are too near already: a solver may bring them nearer by this [m]."""
+PIECES_MAX = 10_000
+"""Largest number of pieces sampled of a pair; ordinary motions and clocks need hundreds."""
 
 
 class Pair(NamedTuple):
@@ -196,10 +198,11 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
     piece = SPACING / SAMPLES
     # At the last step both rest, and have landed if they ever do.
     last = max(last_step(one.motion), last_step(other.motion) - least)
-    pieces = max(int(np.ceil((last - begin) / piece)), 0) + 1
+    # Any steps give an upper bound: of a clock of which nothing is known, not all are tried.
+    pieces = int(np.ceil(min(max((last - begin) / piece, 0.0), PIECES_MAX))) + 1
     nearest = limit
     for i in range(pieces + 1):
-        step = begin + i * piece
+        step = begin + i * piece if i < pieces else max(begin + i * piece, last)
         low, high = moving_shifts(other.motion, step, step, least, most)
         slices = int(np.ceil((high - low) / piece))
         for j in range(slices + 1):

@@ -274,3 +274,19 @@ def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
     made.state.rows.late[0] = late
     assert not made.objection(zones.parse("cylinder(0, 9, 0.5)", 2))
     assert "vehicle 1 hovers in" in made.objection(zones.parse("cylinder(4, 0, 0.5)", 2))
+
+
+@pytest.mark.parametrize("late", [0.0, 1e11])
+def test_a_vehicle_moves_away_from_one_of_whose_clock_nothing_is_known(late: float) -> None:
+    """They are too near already; the answer must not take as long as the clock may be late."""
+    made = ready()
+    for row, x in ((0, 0.3), (1, 0.0)):
+        made.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))
+        made.state.possible.replace(
+            row, [made.state.possible_motion(row, made.vehicles[row].in_force.motion)], 0.0
+        )
+    made.state.possible.set_errors(np.zeros(2), np.array([0.0, late]))
+    away = Motion(100, np.array([[0.3, 0.0], [0.4, 0.0], [0.4, 0.0]]), np.zeros((3, 2)))
+    planned_ = made.state.possible_motion(0, away)
+    in_force = made.vehicles[0].in_force.motion
+    assert not too_near(planned_, in_force, 101, 0, made.state.possible, 0.9).any()
