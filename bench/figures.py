@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 import tyro
 
-from bench.harness import TextTable, refresh
+from bench.harness import TextTable, place_of, refresh
 from skytether.cli.fly import FlyOptions
 from skytether.lab import sweep
 from skytether.lab.commands import tables
@@ -42,7 +42,6 @@ PLACEHOLDER = re.compile(r"\{([a-z]\w*)\.([\w.+]+)(?:([*/])([\d.]+))?\}")
 `/39` at the end.
 """
 NUMBER = r"-?\d+(?:\.\d+)?"
-MARKED = r"(?<=<!-- table: {} -->\n).*?(?=<!-- end -->)"
 STATISTICS: dict[str, Any] = {"mean": np.mean, "median": np.median, "least": np.min, "most": np.max}
 CHUNK = 10
 """Number of flights in a task."""
@@ -205,7 +204,7 @@ def compare_tables(figure: Figure, page: str, made: Mapping[str, TextTable]) -> 
     written = refresh(page, {name: made[name] for name in figure.tables})
     numbers = list[Number]()
     for name in figure.tables:
-        place = re.compile(MARKED.format(re.escape(name)), re.DOTALL)
+        place = place_of(name)
         before, after = (re.findall(NUMBER, place.findall(each)[0]) for each in (page, written))
         pairs = zip_longest(before, after, fillvalue="nan")
         numbers += [Number(one, float(other)) for one, other in pairs]
@@ -226,8 +225,8 @@ class FiguresOptions:
     jobs: int | None = None
     """Number of flights at once; one per core unless given."""
     out: Path = Path("results/figures")
-    """Folder that keeps flights, of each state of the code apart: after Ctrl-C the same command
-    goes on."""
+    """Folder of the finished flights, with one folder for each state of the code. After Ctrl-C the
+    same command continues."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -244,11 +243,11 @@ def main(argv: Sequence[str]) -> None:
     }
     if unknown := set(options.only) - figures.keys():
         raise command.CommandError(f"--only: got {', '.join(sorted(unknown))}, no such figure", 2)
-    rows, bad = list[list[str]](), 0
+    kept, rows, bad = options.out / code(), list[list[str]](), 0
     for name, figure in figures.items():
         page = ROOT / figure.page
         try:
-            verdict = make(figure, page, options.out / code(), Flags(options.jobs))
+            verdict = make(figure, page, kept, Flags(options.jobs))
         except (ValueError, subprocess.CalledProcessError) as error:
             rows.append([name, figure.page, "", "", "", str(error)])
             bad += 1

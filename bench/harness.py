@@ -190,16 +190,21 @@ class TextTable:
         tables.show(title, self.headings, self.rows)
 
 
+def place_of(name: str) -> re.Pattern[str]:
+    """Place of a table in a document, between `<!-- table: name -->` and `<!-- end -->`."""
+    begin = f"<!-- table: {re.escape(name)} -->\n"
+    return re.compile(rf"(?<={begin}).*?(?=<!-- end -->)", re.DOTALL)
+
+
 def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
-    """Document with each table replaced between `<!-- table: name -->` and `<!-- end -->`.
+    """Document with each table replaced in its place, see `place_of`.
 
     Raises:
         ValueError: the document has not exactly one place for a table.
     """
     for name, table in tables.items():
-        place = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end -->)", re.DOTALL)
         body = table.markdown().replace("\\", r"\\")
-        document, found = place.subn(rf"\1\n{body}\n", document)
+        document, found = place_of(name).subn(rf"\n{body}\n", document)
         if found != 1:
             raise ValueError(f"table {name}: got {found} places in the document, expected 1")
     return document

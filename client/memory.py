@@ -24,8 +24,6 @@ from skytether.client.vehicle import VehicleMemory
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import KNOTS_MAX
 
-KEPT_BYTES_MAX = 8192
-"""Largest size of the saved state [B]."""
 TIME_MAX_NS = 2**62
 """Largest time accepted from a file [ns]."""
 STEP_MAX = 2**40

@@ -25,7 +25,7 @@ class Arrivals(NamedTuple):
     """Messages of one datagram, by sender."""
 
     heard: Sequence[Message] = ()
-    """The autopilot's, for us or for all."""
+    """Messages of the autopilot to us, or to every system."""
     others: Sequence[Message] = ()
     """Those of others than the autopilot and us, once the autopilot is known."""
     met: Message | None = None
@@ -107,7 +107,7 @@ class Connection:
         )
 
     def _is_for_us(self, message: Message) -> bool:
-        """Whether a message is for us or for all."""
+        """Whether a message is addressed to us, or to every system."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         return system in (0, self._keys.system) and component in (0, self._keys.component)

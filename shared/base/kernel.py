@@ -41,7 +41,6 @@ R1 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 1, "C", rea
 R2 = Annotated[NDArray[np.float64], numba.types.Array(numba.float64, 2, "C", readonly=True)]
 F3 = Annotated[NDArray[np.float64], numba.float64[:, :, ::1]]
 F4 = Annotated[NDArray[np.float64], numba.float64[:, :, :, ::1]]
-F5 = Annotated[NDArray[np.float64], numba.float64[:, :, :, :, ::1]]
 I1 = Annotated[NDArray[np.int64], numba.int64[::1]]
 I2 = Annotated[NDArray[np.int64], numba.int64[:, ::1]]
 I3 = Annotated[NDArray[np.int64], numba.int64[:, :, ::1]]

@@ -332,7 +332,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _ratio_row(found: tuple[float, float, float] | None) -> dict[str, float | None]:
-    """Columns of a ratio and its interval; see `ratio`."""
+    """CSV cells of a ratio and its interval's ends, empty without one; see `ratio`."""
     return dict(zip(("ratio", "ratio_low", "ratio_high"), found or (None,) * 3, strict=True))
 
 

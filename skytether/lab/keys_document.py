@@ -96,7 +96,7 @@ def _either(kinds: list[str]) -> str:
 
 
 def _bounded(kind: type, meta: msgspec.Meta) -> str:
-    """Range of a number; the largest length of a text is not shown."""
+    """Allowed range of a number, in words; "text" for a text of any allowed length."""
     if kind is str:
         return "text"
     low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
