@@ -164,7 +164,11 @@ class DatagramBatch:
 
     @staticmethod
     def stamp(sock: socket.socket) -> None:
-        """Let the kernel note when datagrams come to a socket, from the next one on."""
+        """Let the kernel stamp datagrams on arrival.
+
+        Linux starts to stamp some milliseconds later, unless another socket of the machine has
+        asked before; until then it stamps a datagram when it is read.
+        """
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress], list[int]]:
