@@ -80,11 +80,11 @@ def kept(problems: list[MotionProblem]) -> Iterator[None]:
     real = TrajectoryQP.solve
 
     def solve(
-        self: TrajectoryQP, p: Array, v: Array, goal: Array, planes: HalfPlanes | None = None
+        self: TrajectoryQP, p: Array, v: Array, targets: Array, planes: HalfPlanes | None = None
     ) -> Any:
-        linear, columns, least = self.problem(p[-1], v[-1], goal, planes)
+        linear, columns, least = self.problem(p[-1], v[-1], targets, planes)
         problems.append(MotionProblem(self.solver, linear, columns, least, p.shape[1]))
-        return real(self, p, v, goal, planes)
+        return real(self, p, v, targets, planes)
 
     plan = cast(Any, TrajectoryQP)
     plan.solve = solve

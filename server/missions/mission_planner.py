@@ -27,6 +27,7 @@ vehicle, and `yielding` which vehicle makes way for another.
 
 import math
 from functools import partial
+from itertools import chain
 from operator import sub
 
 import numpy as np
@@ -46,7 +47,7 @@ from skytether.server.missions.yielding import YIELD_S, Yielding
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
-from skytether.shared.law.motion import SPACING, Motion
+from skytether.shared.law.motion import INTERVALS, SPACING, Motion
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 
@@ -96,8 +97,6 @@ class MissionPlanner(SplineScheme):
         mission = scenario.mission
         clearances = self._clearances = scenario.clearances
         self._dt_s = terms.dt_s
-        self._kept_steps = -(-terms.join // SPACING) * SPACING
-        """Steps after the first knot up to which a motion equals the one in force."""
         self._resend_after = terms.age_max // 3
         """Steps after which a motion is sent again, before it is too old to be flown."""
         self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
@@ -299,7 +298,10 @@ class MissionPlanner(SplineScheme):
             self._state.update_possible()
             self._plan_motion(row, vehicle, k, out)
             return
-        if max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M:
+        has_path = self._state.is_show and vehicle.yielding is None
+        targets = self._state.targets(row) if has_path else None
+        is_there = max(map(abs, map(sub, place.tolist(), goal.tolist()))) < ARRIVED_M
+        if is_there and (targets is None or np.abs(targets - place).max() < ARRIVED_M):
             vehicle.turned_rad = 0.0
             if vehicle.yielding:
                 asker = self._state.number_of(vehicle.yielding.asker)
@@ -309,7 +311,7 @@ class MissionPlanner(SplineScheme):
         way = self._way(row, goal) if self._zones else (place, goal)
         is_stuck = vehicle.is_stuck(k, goal, sum(map(math.dist, way[:-1], way[1:])))
         asked = is_stuck and self._ask_to_yield(row, np.array(way))
-        self._plan_motion(row, vehicle, k, goal)
+        self._plan_motion(row, vehicle, k, goal, targets)
         if is_stuck:
             is_blocked = vehicle.zone_blocks and not asked
             if is_blocked and self._waypoints.close_way(vehicle, k, place, goal):
@@ -342,9 +344,16 @@ class MissionPlanner(SplineScheme):
                 return way_out
         return None
 
-    def _plan_motion(self, row: int, vehicle: VehicleMotions, k: int, goal: Array) -> None:
-        """Find a motion towards a goal, around others in the way."""
-        vehicle.next = self._motion_toward(row, vehicle, k, goal)
+    def _plan_motion(
+        self,
+        row: int,
+        vehicle: VehicleMotions,
+        k: int,
+        goal: Array,
+        targets: Array | None = None,
+    ) -> None:
+        """Find a motion along a path, or towards a goal, around others in the way."""
+        vehicle.next = self._motion_toward(row, vehicle, k, goal, targets)
         self.counts["stuck"] += vehicle.next is None
 
     def _way(self, row: int, goal: Array) -> Array:
@@ -397,9 +406,10 @@ class MissionPlanner(SplineScheme):
         return free is not None
 
     def _motion_toward(
-        self, row: int, vehicle: VehicleMotions, k: int, goal: Array
+        self, row: int, vehicle: VehicleMotions, k: int, goal: Array, path: Array | None
     ) -> Motion | None:
-        """Motion from the one in force towards a goal, away from all others; None if none is found.
+        """Motion from the one in force along a path, or if that is blocked towards a goal, away
+        from all others; None if none is found.
 
         It is added to the possible motions, so that the next vehicle's plan accounts for it.
 
@@ -408,15 +418,17 @@ class MissionPlanner(SplineScheme):
         """
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
-        due = k + self._kept_steps
-        kept = states(base, k, self._kept_steps // SPACING + 1, self._dt_s)
+        due = k + self._state.kept_steps
+        kept = states(base, k, self._state.kept_steps // SPACING + 1, self._dt_s)
         p0 = kept[0][-1]
         planes, violated = None, np.zeros(self._state.possible.count + 1, dtype=np.bool_)
         rests = partial(self._state.resting_places, row)
-        for waypoint in self._waypoints.candidates(vehicle, k, p0, goal, rests):
+        waypoints = self._waypoints.candidates(vehicle, k, p0, goal, rests)
+        targets_of = (np.tile(waypoint, (INTERVALS, 1)) for waypoint in waypoints)
+        for targets in targets_of if path is None else chain([path], targets_of):
             for _ in range(ROUNDS):
                 constraints = planes.from_some(violated) if planes else None
-                solved = qp.solve(*kept, waypoint, constraints)
+                solved = qp.solve(*kept, targets, constraints)
                 if solved is None:
                     self.counts["unsolved"] += 1
                     return None
@@ -428,7 +440,7 @@ class MissionPlanner(SplineScheme):
                 violated |= conflicts
                 planes = planes or self._half_planes(row, base, due)
             # A plan that hardly moves counts as stuck, and another waypoint is tried.
-            moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(waypoint, p0)
+            moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(targets[-1], p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not conflicts.any():
                 vehicle.waits_for, vehicle.turned_rad = "", max(0.0, vehicle.turned_rad - TURN_BACK)
                 self._state.possible.add(row, planned, vehicle.outside_m)

@@ -27,6 +27,8 @@ LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Largest number of steps that a motion takes."""
 RESTART_STEPS = 20
 """Steps after a client's restart up to which an observation may be from before it."""
+PLANNED = np.arange(1.0, INTERVALS + 1.0)
+"""Numbers n of a motion's planned knots."""
 PLAN_DUE, REPEAT_DUE = 1, 2
 """Flags in `MissionState.due`: a motion may be planned for the vehicle at this step; its latest
 motion is repeated."""
@@ -107,10 +109,14 @@ class MissionState:
         self.number_of = number_of
         """Number of the vehicle in a row."""
         self._references = references
-        goals = scenario.make_reference()
-        self.absent = set(goals.vehicles) if isinstance(goals, Mission) else set[int]()
+        mission = scenario.make_reference()
+        self.absent = set(mission.vehicles) if isinstance(mission, Mission) else set[int]()
         """Numbers of the mission's vehicles that have not yet been at rest at their start."""
+        self.is_show = isinstance(mission, Mission) and mission.is_show
+        """Whether vehicles follow timed paths."""
         self._tube_m, self._dt_s, self._join = scenario.mission.tube_m, terms.dt_s, terms.join
+        self.kept_steps = -(-terms.join // SPACING) * SPACING
+        """Steps after the first knot up to which a motion equals the one in force."""
         self._land_after = terms.land_after if scenario.lands else NEVER
         """Steps of hovering in silence after which a vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
@@ -348,10 +354,21 @@ class MissionState:
         self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
-        """Present goal of a vehicle [m]; shape (axes,)."""
-        k = self.now + self.ahead(row)
-        desired = self._references(self.number_of(row))(np.array(k * self._dt_s))
-        return np.ascontiguousarray(desired[:, 0])  # kernels need contiguous arrays
+        """Present goal of a vehicle [m]; shape (axes,). In a show: where its path leads by the end
+        of a motion that is planned now.
+        """
+        steps = self.kept_steps + INTERVALS * SPACING if self.is_show else 0
+        return self._desired(row, np.array((self.now + self.ahead(row) + steps) * self._dt_s))
+
+    def targets(self, row: int) -> Array:
+        """Points of a show's path at the knots of a motion planned now [m]; shape (N, axes)."""
+        steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
+        return self._desired(row, steps * self._dt_s)
+
+    def _desired(self, row: int, times_s: Array) -> Array:
+        """Desired positions of a vehicle [m]; shape of the times + (axes,)."""
+        desired = self._references(self.number_of(row))(times_s)
+        return np.ascontiguousarray(desired[..., 0])  # kernels need contiguous arrays
 
     def resting_places(self, row: int) -> list[Array]:
         """Resting positions of all vehicles but one [m]."""

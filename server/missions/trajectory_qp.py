@@ -3,9 +3,10 @@
 The beginning of the motion equals the motion in force. After that it is planned over the
 accelerations a_n between knots T apart, for n = 0 … N-1,
 
-    min  Σ w_n |p_n - g|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
+    min  Σ w_n |p_n - g_n|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
 
-with the target g, and a half-plane for each near motion and zone and each time,
+with the targets g_n, all the same for a waypoint, and a half-plane for each near motion and zone
+and each time,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
@@ -141,7 +142,7 @@ class TrajectoryQP:
         """Largest distance at these times between two motions from the same state [m]."""
 
     def solve(
-        self, kept_p: Array, kept_v: Array, goal: Array, planes: HalfPlanes | None = None
+        self, kept_p: Array, kept_v: Array, targets: Array, planes: HalfPlanes | None = None
     ) -> tuple[Array, Array] | None:
         """Positions and velocities of the knots, starting with those of the motion in force; None
         without a solution.
@@ -149,7 +150,7 @@ class TrajectoryQP:
         Args:
             kept_p, kept_v: knots of the motion in force up to the begin of the plan [m, m/s]; shape
                 (kept, axes).
-            goal: target g [m]; shape (axes,).
+            targets: g_1 … g_N [m]; shape (N, axes).
             planes: constraints on positions at `times`.
         """
         kept = len(kept_p)
@@ -157,28 +158,28 @@ class TrajectoryQP:
         position[:kept], velocity[:kept] = kept_p, kept_v
         if not planes or not len(planes.time):
             is_solved = solve_axes(
-                self.constants, self.axis_problem, kept, goal, position, velocity
+                self.constants, self.axis_problem, kept, targets, position, velocity
             )
             return (position, velocity) if is_solved else None
-        x = self.solver.solve(*self.problem(kept_p[-1], kept_v[-1], goal, planes), self._axes)
+        x = self.solver.solve(*self.problem(kept_p[-1], kept_v[-1], targets, planes), self._axes)
         if x is None:
             return None
         _integrate(self.constants, x, kept, position, velocity)
         return position, velocity
 
     def problem(
-        self, p0: Array, v0: Array, goal: Array, planes: HalfPlanes | None
+        self, p0: Array, v0: Array, targets: Array, planes: HalfPlanes | None
     ) -> tuple[Array, Array, Array]:
         """QP for `DualActiveSet`: linear term, columns of the constraints, and their bounds.
 
         Args:
             p0, v0: state at the begin of the plan [m, m/s]; shape (axes,).
-            goal, planes: see `solve`.
+            targets, planes: see `solve`.
         """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
         bounds = np.empty(fixed + (len(planes.time) if planes else 0))
-        _fill_qp(self.constants, p0, v0, goal, linear, bounds)
+        _fill_qp(self.constants, p0, v0, targets, linear, bounds)
         # Half-planes follow the constraints that are always present.
         if planes and len(planes.time):
             columns = np.empty((variables, len(bounds)))
@@ -196,11 +197,11 @@ class TrajectoryQP:
 
 
 @kernel
-def _fill_qp(constants: QPConstants, p0: F1, v0: F1, goal: F1, linear: F1, bounds: F1) -> None:
+def _fill_qp(constants: QPConstants, p0: F1, v0: F1, targets: F2, linear: F1, bounds: F1) -> None:
     """Fill in the linear term, and the bounds of the constraints that are always present."""
     axes = len(p0)
     for x in range(axes):
-        _fill_axis(constants, x, p0[x], v0[x], goal[x], linear, bounds, x, axes)
+        _fill_axis(constants, x, p0[x], v0[x], targets, linear, bounds, x, axes)
 
 
 @part
@@ -209,7 +210,7 @@ def _fill_axis(
     x: int,
     p0: float,
     v: float,
-    goal: float,
+    targets: F2,
     linear: F1,
     bounds: F1,
     at: int,
@@ -227,26 +228,26 @@ def _fill_axis(
     for j in range(n):
         free = p0 + (j + 1) * constants.T * v
         for i in range(n):
-            weighed = constants.weights[j] * (free - goal)
+            weighed = constants.weights[j] * (free - targets[j, x])
             linear[at * n + i] -= constants.to_position[j, i] * weighed
 
 
 @making_kernel
 def solve_axes(
-    constants: QPConstants, problem: AxisProblem, kept: int, goal: F1, position: F2, velocity: F2
+    constants: QPConstants, problem: AxisProblem, kept: int, targets: F2, position: F2, velocity: F2
 ) -> bool:
     """Fill in the knots of a motion without half-planes; returns whether there is a solution.
 
     Args:
         constants, problem: see `TrajectoryQP`.
         kept: number of given knots, those of the motion in force.
-        goal: target g [m]; shape (axes,).
+        targets: g_1 … g_N [m]; shape (N, axes).
         position, velocity: knots, the given ones first [m, m/s]; shape (kept + N, axes).
     """
     linear, bounds = problem.linear, problem.bounds
-    for x in range(len(goal)):
+    for x in range(targets.shape[1]):
         p0, v0 = position[kept - 1, x], velocity[kept - 1, x]
-        _fill_axis(constants, x, p0, v0, goal[x], linear, bounds, 0, 1)
+        _fill_axis(constants, x, p0, v0, targets, linear, bounds, 0, 1)
         columns, scratch = problem.columns[x], problem.scratch
         if solve_qp(problem.root[x], linear, problem.x, columns, bounds, 1, scratch) != SOLVED:
             return False

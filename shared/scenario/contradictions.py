@@ -257,7 +257,8 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
         one, other, at_s, away_m = too_near
         margin_m = scenario.clearances.margin_m
         most = f"with 2 · mission.tube_m and {margin_m:g} m at most {away_m:.3g} m"
-        expected = f"{most}, as the goals of vehicles {one} and {other} at {at_s:g} s"
+        what = "paths" if goals.is_show else "goals"
+        expected = f"{most}, as the {what} of vehicles {one} and {other} at {at_s:.6g} s"
         if scenario.lands:
             expected += " side by side, for both may land (vehicle.land_after_s = 0: never)"
         yield "mission.separation_m", mission.separation_m, expected

@@ -1,6 +1,7 @@
-"""Missions: timed goals of several vehicles, which the server keeps apart.
+"""Missions: timed goals of several vehicles, or timed paths (a show), which the server keeps apart.
 
-A mission is also the reference of a vehicle: its present goal, with velocity 0.
+A mission is also the reference of a vehicle: its present goal, with velocity 0; in a show, the
+present point and velocity of its path.
 """
 
 from bisect import bisect_right
@@ -13,7 +14,13 @@ from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import GrammarError, calls
-from skytether.shared.scenario.reference import FAR_M, Reference, check_times, read_table
+from skytether.shared.scenario.reference import (
+    FAR_M,
+    Reference,
+    check_times,
+    read_table,
+    timed_path,
+)
 
 SWAP_AT_S = 2.0
 """Time at which vehicles that swap places depart [s]."""
@@ -35,12 +42,22 @@ class Mission:
             number of the vehicle.
         axes: number of axes.
         vehicle: number of the vehicle whose reference this is.
+        is_show: whether vehicles follow straight lines from goal to goal, each reached at its time.
     """
 
-    def __init__(self, goals: Mapping[int, tuple[Array, Array]], axes: int, vehicle: int) -> None:
-        self._goals, self._axes = goals, axes
+    def __init__(
+        self,
+        goals: Mapping[int, tuple[Array, Array]],
+        axes: int,
+        vehicle: int,
+        *,
+        is_show: bool = False,
+    ) -> None:
+        self._goals, self._axes, self.is_show = goals, axes, is_show
         self._times_s, self._points_m = goals.get(vehicle, (np.zeros(1), np.zeros((1, axes))))
         self._times: list[float] = self._times_s.tolist()
+        moves = is_show and len(self._times) > 1
+        self._path = timed_path(self._times_s, self._points_m) if moves else None
 
     @property
     def vehicles(self) -> tuple[int, ...]:
@@ -65,7 +82,7 @@ class Mission:
 
     def of(self, vehicle: int) -> "Mission":
         """The reference of another vehicle."""
-        return Mission(self._goals, self._axes, vehicle)
+        return Mission(self._goals, self._axes, vehicle, is_show=self.is_show)
 
     def goals(self, vehicle: int) -> Array:
         """Goals of a vehicle [m]; shape (n, axes)."""
@@ -73,6 +90,8 @@ class Mission:
 
     def __call__(self, t: NDArray[Any]) -> Array:
         """Goals at times [s]; see `Reference`."""
+        if self._path:
+            return self._path(t)
         t = np.asarray(t, dtype=np.float64)
         if not t.ndim:  # of one vehicle at each step: no search in arrays
             state = np.zeros((self._axes, 2))
@@ -84,7 +103,7 @@ class Mission:
         return state
 
     def nearest(self, apart_m: float, height: float) -> tuple[int, int, float, float] | None:
-        """First two vehicles whose goals are nearer than `apart_m` at the same time.
+        """First two vehicles whose goals, or paths, are nearer than `apart_m` at the same time.
 
         Args:
             apart_m: distance [m].
@@ -93,6 +112,8 @@ class Mission:
         Returns:
             numbers of the two vehicles, time [s] and distance [m]; None if there are no such two.
         """
+        if self.is_show:
+            return _nearest_on_paths(self._goals, apart_m, height)
         stays = _Stays.of(self._goals, height)
         pair = stays.nearest(apart_m)
         if pair is None:
@@ -230,6 +251,45 @@ def _neighbours(
     return at[hit], is_occupied
 
 
+def _nearest_on_paths(
+    goals: Mapping[int, tuple[Array, Array]], apart_m: float, height: float
+) -> tuple[int, int, float, float] | None:
+    """First two vehicles of a show nearer than `apart_m` to each other, see `Mission.nearest`.
+
+    Between two consecutive times of any vehicles, every vehicle moves along a straight line.
+    """
+    numbers = list(goals)
+    times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))
+    places = np.stack(
+        [
+            np.stack([np.interp(times_s, own_s, along) for along in points_m.T], axis=1)
+            for own_s, points_m in goals.values()
+        ],
+        axis=1,
+    )
+    places[..., 2:] *= height
+    for k, (begin, end) in enumerate(zip(places, [*places[1:], places[-1]], strict=True)):
+        moved, middle = end - begin, 0.5 * (begin + end)
+        reach_m = apart_m + float(np.linalg.norm(moved, axis=1).max())
+        # Vehicles sorted along the first axis are compared with those within reach behind them.
+        order = np.argsort(middle[:, 0])
+        x, rank = middle[order, 0], np.arange(len(order))
+        counts = np.searchsorted(x, x + reach_m, side="right") - rank - 1
+        one = np.repeat(rank, counts)
+        other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(counts) - counts, counts)
+        one, other = order[one], order[other]
+        off, way = begin[one] - begin[other], moved[one] - moved[other]
+        along = -(off * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-18)
+        share = np.clip(along, 0.0, 1.0)
+        away_m = np.linalg.norm(off + share[:, None] * way, axis=1)
+        if (away_m < apart_m).any():
+            i = int(away_m.argmin())
+            length_s = times_s[min(k + 1, len(times_s) - 1)] - times_s[k]
+            pair = sorted((numbers[one[i]], numbers[other[i]]))
+            return *pair, float(times_s[k] + share[i] * length_s), float(away_m[i])
+    return None
+
+
 class Guided:
     """References of a mission's vehicles, with goals that may be replaced in flight.
 
@@ -250,7 +310,8 @@ class Guided:
         def reference(t: NDArray[Any]) -> Array:
             state = original(t)
             if vehicle in self.goals:
-                state[np.asarray(t) > 0.0, :, 0] = self.goals[vehicle]
+                late = np.asarray(t) > 0.0
+                state[late, :, 0], state[late, :, 1] = self.goals[vehicle], 0.0
             return state
 
         return reference
@@ -316,7 +377,7 @@ def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
     return Mission(goals, 3, 1)
 
 
-def mission(content: bytes, axes: int) -> Mission:
+def mission(content: bytes, axes: int, *, is_show: bool = False) -> Mission:
     """Mission from a CSV table with the columns vehicle, t [s], x, y and, with three axes, z [m].
 
     Raises:
@@ -337,4 +398,4 @@ def mission(content: bytes, axes: int) -> Mission:
         goals[number] = own[:, 1], own[:, 2:]
     if (np.abs(rows[:, 2:]) > FAR_M).any():
         raise ValueError(f"expected at most {FAR_M:g} m from the origin")
-    return Mission(goals, axes, 1)
+    return Mission(goals, axes, 1, is_show=is_show)

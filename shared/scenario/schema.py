@@ -162,9 +162,9 @@ class ControlConfig(Section, frozen=True):
         return schemes.properties(self.scheme)
 
 
-MISSIONS = ("swap", "sphere", "mission")
-"""Shapes that are missions: goals of several vehicles, which keep apart."""
-TABLES = ("csv", "mission")
+MISSIONS = ("swap", "sphere", "mission", "show")
+"""Shapes that are missions: goals or paths of several vehicles, which keep apart."""
+TABLES = ("csv", "mission", "show")
 """Shapes that are read from `reference.file`."""
 
 

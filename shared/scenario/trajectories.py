@@ -106,3 +106,9 @@ def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 1
 def mission(scenario: Scenario) -> Reference:
     """Mission with goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
     return missions.mission(scenario.table, scenario.model.axes)
+
+
+@reference
+def show(scenario: Scenario) -> Reference:
+    """Mission of timed paths, straight from row to row of the same table, each reached at its t."""
+    return missions.mission(scenario.table, scenario.model.axes, is_show=True)
