@@ -48,8 +48,6 @@ from skytether.shell.process import ProcessOptions
 
 @dataclass(frozen=True)
 class ClientOptions(ProcessOptions):
-    """Options of `skytether client`."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
@@ -213,7 +211,7 @@ def _memory(
 def _before(
     memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
 ) -> SavedState | None:
-    """State saved by an earlier run; whether it was usable is added to `warnings`."""
+    """State saved by an earlier run. A warning for the log is added to `warnings`."""
     try:
         saved = memory.read()
         if saved is None:

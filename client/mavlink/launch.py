@@ -2,9 +2,9 @@
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's own state says so; until then its command is repeated. Only a
-vehicle on the ground whose scenario is armed is armed, and a pilot's mode is left alone: once the
-vehicle is armed, its mode is changed only if it is one of ours.
+A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
+is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by a pilot is
+not changed: once the vehicle is armed, only a mode of `Flavour.own` is replaced.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
@@ -28,25 +28,23 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = SECOND_NS
-"""Time after which a command is repeated [ns]."""
 STREAM_NS = 500 * MILLISECOND_NS
-"""Time for which set-points are sent before requesting a mode that needs them [ns]."""
+"""Time for which set-points are sent before requesting a mode that needs them."""
 FRESH_NS = 500 * MILLISECOND_NS
-"""Age up to which a position counts as current [ns]."""
+"""Age up to which a position counts as current."""
 LAND_MAX_NS = 120 * SECOND_NS
-"""Longest wait for a landing [ns]."""
 RETURN_MAX_NS = 600 * SECOND_NS
-"""Longest wait for a return [ns]."""
 REFUSED_NS = 4 * SECOND_NS
-"""Time after which a vehicle that ignores the command to return is told to land [ns]."""
+"""Time after which a vehicle that ignores the command to return is commanded to land."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot that is reported as the reason why a step is not done [ns]."""
+"""Silence of the autopilot after which that silence is reported as the reason for a step not done.
+"""
 SILENT_MAX_NS = 10 * SECOND_NS
-"""Silence of the autopilot after which a landing is no longer waited for [ns]."""
+"""Silence of the autopilot after which the end of a landing is no longer awaited."""
 THERE_M = 0.3
-"""Largest difference from the take-off altitude at which the climb is over [m]."""
+"""Largest difference from the take-off altitude at which the climb is over."""
 STILL_MPS = 0.3
-"""Vertical speed below which the climb is over [m/s]."""
+"""Vertical speed below which the climb is over."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
 ARM = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM)
 TAKE_OFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
@@ -55,9 +53,7 @@ RESULTS = {
     number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_RESULT"].items()
 }
-"""Words for the results of commands."""
 SILENT = "nothing is heard of it"
-"""Reason why a step is not done if the autopilot is silent."""
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
     LaunchStep.HOLD: "not in a mode that holds",
@@ -69,8 +65,6 @@ NOT_DONE = {
 
 
 class Phase(Enum):
-    """Phase of a flight."""
-
     GROUND = auto()
     CLIMBING = auto()
     FLYING = auto()
@@ -82,14 +76,10 @@ class Launch:
 
     Args:
         vehicle: number of the vehicle, for events.
-        flavour: which autopilot.
         target: numbers of its system and component.
         altitude: take-off altitude above the ground [m].
         patience_ns: time that each step may take [ns].
         from_takeoff: whether our origin is where the vehicle is armed.
-        condition: status of the autopilot.
-        positions: its measurements.
-        events: list to which events are appended.
     """
 
     def __init__(
@@ -111,27 +101,26 @@ class Launch:
         self._condition, self._positions, self._events = condition, positions, events
         self.phase = Phase.GROUND
         self._step = 0
-        """Index of the current step of the take-off sequence."""
         self._since_ns: int | None = None
-        """Time since which the current step is waited for."""
+        """Start of the current step."""
         self._asked_ns: int | None = None
         """Time at which its command was last sent."""
         self._accepted = False
-        """Whether the take-off command was accepted."""
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
         self._asked_to_arm = False
-        """Whether the operator was told so."""
+        """Whether `why_not_armed` was reported to the operator."""
         self._hovers_ns: int | None = None
-        """Time since which it hovers until the origin is given; None while it does not."""
+        """Time since which the vehicle hovers because the origin is unknown; None while it does
+        not.
+        """
         self.took_off = False
-        """Whether this run of the client has armed it."""
         self._closed = False
-        """Whether nothing may begin any more."""
+        """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
-        """Number of the mode in which it comes down."""
+        """Number of the mode in which it descends."""
         self.waits_for = ""
-        """What is missing before it takes off, in words; empty if nothing is."""
+        """What prevents the take-off, in words; empty if nothing does."""
         self._stated_reason = ""
         """Reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
@@ -145,7 +134,6 @@ class Launch:
 
         Args:
             may_arm: whether a vehicle on the ground is armed.
-            now_ns: time now.
         """
         if self._is_flying and not self.failure:
             is_placed = self._is_placed(now_ns)
@@ -165,12 +153,11 @@ class Launch:
         return self.phase is Phase.FLYING
 
     def _is_placed(self, now_ns: int) -> bool:
-        """Whether the present position is known."""
         came_ns = self._positions.came_ns
         return came_ns is not None and now_ns - came_ns <= FRESH_NS
 
     def _begin(self, may_arm: bool, now_ns: int) -> None:
-        """Begin the climb when possible, or find that the vehicle is flying already."""
+        """Begin the climb when possible; a vehicle in the air is flown from there."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
         if self._silence(now_ns):
@@ -222,7 +209,7 @@ class Launch:
             self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.why_not_armed))
 
     def arm(self) -> None:
-        """Allow arming, as an operator said; ignored unless the vehicle is on the ground."""
+        """Allow arming, on an operator's order; ignored unless the vehicle is on the ground."""
         condition = self._condition
         if self.phase is Phase.GROUND and not (condition.armed or condition.is_airborne):
             self.why_not_armed, self._asked_to_arm = "", False
