@@ -53,8 +53,7 @@ class Compensator:
         """Number of horizons that arrived after a newer one, or again."""
         self.repeated = 0
         """Number of times that the horizon in force arrived again, because the server did not know
-        that it had arrived.
-        """
+        that it had arrived."""
 
     def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
         """Put a horizon in force unless a newer one has arrived; return whether it is in force now.

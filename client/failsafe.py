@@ -32,8 +32,8 @@ WINDOW_NS = SECOND_NS
 MALFORMED_MAX = 5
 """Number of malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
-"""Number of horizons from the future within `WINDOW_NS` after which the client opens a new session.
-"""
+"""Number of horizons from the future within `WINDOW_NS` after which the client opens a new
+session."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 """Margin added to the time that braking takes."""
 
@@ -54,8 +54,8 @@ BROKEN = frozenset(
 )
 """Causes after which the link has to be good for `GOOD_NS` again, in every mode."""
 LOCKING = BROKEN | GROUNDING | YIELDING | {Reason.LATE, Reason.RETURNED}
-"""Causes of braking after which horizons are refused until the vehicle hovers and the link is good.
-"""
+"""Causes of braking after which horizons are refused until the vehicle hovers and the link is
+good."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session, so that another WELCOME is needed."""
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}

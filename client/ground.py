@@ -13,8 +13,7 @@ SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
 The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
-of the packets each way.
-"""
+of the packets each way."""
 
 
 class GroundReports:
@@ -31,8 +30,7 @@ class GroundReports:
         self._welcomed: int | None = None
         self._silent_ns: int | None = None
         """Time of the newest packet before the server was reported as silent; None if it is not
-        silent.
-        """
+        silent."""
 
     def wait(self, waits_for: str, *, now_ns: int) -> None:
         """Report what prevents the flight (empty: nothing), once it has done so for a while."""

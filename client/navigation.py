@@ -30,12 +30,11 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
-"""Longest time over which a measurement is extrapolated; an older one is extrapolated by this time.
-"""
+"""Longest time over which a measurement is extrapolated; an older one is extrapolated by this
+time."""
 SIGMAS = 10.0
 """Standard deviations of sensor noise by which two measurements may differ without counting as a
-leap.
-"""
+leap."""
 
 
 class Sensing(NamedTuple):
@@ -86,20 +85,17 @@ class Navigation:
         self.leaps = Leaps(scenario)
         self.leapt = False
         """Whether a measurement since the last step is farther away than any vehicle could have
-        moved.
-        """
+        moved."""
         self._nothing = np.full((2, axes), math.nan)
         self.measured: Array = np.full((axes, 2), math.nan)
         """Measurements since the last step, position [m] and velocity [m/s] of each axis, NaN if
-        missing; shape (axes, 2).
-        """
+        missing; shape (axes, 2)."""
         self.estimate = self.measured
-        """Estimated present state, position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        """
+        """Estimated present state, position [m] and velocity [m/s] of each axis; shape (axes,
+        2)."""
         self.predicted = self.estimate
         """State in which the next input will take effect, used by feedback and in observations.
-        Without a dead time it is the estimate.
-        """
+        Without a dead time it is the estimate."""
         self.is_known = False
         """Whether the estimate is finite, also as float32."""
 
@@ -193,8 +189,7 @@ class Leaps:
         sensor = scenario.sensor
         self.off_m: list[float] = []
         """Distance of the newest position from the nearest one that the vehicle could have reached,
-        on each axis [m]; empty unless it has leapt.
-        """
+        on each axis [m]; empty unless it has leapt."""
         self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position = self._velocity = np.full(scenario.model.axes, math.nan)

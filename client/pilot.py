@@ -85,8 +85,7 @@ class Pilot:
         self._flown_ns = 0
         self._takes_from: int | None = None
         """Step of the first observation that announced that horizons are accepted; None while they
-        are not.
-        """
+        are not."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
@@ -97,8 +96,7 @@ class Pilot:
         self.missed = 0
         self.leap_m: tuple[float, ...] | None = None
         """Leap about which the operator has not decided: displacement on each axis [m], or empty if
-        only the velocity has leapt. None without a leap.
-        """
+        only the velocity has leapt. None without a leap."""
 
     @property
     def without_ns(self) -> int:

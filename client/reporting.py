@@ -19,8 +19,7 @@ from skytether.shared.wire.protocol import Mode
 
 RETRY_STEPS = 4
 """Number of steps after which a vehicle that waits for its first horizon reports again. The
-interval then doubles, so that a long wait costs few packets.
-"""
+interval then doubles, so that a long wait costs few packets."""
 
 
 @compilable

@@ -39,8 +39,7 @@ from skytether.shared.wire.protocol import (
 
 SLEPT_NS = JUMP_NS // 2
 """Advance of the server's clock over the client's that shows that this machine was suspended; far
-more than changing delays cause.
-"""
+more than changing delays cause."""
 UNANSWERED_NS = 5 * SECOND_NS
 """Time without a first answer after which the log reports it."""
 REFUSED = {

@@ -55,8 +55,7 @@ class VehicleMemory(msgspec.Struct, frozen=True, kw_only=True):
     unknown."""
     leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Displacement in `origin` about which the operator has not decided, see
-    `Vehicle.leap_m` [m].
-    """
+    `Vehicle.leap_m` [m]."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which the fields above were last valid [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
@@ -74,8 +73,7 @@ class Vehicle(ABC):
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None
     """Displacement of the measured position on each axis about which the operator has not decided
-    [m]; it is subtracted meanwhile. None: no leap, or the vehicle does not detect any.
-    """
+    [m]; it is subtracted meanwhile. None: no leap, or the vehicle does not detect any."""
     failure: Failure | None = None
     """Event that makes the vehicle unusable, so that no session is requested."""
 

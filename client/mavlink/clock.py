@@ -72,8 +72,7 @@ class BootClock:
         """Rate at which the client's clock gains on the autopilot's."""
         self._answers: deque[tuple[int, int]] = deque(maxlen=RATED)
         """Newest answers, whether or not the line fits them: the client's clock and time since boot
-        [ns].
-        """
+        [ns]."""
         self.jumps = 0
         """Number of restarts of the autopilot's clock, as after a reboot."""
 

@@ -16,8 +16,7 @@ NUMBERS = 256
 """Range of the sequence numbers of frames, which wrap around."""
 OVERTAKEN_NS = SECOND_NS
 """Longest time for which a frame with a lower number counts as overtaken; after a longer pause its
-sender may have restarted.
-"""
+sender may have restarted."""
 KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
 """Flag of an estimate with a valid velocity."""
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL

@@ -48,8 +48,7 @@ class Flavour:
     steps: tuple[LaunchStep, ...]
     streams_first: bool
     """Whether set-points have to be sent before the autopilot enters its guided mode; they also
-    bring it back there.
-    """
+    bring it back there."""
     words_for_stations: bool
     """Whether it sends status texts to ground stations only."""
     time_out: str

@@ -37,8 +37,8 @@ RETURN_MAX_NS = 600 * SECOND_NS
 REFUSED_NS = 4 * SECOND_NS
 """Time after which a vehicle that ignores the command to return is commanded to land."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot after which that silence is reported as the reason for a step not done.
-"""
+"""Silence of the autopilot after which that silence is reported as the reason for a step not
+done."""
 SILENT_MAX_NS = 10 * SECOND_NS
 """Silence of the autopilot after which the end of a landing is no longer awaited."""
 THERE_M = 0.3
@@ -112,8 +112,7 @@ class Launch:
         """Whether `why_not_armed` was reported to the operator."""
         self._hovers_ns: int | None = None
         """Time since which the vehicle hovers because the origin is unknown; None while it does
-        not.
-        """
+        not."""
         self.took_off = False
         self._closed = False
         """Whether take-off is no longer allowed."""
@@ -340,7 +339,6 @@ class Launch:
     # -- what is asked and heard -------------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Commands that are due now."""
         if self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS:
             return []
         command = self._command(now_ns)
@@ -393,7 +391,6 @@ class Launch:
         return dialect.MAVLink_command_long_message(*self._target, command, 0, *padded)
 
     def hear(self, message: Message) -> None:
-        """Process the answer to one of our commands."""
         command, result = message.command, message.result
         if command not in WORDS or result == IN_PROGRESS:
             return
@@ -414,5 +411,4 @@ class Launch:
         self._stated_reason = self._stated_reason or answer
 
     def hear_text(self, text: str) -> None:
-        """Note a text from the autopilot as the reason why a step is not done."""
         self._stated_reason = text
