@@ -261,7 +261,7 @@ class Launch:
                 return there and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
-        """Wait for the autopilot, and fail when it takes too long."""
+        """Wait for the autopilot; give up after too long."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if self.phase is Phase.GROUND:
@@ -273,7 +273,7 @@ class Launch:
             self._fail(waited, self._silence(now_ns) or self._stated_reason or why, now_ns)
 
     def _silence(self, now_ns: int) -> str:
-        """Sentence about a silent autopilot; empty if it is heard."""
+        """Message about a silent autopilot; empty if it is not silent."""
         heard_ns = self._condition.heard_ns
         if heard_ns is None or now_ns - heard_ns <= QUIET_NS:
             return ""
@@ -309,16 +309,14 @@ class Launch:
             self._enter(Phase.LANDING, now_ns)
 
     def close(self, *, now_ns: int) -> list[Message]:
-        """End the launch; returns messages that make the vehicle land if it is under our
-        control.
-        """
+        """End the launch; returns messages that land the vehicle if it is under our control."""
         self._closed = True
         if self.phase is Phase.GROUND or not self._is_ours(now_ns):
             return []
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether it is armed and in a mode of ours, as far as is currently known."""
+        """Whether the vehicle is armed and in a mode of ours, as far as is currently known."""
         condition = self._condition
         in_ours = condition.mode in self._flavour.own and condition.armed
         return in_ours and condition.is_fresh(now_ns=now_ns)

@@ -12,15 +12,13 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 SPACING = 10
-"""Steps from one knot to the next."""
 INTERVALS = 12
-"""Number of planned intervals."""
 JOIN_MAX = 3
 """Largest number of intervals that a new motion copies from the motion in force."""
 SAMPLES = 4
 """Number of straight pieces that approximate an interval of a motion."""
 MARGIN_M = 0.03
-"""Least margin of a plan, see `Clearances` [m]."""
+"""Smallest margin of a plan, see `Clearances`."""
 
 
 Knots = Annotated[Array, 2]
@@ -45,7 +43,7 @@ class Motion(NamedTuple):
     def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
         """Positions [m] and velocities [m/s] at steps, which may be fractional.
 
-        Before the first knot the vehicle rests there.
+        Before the first knot the vehicle is at rest there.
 
         Args:
             steps: shape (n,).

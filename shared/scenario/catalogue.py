@@ -46,7 +46,6 @@ def keys_of(*groups: InFlight) -> frozenset[str]:
 
 
 def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
-    """Terms on which two ends differ, named by their keys."""
     return tuple(
         Difference(TERMS[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(Terms._fields, here, there, strict=True)
