@@ -199,7 +199,7 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
-    # Last goals of other vehicles; with `allocate` they are only known in the server.
+    # Last goals of other vehicles; with `allocate` only the server knows them.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     beside = " to the side" if scenario.lands else ""

@@ -16,13 +16,13 @@ from skytether.shared.scenario.grammar import GrammarError, calls
 from skytether.shared.scenario.reference import FAR_M, Reference, check_times, read_table
 
 SWAP_AT_S = 2.0
-"""Time at which vehicles that swap places depart [s]."""
+"""Time at which vehicles that swap places depart."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
 VEHICLES_MAX = 65_535
 """Largest number of a vehicle."""
 CROWDED = 32
-"""Number of stays in neighbouring cells at one time above which two of them are surely too near."""
+"""Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
 
 class Mission:
@@ -44,12 +44,10 @@ class Mission:
 
     @property
     def vehicles(self) -> tuple[int, ...]:
-        """Numbers of the vehicles that have goals."""
         return tuple(self._goals)
 
     @property
     def places(self) -> Array:
-        """All goals of all vehicles [m]; shape (n, axes)."""
         return np.concatenate([points_m for _, points_m in self._goals.values()])
 
     @property
@@ -60,19 +58,15 @@ class Mission:
 
     @property
     def lasts_s(self) -> float:
-        """Time of the last goal [s]."""
         return max(float(times_s[-1]) for times_s, _ in self._goals.values())
 
     def of(self, vehicle: int) -> "Mission":
-        """The reference of another vehicle."""
         return Mission(self._goals, self._axes, vehicle)
 
     def goals(self, vehicle: int) -> Array:
-        """Goals of a vehicle [m]; shape (n, axes)."""
         return self._goals[vehicle][1]
 
     def __call__(self, t: NDArray[Any]) -> Array:
-        """Goals at times [s]; see `Reference`."""
         t = np.asarray(t, dtype=np.float64)
         if not t.ndim:  # of one vehicle at each step: no search in arrays
             state = np.zeros((self._axes, 2))
@@ -122,17 +116,14 @@ class _Stays(NamedTuple):
     """Stays of all vehicles: a goal, from its time until that of the vehicle's next goal."""
 
     vehicles: NDArray[np.int64]
-    """Number of each stay's vehicle; shape (n,)."""
     begin_s: Array
-    """Time at which each stay begins [s]; shape (n,)."""
     end_s: Array
-    """Time at which each stay ends [s]; shape (n,)."""
     places_m: Array
     """Goal of each stay, heights scaled [m]; shape (n, axes)."""
 
     @classmethod
     def of(cls, goals: Mapping[int, tuple[Array, Array]], height: float) -> "_Stays":
-        """Stays at the vehicles' goals, sorted by the time at which they begin."""
+        """Stays at the vehicles' goals, sorted by start time."""
         counts = [len(times_s) for times_s, _ in goals.values()]
         begin_s = np.concatenate([times_s for times_s, _ in goals.values()])
         ends_s = [np.append(times_s[1:], np.inf) for times_s, _ in goals.values()]
@@ -143,7 +134,6 @@ class _Stays(NamedTuple):
         return cls(vehicles[order], begin_s[order], np.concatenate(ends_s)[order], places_m[order])
 
     def distance_m(self, one: int, other: int) -> float:
-        """Distance of two stays [m]."""
         return float(np.linalg.norm(self.places_m[one] - self.places_m[other]))
 
     def nearest(self, apart_m: float) -> tuple[int, int] | None:
@@ -242,8 +232,8 @@ class Guided:
         self._references, self.goals = references, goals
 
     def of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: its replaced goal, if any; its start at time 0 is never
-        replaced.
+        """Reference of a vehicle: its replaced goal, if any; its start at time
+        0 is never replaced.
         """
         original = self._references(vehicle)
 

@@ -31,8 +31,8 @@ class TooFast(NamedTuple):
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight: no live point, target or
-    mission.
+    """Whether the desired trajectory is known before the flight: no live
+    point, target or mission.
     """
     return scenario.reference.shape not in ("live", "target") and not scenario.is_mission
 
@@ -40,20 +40,14 @@ def is_known(scenario: Scenario) -> bool:
 def excess(scenario: Scenario, velocity: Array) -> Array:
     """Ratio of the desired speed to the vehicle's largest, on each axis; shape (n, axes).
 
-    Args:
-        scenario: has u_max and the gain.
-        velocity: desired velocity [m/s]; shape (n, axes).
+    `velocity` is the desired velocity [m/s]; shape (n, axes).
     """
     ratio: Array = np.abs(velocity) / (scenario.u_max * scenario.model_gain)
     return ratio
 
 
 def is_too_fast(scenario: Scenario, velocity: Array) -> Flags:
-    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,).
-
-    Args:
-        scenario, velocity: see `excess`.
-    """
+    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,)."""
     over: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
     return over
 
