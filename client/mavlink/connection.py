@@ -141,6 +141,6 @@ def _sender(message: Message) -> tuple[int, int]:
 
 def _content(messages: Sequence[Message]) -> str:
     if not messages:
-        return "what is no MAVLink"
+        return "data that is not MAVLink"
     system, component = _sender(messages[-1])
     return f"{messages[-1].get_type()} of system {system}, component {component}"

@@ -53,11 +53,11 @@ RESULTS = {
     number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_RESULT"].items()
 }
-SILENT = "nothing is heard of it"
+SILENT = "it is silent"
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
     LaunchStep.HOLD: "not in a mode that holds",
-    LaunchStep.GUIDE: "not in the mode that obeys us",
+    LaunchStep.GUIDE: "not in the mode that follows set-points",
     LaunchStep.ARM: "not armed",
     LaunchStep.LIFT: "not taken off",
     LaunchStep.CLIMB: "not at the altitude of take-off",
@@ -137,7 +137,7 @@ class Launch:
         if self._is_flying and not self.failure:
             is_placed = self._is_placed(now_ns)
             if not is_placed:
-                self._wait("not flown", "it does not tell where it is", now_ns)
+                self._wait("not flown", "its position is unknown", now_ns)
             return is_placed
         if self.failure or self._closed or self.phase is Phase.LANDING:
             return False
@@ -162,9 +162,9 @@ class Launch:
         if self._silence(now_ns):
             self._wait("not ready", SILENT, now_ns)
         elif not condition.is_fresh(now_ns=now_ns) or not condition.landed:
-            self._wait("not ready", "it does not say whether it is on the ground", now_ns)
+            self._wait("not ready", "it does not report whether it is on the ground", now_ns)
         elif not self._is_placed(now_ns):
-            self._wait("not ready", "it does not tell where it is", now_ns)
+            self._wait("not ready", "its position is unknown", now_ns)
         elif condition.is_flying and condition.mode == flavour.guided:
             self._go_on(now_ns)
         elif condition.armed and condition.is_airborne:
@@ -198,7 +198,7 @@ class Launch:
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
             self._enter(Phase.FLYING, now_ns)  # it is under our control, and lands
-            self._fail(waited, "nobody has said where its origin is, see mavlink.origin", now_ns)
+            self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
         """Report once that an operator has to allow arming."""
@@ -277,7 +277,7 @@ class Launch:
         heard_ns = self._condition.heard_ns
         if heard_ns is None or now_ns - heard_ns <= QUIET_NS:
             return ""
-        return f"nothing is heard of its autopilot for {(now_ns - heard_ns) / SECOND_NS:.0f} s"
+        return f"no message from its autopilot for {(now_ns - heard_ns) / SECOND_NS:.0f} s"
 
     def _fail(self, doing: str, why: str, now_ns: int) -> None:
         self.failure = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)

@@ -196,7 +196,7 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
         Rule(
             ("SYSID_MYGCS", "MAV_GCS_SYSID"),
             lambda v: (
-                f"it notices that system {v:g} is gone, and heeds a joystick of no other; ours is "
+                f"it watches for system {v:g} alone, and accepts a joystick from no other; ours is "
                 f"{system}"
             ),
             _among(system),
@@ -221,14 +221,14 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
         ),
         Rule(
             ("BATT_FS_LOW_ACT",),
-            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+            _table({0: "a low battery is only reported"}, "with a low battery it acts by itself"),
         ),
         Rule(("FENCE_ENABLE",), _table(_FENCES, "its own fence is on")),
         Rule(("FENCE_TYPE",), _fence_types),
         Rule(
             ("FENCE_ACTION",),
             _table(
-                {0: "beyond its fence it only says so", 4: "beyond its fence it brakes"},
+                {0: "beyond its fence it only reports it", 4: "beyond its fence it brakes"},
                 "beyond its fence it returns home or lands",
             ),
         ),
@@ -276,12 +276,12 @@ def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
         Rule(("COM_DL_LOSS_T",), lambda v: f"a ground station is lost after {v:g} s"),
         Rule(
             ("COM_LOW_BAT_ACT",),
-            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+            _table({0: "a low battery is only reported"}, "with a low battery it acts by itself"),
         ),
         Rule(
             ("GF_ACTION",),
             _table(
-                {0: "beyond its fence it goes on", 1: "beyond its fence it only says so"},
+                {0: "beyond its fence it goes on", 1: "beyond its fence it only reports it"},
                 "beyond its fence it acts by itself",
             ),
         ),

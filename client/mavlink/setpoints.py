@@ -70,15 +70,13 @@ class Setpoints:
     ) -> Vector | None:
         """Velocity to be sent now, in our axes [m/s]; None if none may be sent.
 
-        After a pause in which the autopilot has left its guided mode, which the first set-point
-        would bring back, its mode has to be heard first.
+        After a pause the autopilot may have left its guided mode, and a set-point would bring it
+        back there. So a heartbeat with its mode has to arrive first.
 
         Args:
-            sends: which set-points are sent.
             leaves_ns: pause after which the autopilot leaves its guided mode [ns]; None if a
                 set-point never brings it back.
             heartbeat_ns: time of the autopilot's newest heartbeat.
-            now_ns: time now.
         """
         if sends is Sends.NOTHING:
             return None

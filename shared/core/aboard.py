@@ -127,7 +127,7 @@ class ClockSilent(VehicleEvent, frozen=True, kw_only=True):
     def __str__(self) -> str:
         return (
             f"vehicle {self.vehicle}: its autopilot has not answered TIMESYNC for "
-            f"{self.silent_s:.0f} s: its clock is followed as it ran until then"
+            f"{self.silent_s:.0f} s: its time is extrapolated from earlier answers"
         )
 
 
@@ -158,7 +158,7 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
     """Distance of the velocity from the range that the commands explain [m/s]."""
 
     def __str__(self) -> str:
-        off = f"flies {self.off_mps:.1f} m/s otherwise than it is told"
+        off = f"deviates by {self.off_mps:.1f} m/s from its commands"
         return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
 
 
@@ -207,7 +207,7 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         at = ", ".join(f"{each:.2f}" for each in self.place)
-        said = "say where its origin lies there: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        said = "set its origin in that frame: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
         return (
             f"vehicle {self.vehicle} hovers at [{at}] of its autopilot's local frame "
             f"(north, east, up), and its origin is not known; {said}"

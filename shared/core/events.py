@@ -88,7 +88,7 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Largest speed of the vehicle along the same axis [m/s]."""
 
     def __str__(self) -> str:
-        asked = f"the desired trajectory asks {self.speed_mps:.3g} m/s at {self.at_s:g} s"
+        asked = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
         most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
         return f"{asked}, and the vehicle flies at most {most}: it cannot follow"
 
@@ -144,7 +144,7 @@ class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     traceback: str
 
     def __str__(self) -> str:
-        return f"a mistake in its code, the flight goes on\n{self.traceback.rstrip()}"
+        return f"an error in its code, the flight goes on\n{self.traceback.rstrip()}"
 
 
 class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -164,7 +164,7 @@ class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     def __str__(self) -> str:
         return (
-            f"a packet has come back from {self.times} new addresses, and opens no more flows: the "
+            f"a packet has returned from {self.times} new addresses, and opens no more flows: the "
             "server has never answered, and its address may lead back to this netem"
         )
 
@@ -199,7 +199,7 @@ class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """MAVLink severity, from 0 (emergency) to 7."""
 
     def __str__(self) -> str:
-        return self.text or "nothing in words"
+        return self.text or "an empty text"
 
 
 class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -212,7 +212,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
-        return f"{self.count} datagrams dropped so far that were no vehicle's, {newest}"
+        return f"{self.count} datagrams dropped so far as forged, repeated or too old, {newest}"
 
 
 class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -292,8 +292,8 @@ class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         return (
-            f"vehicle {self.vehicle}: its client has begun anew without its motion; until it is "
-            "heard, others keep away from all of that"
+            f"vehicle {self.vehicle}: its client has restarted without its motion; until its "
+            "first packet arrives, others keep clear of every place where it may be"
         )
 
 
@@ -327,7 +327,7 @@ class NoAnswer(PeerEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         if self.secure:
-            said = f"nobody who knows this key answers at {self.peer} in {self.waited_s:.0f} s"
+            said = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
             return f"vehicle {self.vehicle}: {said}"
         return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
 
@@ -423,7 +423,7 @@ class InZone(VehicleEvent, frozen=True, kw_only=True):
     """Zone, as written in the scenario."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is led out"
+        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is guided out"
 
 
 class LeftTube(VehicleEvent, frozen=True, kw_only=True):
@@ -475,8 +475,8 @@ class TimeUnknown(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     def __str__(self) -> str:
         return (
             'link.time_of_day is "host", and the kernel of this host does not say how wrong its '
-            "clock is: delays alone tell of clocks (chrony needs `rtcsync` in its configuration; "
-            "systemd-timesyncd states no error)"
+            "clock is: clocks are compared by delays alone (chrony needs `rtcsync` in its "
+            "configuration; systemd-timesyncd states no error)"
         )
 
 
@@ -516,7 +516,9 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
     reason: str
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: what an earlier run kept is not followed: {self.reason}"
+        return (
+            f"vehicle {self.vehicle}: the state saved by an earlier run is not used: {self.reason}"
+        )
 
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -526,14 +528,14 @@ class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     def __str__(self) -> str:
         each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
-        return f"in force again from {self.path}, as it was set in flight: {each}"
+        return f"set in flight and in force again, from {self.path}: {each}"
 
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     reason: str
 
     def __str__(self) -> str:
-        return f"what the next run of this process must know cannot be kept: {self.reason}"
+        return f"the state for the next run of this process cannot be saved: {self.reason}"
 
 
 class Finished(VehicleEvent, frozen=True, kw_only=True):

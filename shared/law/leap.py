@@ -35,13 +35,10 @@ def displacement(p: float, v: float, after_p: float, after_v: float, time: float
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
-    """Whether no vehicle can have moved from one position to the other.
+    """Whether no vehicle can have moved from one position to the other; arguments as in
+    `displacement`.
 
-    Args:
-        p, v: position [m] and velocity [m/s] on one axis before.
-        after_p, after_v: position [m] and velocity [m/s] after.
-        time: time between the two [s].
-        noise: change of position that noise may cause [m].
+    `noise` is the change of position that noise may cause [m].
     """
     return abs(displacement(p, v, after_p, after_v, time)) > most_m(time, noise)
 

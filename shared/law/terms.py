@@ -16,11 +16,8 @@ from skytether.shared.law.model import Model, discretise
 
 class Difference(msgspec.Struct, frozen=True):
     key: str
-    """Key of the scenario."""
     here: str
-    """Value at the end that reports it."""
     there: str
-    """Value at the other end."""
 
 
 FLOWN_AS = ("committed", "predictive", "trajectory", "none")

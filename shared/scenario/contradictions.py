@@ -154,7 +154,7 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
         expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
         yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
-        expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
+        expected = "'land' on a mission: all other vehicles expect a vertical landing"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected
     # A vehicle that receives nothing flies its motion to the end before it brakes.
     longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
@@ -228,7 +228,7 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
     mission, goals = scenario.mission, scenario.unallocated_reference()
     assert isinstance(goals, Mission)
     if mission.allocate and not goals.in_step:
-        expected = "false, or a goal of each vehicle at each time that one of them has one"
+        expected = "false, or goals of all vehicles at the same times"
         yield "mission.allocate", "true", expected
         return
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m

@@ -425,7 +425,8 @@ class Scenario(Section, frozen=True):
     duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
     """Length of the flight [s]."""
     settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
-    """Time at the start that RMSE leaves out [s]; at most half of the flight."""
+    """Time at the start that RMSE leaves out [s]; half of the flight if it is shorter than
+    this time."""
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
     """Seed of all random numbers."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True

@@ -77,14 +77,14 @@ REASON_TEXTS = {
     Reason.GOOD: "the link has been good for a second",
     Reason.UNARMED: "it is not armed",
     Reason.HORIZON: "a horizon has come",
-    Reason.OLD: "no newer horizon has come",
+    Reason.OLD: "no newer horizon has arrived",
     Reason.ENDED: "its plan has ended",
     Reason.LOST: "the server is silent",
     Reason.CLOSED: "the server has closed the session",
     Reason.RESTARTED: "the server has restarted",
-    Reason.LATE: "horizons come too late",
+    Reason.LATE: "horizons arrive too late",
     Reason.MALFORMED: "the server sends malformed messages",
-    Reason.RESYNC: "the server plans for impossible times",
+    Reason.RESYNC: "the server sends horizons from the future",
     Reason.STALLED: "its own computer woke it too late",
     Reason.BRAKED: "it has braked",
     Reason.ALONE: "the server has been silent for long",
@@ -92,15 +92,15 @@ REASON_TEXTS = {
     Reason.LEAPT: "its state has jumped further than a vehicle can move",
     Reason.TAKEN: "a pilot, or its autopilot, has taken over",
     Reason.DISARMED: "its motors are disarmed",
-    Reason.RETURNED: "its autopilot obeys again",
+    Reason.RETURNED: "its autopilot follows commands again",
     Reason.BATTERY: "its battery is low",
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
     Reason.HOMEWARD: "the server has been silent for long",
     Reason.RIVAL: "somebody else commands its autopilot",
-    Reason.STRAYED: "it does not do what it is told",
-    Reason.WAITED: "what it waits for has not come for long",
-    Reason.RESUMED: "its process has restarted, and it goes on along its motion",
+    Reason.STRAYED: "it does not follow its commands",
+    Reason.WAITED: "it has waited too long",
+    Reason.RESUMED: "its process has restarted, and it continues its motion",
     Reason.UNUSABLE: "the positions of its autopilot cannot be used",
 }
 
@@ -111,17 +111,9 @@ def client_columns(axes: int) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            (
-                "state",
-                "<f8",
-                (axes, 2),
-            ),  # true position [m] and velocity [m/s]; for a real vehicle, the estimate
+            ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
             ("measured", "<f8", (axes, 2)),  # since the step before [m, m/s]; NaN if not measured
-            (
-                "estimate",
-                "<f8",
-                (axes, 2),
-            ),  # used by feedback and in observations, see docs/vehicles.md
+            ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether it comes from a horizon: not while hovering or braking
             ("in_force", "<i8"),  # step that the horizon in force was made for; -1 for none
@@ -153,14 +145,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without a
             # plan, or without a trigger that needs expected_gap
             *((figure, "<f8") for figure in properties(scheme).figures),
-            (
-                str(Compared.OWN),
-                "<f8",
-            ),  # figure of a plug-in's policy, in the policy's own unit; else NaN
-            (
-                "threshold",
-                "<f8",
-            ),  # threshold of the compared figure, in its unit; 0 if nothing is compared
+            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit; else NaN
+            ("threshold", "<f8"),  # of the compared figure; 0 if nothing is compared
             ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),
             ("solved", "?"),

@@ -17,13 +17,12 @@
 |      |             |         | silence                                                    |
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 
-With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
+With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
 
-`docs/protocol.md` has the bytes. What the receiver knows is not sent: a state is sampled at the
-begin of its step, so that the vehicle's clock is its step; a stamp is told in microseconds modulo
-2^32 (71 minutes), and is the one of these times that lies nearest to what the receiver expects. A
-datagram that is not exactly one of these messages is a `ProtocolError`: the peer's mistake, to be
-dropped and counted by its reason, never answered.
+A state is sampled at the start of its step, so the step number is also its time stamp. Other time
+stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 that
+comes nearest to the expected time. A datagram that is not exactly one of these messages is an error
+of the peer (`ProtocolError`): dropped, counted by its reason, and never answered.
 """
 
 import math
@@ -242,10 +241,10 @@ class Idle(IntEnum):
 
 
 IDLE_TEXTS = {
-    Idle.PLANS: "no newer horizon has come",
+    Idle.PLANS: "no newer horizon has arrived",
     Idle.OBSERVATION: "its newest observation at the server is older than link.age_max_s",
-    Idle.DELAY: "the delay to it is longer than a horizon has room for",
-    Idle.UNSOLVED: "the solver has found none",
+    Idle.DELAY: "the delay to it is longer than a horizon can cover",
+    Idle.UNSOLVED: "the solver has found no plan",
 }
 
 

@@ -315,7 +315,7 @@ def _checked(
     _refuse(delay_s < 0.0, delay_s, "a delay of at least 0, or -1 of a lost packet")
     _refuse(delay_s > DELAY_MAX_S, delay_s, f"a delay of at most {DELAY_MAX_S:g} s")
     if lost.all():
-        raise ValueError("got lost packets alone, expected at least one that came")
+        raise ValueError("got lost packets only, expected at least one that arrived")
     order = np.argsort(time_s, kind="stable")
     time_s, delay_s, lost = time_s[order] - time_s[order[0]], delay_s[order], lost[order]
     if time_s[-1] > 1e9:
