@@ -46,7 +46,6 @@ class Compensator:
         """First step whose input came from the horizon in force."""
         self._new = False
         self.observed = -1
-        """Step of the observation that the horizon in force was planned from, or -1."""
         self.covered = False
         """Whether the horizon in force has an input for the latest chosen step."""
         self.stale = 0
@@ -107,7 +106,7 @@ class Compensator:
 
         Args:
             made_for: step of the first knot.
-            observed: step of the observation that it was planned from.
+            observed: step of the observation that the spline was planned from.
             spacing: steps from one knot to the next.
             knots: position [m] and velocity [m/s] of each knot; shape (axes, knots, 2).
         """
@@ -161,11 +160,10 @@ class Compensator:
     def choose(
         self, step: int, state: Array, disturbance: Array, before: Array
     ) -> tuple[list[float], list[float]]:
-        """Input u* of a step, and the same without feedback, on each axis [m/s].
+        """Input u* of a step, and the same without feedback, on each axis [m/s]; see
+        `Follower.input_at`.
 
-        Args:
-            step: k, never smaller than before.
-            state, disturbance, before: see `Follower.input_at`.
+        `step` never decreases.
 
         Source: eq. (11).
         """

@@ -122,14 +122,12 @@ class Client(Endpoint):
         )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
-        """Event at the end of a flight that had no plan."""
         self._land_after_s = scenario.vehicle.land_after_s
         self._reported_leap: tuple[float, ...] | None = None
         self._ground = GroundReports(vehicle, server, self._timeout_ns, self._events)
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
-        """Time of day; None if the host does not know it."""
         self._time_due_ns = 0
         self.horizons = 0
         self.dropped: Counter[Drop] = Counter()
@@ -140,7 +138,6 @@ class Client(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether the flight has ended, or cannot begin, and the vehicle is down."""
         pilot = self._pilot
         if pilot.next_ns is not None:
             return pilot.step >= pilot.steps and self._flies.is_down
@@ -148,17 +145,14 @@ class Client(Endpoint):
 
     @property
     def missed(self) -> int:
-        """Number of steps missed because the process was delayed."""
         return self._pilot.missed
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._pilot.began_ns
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._pilot.disturbance
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -189,8 +183,8 @@ class Client(Endpoint):
     def _begin(self, now_ns: int) -> None:
         """Begin the flight once the first session is open and the vehicle can be flown.
 
-        The flight of an earlier run continues at once, while the client asks for a session: the
-        vehicle follows the motion that was in force, or hovers.
+        The flight of an earlier run continues at once, before there is a session: the vehicle
+        follows the motion that was in force, or hovers.
         """
         before, flies = self._memory.before, self._flies
         if self._session.number is not None:
@@ -209,7 +203,7 @@ class Client(Endpoint):
         cause = Reason.RESUMED if motion else Reason.LOST
         self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
 
-    # -- what is kept ------------------------------------------------------------------------
+    # -- saved state -------------------------------------------------------------------------
 
     def _to_keep(self) -> SavedState:
         pilot, compensator = self._pilot, self._pilot.compensator
@@ -299,8 +293,8 @@ class Client(Endpoint):
             self._tell_leap(pilot.leap_m)
         if pilot.step >= pilot.steps:
             self._end(now_ns)
-        # Nothing is sent before the state is saved: otherwise the server would forget a motion that
-        # the next run flies.
+        # Nothing is sent before the state is saved: otherwise the server would not know which
+        # motion the next run flies.
         if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
             return
         observation = pilot.observation(session)
@@ -345,7 +339,6 @@ class Client(Endpoint):
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def _tell_time(self, now_ns: int) -> None:
-        """Report at intervals the time of day at which step 0 began; only on a mission."""
         if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
             return
         error_ns = self._time.error_at(now_ns)

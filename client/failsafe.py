@@ -40,7 +40,6 @@ BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
 """Causes for which a pilot flies the vehicle, or nobody."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
-"""Causes that make the vehicle brake and land."""
 BROKEN = frozenset(
     {
         Reason.LOST,
@@ -190,10 +189,10 @@ class Failsafe:
         """Time since which the link has been good; only valid while it is good."""
         self._horizon_ns = 0
         self._late_ns: int | None = None
-        """Time since which all horizons have been late; None if the newest was not."""
+        """Time since which all horizons have been late; None if the newest was in time."""
         self._began_ns = 0
         self._waits_ns = 0
-        """Time since which the vehicle has waited for what it needs to fly on."""
+        """Start of the wait for a good link, a ready autopilot or an operator."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         self.has_leapt = False
         """Whether the measured state has leapt and the operator has not yet chosen a frame."""
@@ -205,7 +204,6 @@ class Failsafe:
 
     @property
     def heard_ns(self) -> int | None:
-        """Time of the newest packet of the session; None without a session."""
         return self._heard_ns
 
     @property
@@ -230,7 +228,7 @@ class Failsafe:
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
-    # -- what arrives ------------------------------------------------------------------------
+    # -- messages and packets ----------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:
         """Note a packet of the session; on a secured link, an authenticated one."""
@@ -274,7 +272,7 @@ class Failsafe:
         if _full(self._future, now_ns):
             self.meet(Reason.RESYNC, now_ns=now_ns)
 
-    # -- what time brings --------------------------------------------------------------------
+    # -- timers ------------------------------------------------------------------------------
 
     def step(self, *, late_ns: int, hindrance: Reason | None, now_ns: int) -> None:
         """Handle the causes that hold at the start of a step.
@@ -322,7 +320,9 @@ class Failsafe:
             self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
-        """Land after waiting too long for a good link, a ready autopilot or an operator."""
+        """Note a leap of the state: no horizon is accepted until an operator
+        has chosen the frame.
+        """
         # With HOLD there is no failsafe, and a leap stops nothing.
         self.has_leapt = self.brakes
         if self.reason not in LOCKING:

@@ -44,7 +44,8 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether a bound limited the latest requested input; the limit of speed does not count."""
+        """Whether a bound limited the latest requested input; a bound on the speed alone does not
+        count."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]

@@ -23,11 +23,8 @@ def apart_ns(vehicles: int, dt_ns: int) -> int:
 
 
 class ClientFleet(Endpoint):
-    """Clients driven as one endpoint; client n uses socket n.
-
-    Args:
-        clients: clients, none of which has been woken yet.
-        apart_ns: time from one start to the next [ns].
+    """Clients driven as one endpoint; client n uses socket n. No client may
+    have been woken before.
     """
 
     def __init__(self, clients: Sequence[Client], apart_ns: int = 0) -> None:
@@ -44,12 +41,10 @@ class ClientFleet(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether every vehicle has finished."""
         return not self._flying
 
     @property
     def failure(self) -> Failure | None:
-        """Event of the first failed vehicle."""
         return next((client.failure for client in self._clients if client.failure), None)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -81,7 +76,6 @@ class ClientFleet(Endpoint):
             client.learn_time(utc_ns, error_ns, now_ns=now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """Objection of the first client that has one."""
         said = (client.objection(scenario, keys) for client in self._clients)
         return next(filter(None, said), "")
 

@@ -38,7 +38,6 @@ class FlownMotion(msgspec.Struct, frozen=True, kw_only=True):
     step: Step
     observed: Step
     spacing: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
-    """Steps from one knot to the next."""
     numbers: Annotated[bytes, msgspec.Meta(max_length=4 * 3 * 2 * KNOTS_MAX)]
     """Position [m] and velocity [m/s] of each knot, float32 of shape (axes, knots, 2)."""
 
@@ -63,12 +62,9 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     boot_id: int | None = None
     """Boot id of the conversation with the server; None if it cannot continue."""
     began_ns: Time | None = None
-    """Start of step 0; None before the flight."""
     heard_ns: Time = 0
-    """Time of the newest packet from the server."""
     motion: FlownMotion | None = None
     frame: VehicleMemory = VehicleMemory()
-    """State saved for the vehicle itself."""
 
     def after(self, time_ns: int) -> "SavedState":
         began_ns = None if self.began_ns is None else self.began_ns + time_ns
@@ -139,7 +135,6 @@ class ClientMemory:
         self._age_max_ns = age_max_ns(terms)
         self.before = before or SavedState()
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
-        """Boot id of the conversation with the server."""
         self._handed: tuple[SavedState, int] | None = None
         """State returned last for writing, and when."""
         self._written: tuple[SavedState, int] | None = None

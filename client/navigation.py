@@ -45,7 +45,7 @@ class Sensing(NamedTuple):
     prompt: bool
     """Whether it measures the whole state at every step without delay."""
     exact: bool
-    """Whether, moreover, it has no noise and no bias."""
+    """Whether it also has neither noise nor bias."""
 
 
 def sensing(scenario: Scenario) -> Sensing:
@@ -141,7 +141,6 @@ class Navigation:
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
@@ -271,7 +270,7 @@ class Newest:
         self.take(measured, numbers)
 
     def advance(self, due: Array, swing: Array | None = None) -> None:
-        """The values stay as they are."""
+        pass
 
     def disturbance(self) -> Array:
         """Disturbance of each axis: unknown, so 0 [m/s]."""
@@ -284,5 +283,4 @@ class Newest:
             self._state[:, 1] = numbers[1]
 
     def estimate(self) -> Array:
-        """Position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
         return self._state.copy()

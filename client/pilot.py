@@ -104,12 +104,10 @@ class Pilot:
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._navigation.disturbance
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._epoch_ns or 0
 
     def starts_ns(self, step: int) -> int:
@@ -138,7 +136,7 @@ class Pilot:
             ProtocolError: the horizon is dropped.
         """
         terms = self._terms
-        # A horizon that was overtaken is late anyway, and says nothing about the newest.
+        # An overtaken horizon is late anyway, and shows no delay of the newest.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
@@ -301,16 +299,14 @@ class Pilot:
     def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
         """Largest speed of the input without feedback [m/s]: without a plan the vehicle brakes.
 
-        Args:
-            had_plan: whether the previous step had a plan.
-            has_plan: whether this step has one.
+        `had_plan` is about the previous step, `has_plan` about this one.
         """
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
         if has_plan or not brakes:
             return math.inf
         return braked(self._speed, 0 if had_plan else 1, self._terms.brake)
 
-    # -- what is told of a step --------------------------------------------------------------
+    # -- observation and record --------------------------------------------------------------
 
     def observation(self, session: ServerSession) -> Observation | None:
         """Observation of the present step; None if none is due or the state is unknown."""

@@ -101,7 +101,7 @@ class ServerSession:
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
-        """Longest silence allowed to the server."""
+        """Measures losses, and chooses the longest silence to allow the server."""
         self.silence_asked = hearing.silence
         """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
@@ -114,7 +114,6 @@ class ServerSession:
         self._began_ns: int | None = None
         self._is_unanswered = False
         self.number: int | None = None
-        """Number of the session; None before the first."""
         self._is_open = False
         """Whether the session may continue; otherwise only a WELCOME is accepted."""
         self._server_boot_id: int | None = None
@@ -126,7 +125,7 @@ class ServerSession:
         self.failure: Failure | None = None
         """Event that makes a session impossible."""
 
-    # -- what is heard -----------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------
 
     def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | Trajectory | None:
         """Process a datagram of this session; return its horizon or trajectory, if it contains one.
@@ -160,7 +159,6 @@ class ServerSession:
         return None
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
-        """Message in a payload; the failsafe counts a malformed one if it is authenticated."""
         try:
             return decode(payload, self._terms)
         except ProtocolError:
@@ -236,7 +234,7 @@ class ServerSession:
             self.silence_asked = message.silence
             self.hearing.hear(message.number, server_ns)
 
-    # -- what is said ------------------------------------------------------------------------
+    # -- sending -----------------------------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> None:
         """Send HELLO if the server is silent, or the link needs new keys."""
@@ -270,7 +268,7 @@ class ServerSession:
 
     def wait(self, *, now_ns: int) -> bool:
         """Whether to go on waiting for the flight; fails after too long without a session."""
-        if self.number is not None:  # the vehicle is not up yet
+        if self.number is not None:  # the vehicle is still on the ground
             return True
         if self._began_ns is None:
             self._began_ns = now_ns

@@ -51,19 +51,14 @@ class Parts(NamedTuple):
 
 
 class Autopilot:
-    """One autopilot and its state as known from its messages.
-
-    Args:
-        scenario: scenario, with its keys of `mavlink`.
-        vehicle: number of the vehicle, for events.
-        altitude: take-off altitude [m].
-        events: list to which events are appended.
+    """One autopilot and its state as known from its messages; `altitude` is
+    that of take-off [m].
     """
 
     parts: Parts | None = None
     """None until a heartbeat of a suitable autopilot has arrived."""
     _unfit: NotTakenOff | None = None
-    """Event that the vehicle is unsuitable or silent, and not flown."""
+    """Event that makes the vehicle unusable: unsuitable or silent."""
     _set_up_ns: int | None = None
     """Time at which everything but the clock was ready."""
     _began_ns: int | None = None
@@ -84,19 +79,16 @@ class Autopilot:
         )
         self._texts = LoggedTexts(vehicle, events)
         self.sets_parameters = False
-        """Whether unsafe parameters are changed."""
         self.flavour: Flavour = ARDUPILOT
         """Which autopilot it is; set with `parts`."""
         self._target = (0, 0)
         """Numbers of its system and component."""
         self._streams_refused = 0
-        """Number of refused requests for a stream."""
         self._was_armed = False
         """Whether a run of the client has armed it since an operator last allowed arming."""
 
     @property
     def is_ready(self) -> bool:
-        """Whether the autopilot is connected and configured safely."""
         return self.parts is not None and self.parts.setup.is_done and self.clock.is_known
 
     @property
@@ -128,7 +120,6 @@ class Autopilot:
 
     @property
     def took_off(self) -> bool:
-        """Whether this run of the client has armed the autopilot."""
         return self.parts is not None and self.parts.launch.took_off
 
     def arm(self) -> None:
@@ -148,8 +139,9 @@ class Autopilot:
         return self.positions.frame(armed=self._was_armed or self.took_off)
 
     def meet(self, heartbeat: Message, target: tuple[int, int]) -> None:
-        """Begin with the autopilot that sent a heartbeat, if it can be flown; `target` are the
-        numbers of its system and component.
+        """Begin with the autopilot that sent a heartbeat, if it can be flown.
+
+        `target` are the numbers of its system and component.
         """
         if why := unfit(heartbeat):
             self._fail("not flown", why)
@@ -221,7 +213,6 @@ class Autopilot:
                 setup.hear(message)
 
     def _hear_interval(self, result: int, stream: str) -> None:
-        """Count a refused stream, and report the first."""
         if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._streams_refused:

@@ -40,9 +40,7 @@ RATED = 8
 JUMP_NS = 100 * MILLISECOND_NS
 """Deviation of an answer, beyond its round trip, that suggests a jump of the clock."""
 JUMPS = 3
-"""Number of deviating answers in a row that confirm a jump."""
 BOOT_MAX_NS = 2**62
-"""Largest time since boot that is accepted."""
 
 
 class Sample(NamedTuple):
@@ -64,7 +62,6 @@ class BootClock:
         self._taken = 0
         """Number of answers used since the clock was started."""
         self._deviating: list[Sample] = []
-        """Newest deviating answers in a row."""
         self._line = (0, 0.0, 0.0)
         """Reference time [ns; the client's clock], offset at that time [ns], and drift."""
         self.round_trip_ns: int | None = None
@@ -74,7 +71,7 @@ class BootClock:
         """Newest answers, whether or not the line fits them: the client's clock and time since boot
         [ns]."""
         self.jumps = 0
-        """Number of restarts of the autopilot's clock, as after a reboot."""
+        """Number of jumps of the autopilot's clock, mostly reboots."""
 
     @property
     def is_known(self) -> bool:
@@ -108,7 +105,6 @@ class BootClock:
         return "" if rate is None else f"{rate:.3g}, expected 1 within {DRIFT_MAX:.0%}"
 
     def ask(self, *, now_ns: int) -> int:
-        """Time stamp for a question sent now."""
         self._questions.append(now_ns)
         return now_ns
 

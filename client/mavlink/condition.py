@@ -52,7 +52,6 @@ class Condition:
         self.charge: float | None = None
         """Charge of the battery, from 0 to 1; None if unknown."""
         self.voltage: float | None = None
-        """Voltage of the battery [V]; None if unknown."""
         self.home: tuple[float, float, float] | None = None
         """Latitude and longitude of home [°], and its altitude above the sea [m]."""
         self.home_up = 0.0
@@ -119,7 +118,6 @@ class Condition:
 
     @property
     def battery_is_weak(self) -> bool:
-        """Whether the battery is low now, even if only for a moment."""
         return self._low_ns is not None
 
     def battery_is_low(self, *, now_ns: int) -> bool:

@@ -32,7 +32,6 @@ class Arrivals(NamedTuple):
     met: Message | None = None
     """First heartbeat of the autopilot."""
     moved: bool = False
-    """Whether the autopilot has restarted at a new address."""
 
 
 class Connection:

@@ -29,9 +29,7 @@ class LaunchStep(Enum):
     """Wait for the mode that follows set-points."""
     ARM = auto()
     LIFT = auto()
-    """Wait until the command to take off is accepted."""
     CLIMB = auto()
-    """Wait until the take-off altitude is reached."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,6 @@ class Flavour:
         return self.modes.get(mode, f"mode {mode}")
 
     def mode_parts(self, mode: int) -> tuple[float, float, float]:
-        """Parameters of the command that sets a mode."""
         if self.submodes:
             return CUSTOM, float(mode >> 16 & 0xFF), float(mode >> 24)
         return CUSTOM, float(mode), 0.0
@@ -142,7 +139,6 @@ FLAVOURS = {
     int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA): ARDUPILOT,
     int(dialect.MAV_AUTOPILOT_PX4): PX4,
 }
-"""Flavours by MAV_AUTOPILOT of a heartbeat."""
 
 
 def unfit(heartbeat: Message) -> str:

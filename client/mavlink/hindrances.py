@@ -90,7 +90,7 @@ class Hindrances:
         return self._silence(now_ns)
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """How a second commander was detected; None if there is none."""
+        """Second commander, by the way it was detected; None if there is none."""
         event: AboardEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest

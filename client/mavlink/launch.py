@@ -75,8 +75,7 @@ class Launch:
     """Take-off and landing of one vehicle.
 
     Args:
-        vehicle: number of the vehicle, for events.
-        target: numbers of its system and component.
+        target: numbers of the autopilot's system and component.
         altitude: take-off altitude above the ground [m].
         patience_ns: time that each step may take [ns].
         from_takeoff: whether our origin is where the vehicle is armed.
@@ -109,7 +108,6 @@ class Launch:
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
         self._asked_to_arm = False
-        """Whether `why_not_armed` was reported to the operator."""
         self._hovers_ns: int | None = None
         """Time since which the vehicle hovers because the origin is unknown; None while it does
         not."""
@@ -126,13 +124,12 @@ class Launch:
         """Refusals reported in this step: command and result."""
         self.failure: NotTakenOff | None = None
 
-    # -- into the air ------------------------------------------------------------------------
+    # -- take-off --------------------------------------------------------------------------
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
         """Continue the take-off; returns whether the vehicle can be flown.
 
-        Args:
-            may_arm: whether a vehicle on the ground is armed.
+        `may_arm` allows arming a vehicle on the ground.
         """
         if self._is_flying and not self.failure:
             is_placed = self._is_placed(now_ns)
@@ -197,11 +194,10 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # it is under our control, and lands
+            self._enter(Phase.FLYING, now_ns)  # the vehicle is under our control, and lands
             self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
-        """Report once that an operator has to allow arming."""
         self._since_ns, self.waits_for = None, "armed = true"
         if not self._asked_to_arm:
             self._asked_to_arm = True
@@ -223,7 +219,6 @@ class Launch:
         self._refused.clear()
 
     def _climb(self, now_ns: int) -> None:
-        """Advance to the first step that is not done."""
         condition, steps = self._condition, self._flavour.steps
         while self._step < len(steps):
             armed_before = steps.index(LaunchStep.ARM) < self._step
@@ -295,7 +290,7 @@ class Launch:
             return False
         return self._flavour.steps[self._step] is LaunchStep.GUIDE
 
-    # -- down again --------------------------------------------------------------------------
+    # -- landing ----------------------------------------------------------------------------
 
     def return_home(self, *, now_ns: int) -> None:
         """Return home and land there, if the vehicle is under our control and in the air."""
@@ -334,7 +329,7 @@ class Launch:
         most_ns = LAND_MAX_NS if self._landing_mode == self._flavour.land else RETURN_MAX_NS
         return lost or not obeys or now_ns - self._since_ns > most_ns
 
-    # -- what is asked and heard -------------------------------------------------------------
+    # -- commands and their answers ---------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> list[Message]:
         if self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS:

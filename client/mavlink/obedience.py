@@ -49,7 +49,7 @@ class Obedience:
         self._outside_ns: int | None = None
         """Time since which the velocity has been outside the bounds; None while it is inside."""
         self._strayed_ns: int | None = None
-        """Newest time at which it had been outside for NOTICED_NS; None for never."""
+        """Newest time at which the velocity had been outside for NOTICED_NS; None for never."""
         self.off_mps = 0.0
         """Newest distance of the velocity from its bounds [m/s]."""
 
@@ -59,11 +59,9 @@ class Obedience:
         self._stepped_ns = self._outside_ns = self._strayed_ns = None
 
     def step(self, command: Vector, velocity: Vector, *, now_ns: int) -> None:
-        """Compare the velocity with the commands.
+        """Compare a velocity with the commands, both in our axes [m/s].
 
-        Args:
-            command: velocity commanded from now on, in our axes [m/s].
-            velocity: measured velocity, in our axes [m/s].
+        `command` applies from now on.
         """
         before_ns, self._stepped_ns = self._stepped_ns, now_ns
         self._commands.append((now_ns, command))

@@ -48,7 +48,7 @@ class Port(Endpoint):
         self.now_ns = 0
         self._tick_ns = self._heartbeat_ns = 0
 
-    # -- what the vehicle asks ---------------------------------------------------------------
+    # -- for the vehicle --------------------------------------------------------------------
 
     @property
     def is_down(self) -> bool:
@@ -79,7 +79,7 @@ class Port(Endpoint):
             parts.launch.land(now_ns=self.now_ns)
             self._tick_ns = self.now_ns
 
-    # -- what comes --------------------------------------------------------------------------
+    # -- received ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         self.now_ns = now_ns
@@ -98,7 +98,7 @@ class Port(Endpoint):
         for message in arrivals.others:
             self._hindrances.rivals.hear(message, target[0], now_ns=now_ns)
 
-    # -- what goes ---------------------------------------------------------------------------
+    # -- sent -------------------------------------------------------------------------------
 
     def wake(self, *, now_ns: int) -> None:
         self.now_ns = now_ns
@@ -187,7 +187,6 @@ class Port(Endpoint):
     # -- figures -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        """Unknown figures are left out."""
         autopilot, counts = self.autopilot, self._connection.counts
         condition, clock, parts = autopilot.condition, autopilot.clock, autopilot.parts
         port_figures: dict[str, Any] = {

@@ -26,8 +26,8 @@ OLD_NS = SECOND_NS
 RECALLED_MAX_NS = 600 * SECOND_NS
 """Longest time for which an origin saved by an earlier run is valid."""
 REBOOT_NS = SECOND_NS
-"""Allowed difference between the advances of the autopilot's clock and ours since the origin was
-saved, beside drift."""
+"""Allowed difference between the advances of the two clocks since the origin was saved, beside
+drift."""
 DRIFT_PARTS = 40
 """Inverse of the allowed drift since then: 2.5 %."""
 SPEED_MAX = 1e3
@@ -212,7 +212,6 @@ class Positions:
             self.place((x, y, z))
 
     def place(self, origin: Vector) -> None:
-        """Set our origin [m; the autopilot's local frame, in our axes]."""
         self.origin, self.has_origin, self._recalled = origin, True, None
         self._waiting.clear()
 

@@ -70,7 +70,6 @@ class Rivals:
 
 
 def _weight(message: Message, system: int) -> int:
-    """Number of set-points that a message counts as."""
     kind = message.get_type()
     named = message.target if kind == "MANUAL_CONTROL" else getattr(message, "target_system", None)
     if named not in (0, system):

@@ -41,7 +41,6 @@ class Rule(NamedTuple):
     is_safe: Callable[[float], bool] = lambda _: True
     wanted: str = ""
     value: float = 0.0
-    """Value to set if the present one is unsafe."""
     required: bool = False
     """Whether a missing parameter makes the autopilot unsafe."""
 
@@ -169,11 +168,9 @@ def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
 
 
 def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for ArduCopter.
+    """Rules for ArduCopter, for `system` as the client's own MAVLink system.
 
-    Args:
-        system: number of the client's own system.
-        returns_below_m: altitude below which the vehicle has to return home, if it does [m].
+    `returns_below_m` is the altitude below which the vehicle has to return home, if it does.
     """
     return (
         *_ardupilot_returns(returns_below_m),

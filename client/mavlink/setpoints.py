@@ -50,13 +50,12 @@ class Setpoints:
         self.count = 0
 
     def command(self, velocity: Vector, *, now_ns: int) -> bool:
-        """Adopt the pilot's command. Return whether to send it now; False if one was just sent."""
+        """Adopt the pilot's command. Return whether to send it now: not if one was just sent."""
         self._velocity, self._flown_ns = velocity, now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         return self._sent_ns is None or now_ns - self._sent_ns >= 0.9 * least_ns
 
     def due_ns(self, sends: Sends, *, now_ns: int) -> int | None:
-        """Time of the next set-point; None if none is to be sent."""
         sent_ns, flown_ns = self._sent_ns, self._flown_ns
         if sends is Sends.ZEROS:
             return now_ns if sent_ns is None else sent_ns + ZERO_NS

@@ -41,8 +41,7 @@ class Setup:
     Args:
         target: numbers of the autopilot's system and component.
         system: number of the client's own system.
-        sets: whether unsafe parameters are set.
-        returns_below_m: altitude below which it has to return home, if it does [m].
+        returns_below_m: altitude below which the vehicle has to return home, if it does [m].
     """
 
     def __init__(
@@ -79,7 +78,6 @@ class Setup:
 
     @property
     def fence(self) -> dict[str, float]:
-        """Known parameters of the autopilot's own fence: values by name."""
         return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
 
     def value(self, name: str) -> float | None:

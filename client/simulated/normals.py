@@ -8,7 +8,6 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 BLOCK = 256
-"""Number of steps in a block."""
 
 
 class Normals:
