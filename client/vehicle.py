@@ -134,7 +134,7 @@ class Vehicle(ABC):
         """
 
     def land(self) -> bool:
-        """Land without further commands; False if the vehicle cannot and has to be flown down."""
+        """Land without further commands; False if the vehicle cannot, and has to be flown down."""
         return False
 
     def return_home(self) -> None:  # noqa: B027 - most cannot

@@ -38,7 +38,6 @@ def mavlink(scenario: Scenario, number: int) -> Vehicle:
 
 
 def make(scenario: Scenario, number: int) -> Vehicle:
-    """Raises ConfigError if the kind is unknown, or the vehicle cannot be made."""
     try:
         named = VEHICLES.one(scenario.vehicle.kind)
     except GrammarError as error:

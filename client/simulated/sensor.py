@@ -58,7 +58,6 @@ class Sensor:
         self._drawn = np.zeros_like(self._bias)
         """Numbers n if only one has noise; shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)
-        """Measurements that are not available yet, oldest first; each of shape (axes, 2)."""
         self._step = 0
 
     def measure(self, state: Array, *, began_ns: int = 0) -> Measurement:

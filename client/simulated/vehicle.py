@@ -72,7 +72,9 @@ class SimulatedVehicle(Vehicle):
 
 
 def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
-    from skytether.client.simulated.quadrotor import QuadrotorPlant  # numba takes a second
+    from skytether.client.simulated.quadrotor import (
+        QuadrotorPlant,
+    )  # importing numba takes a second
 
     plant = QuadrotorPlant(scenario, stream(scenario.seed, "turbulence", number), number)
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))

@@ -55,7 +55,6 @@ class Weather:
         if self._gust_mps2 == 0.0:
             self._gust = None
         self._push = self._pushed()
-        """Push of steady wind and gust now, w + τ a [m/s]."""
 
     def push(self) -> Array:
         """Push w + τ a over the next step, which acts like an input [m/s]; shape (axes,)."""
@@ -64,10 +63,9 @@ class Weather:
         return self._push
 
     def shove(self, x: Array) -> None:
-        """Add the effect of white acceleration over that step to a state, in place.
+        """Add the effect of white acceleration over that step to `x`, in place.
 
-        Args:
-            x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        `x` has position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
         if self._white is None:
             return

@@ -334,7 +334,6 @@ class Growing:
         self._path = path
         status = check(path)
         self.at = path
-        """Present path of the file."""
         if status and status.st_size:
             self.at, descriptor = _unused(path, _new)
         else:
@@ -367,7 +366,6 @@ class Growing:
 
 
 def _new(path: Path, mode: int = MODE) -> int:
-    """Descriptor of a new file; raises OSError if it exists, or cannot be created."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, mode)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 def hint(given: str, known: Iterable[str]) -> str:
-    """Ask for the most similar known name; if none is similar, list them all."""
+    """Question for the most similar known name; if none is similar, a list of all."""
     import difflib  # imported only after a user's mistake
 
     close = difflib.get_close_matches(given, known, n=1)

@@ -78,7 +78,6 @@ def kernel(function: F) -> F:
 
 
 def making_kernel(function: F) -> F:
-    """Kernel that creates arrays."""
     return _at_first_call(numba.njit(error_model="numpy")(function))
 
 
@@ -120,14 +119,12 @@ def check_types() -> None:
 
 
 KERNELS: list[Any] = []
-"""Kernels of all imported modules, compiled or not."""
 
 
 class Missing(NamedTuple):
     """Kernel without machine code in memory or on disk."""
 
     name: str
-    """Module and name of the kernel, for `compile_named`."""
     is_stored: bool
     compile: Callable[[], None]
     """Function that compiles it, or loads machine code compiled by another process since."""
@@ -189,7 +186,6 @@ def _is_stored(dispatcher: Any) -> bool:
 
 @global_compiler_lock  # type: ignore[untyped-decorator]
 def _compile(dispatcher: Any) -> None:
-    """Load the machine code of a kernel from disk, or compile it, once."""
     if dispatcher.overloads:
         return
     _store_on_disk(dispatcher)
@@ -207,7 +203,6 @@ def _compile(dispatcher: Any) -> None:
 
 
 def _store_on_disk(dispatcher: Any) -> None:
-    """Store machine code on disk, if a folder is writable."""
     if isinstance(dispatcher._cache, KernelCache):
         return
     with suppress(RuntimeError):  # no folder is writable
@@ -239,7 +234,6 @@ def part(function: F) -> F:
 
 
 def making_part(function: F) -> F:
-    """Part that creates arrays."""
     compiled: F = numba.njit(error_model="numpy")(function)
     return compiled
 
@@ -301,9 +295,7 @@ def interpret_all() -> None:
 
 
 _MACHINE: dict[Callable[..., Any], Any] = {}
-"""Kernels by original function."""
 _PLAIN: dict[Any, Callable[..., Any]] = {}
-"""Original functions by kernel."""
 
 
 def plain(function: F) -> F:
@@ -319,7 +311,7 @@ class DependencyStamp:
         return self.stamp
 
     def get_disambiguator(self) -> str:
-        """Part of the file's name: a file with another stamp is not even opened."""
+        """A file with another stamp is not even opened, since the stamp is part of its name."""
         return self.stamp[:16]
 
     @classmethod
@@ -408,7 +400,6 @@ def _source(function: Callable[..., Any]) -> str:
 
 
 def _type_name(hint: Any) -> str:
-    """Text that identifies a type, wherever it is defined."""
     if not hasattr(hint, "_fields"):
         return repr(hint)
     fields = get_type_hints(hint, include_extras=True)

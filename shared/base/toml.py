@@ -25,7 +25,6 @@ _OPAQUE = re.compile(
 )
 """Strings and comments, in which dots and brackets have no meaning."""
 _DIVIDERS = re.compile(r"[=,\[\]{}\n]")
-"""Characters that end a key."""
 
 
 def loads(text: str) -> dict[str, Any]:

@@ -29,8 +29,6 @@ class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
-    """The first heartbeat of the vehicle's autopilot has arrived."""
-
     name: str
     system: int
 
@@ -81,10 +79,7 @@ class TextsOmitted(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotWaits(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on the ground cannot be flown yet."""
-
     waits_for: str
-    """What prevents the flight, in words."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} waits for {self.waits_for}"
@@ -182,8 +177,6 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not flown because its take-off has failed."""
-
     doing: str
     why: str
 

@@ -60,7 +60,6 @@ class Running:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with all changes so far."""
         return self._scenario
 
     @property
@@ -138,7 +137,8 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of whole keys: arguments of a text are replaced in the text.
+        """Values of whole keys: an argument, such as `network.uplink.loss`, is replaced in its
+        text.
 
         Raises:
             ConfigError: a key may not change, or a text has no such argument.

@@ -57,7 +57,7 @@ def host_of(address: Address) -> str:
 
 
 class Form(NamedTuple):
-    """Format of one kind of packets: first bytes and bounds of the length."""
+    """Format of one kind of packets: first bytes and bounds of the length [B]."""
 
     head: bytes
     least: int

@@ -23,7 +23,6 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     host: str
     port: int
     waiting_for: str
-    """Peers that the process waits for, in words."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -60,8 +59,6 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A page has refused browsers, or dropped their messages."""
-
     why: str
     count: int
 
@@ -73,7 +70,6 @@ class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     host: str
     port: int
     local: bool = True
-    """Whether only this machine can read them."""
 
     def __str__(self) -> str:
         whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
@@ -112,8 +108,6 @@ class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Figures of a process, on request or at its end."""
-
     figures: dict[str, Any]
 
     def __str__(self) -> str:
@@ -139,8 +133,6 @@ class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """An error in the code of a process, which goes on."""
-
     traceback: str
 
     def __str__(self) -> str:
@@ -252,8 +244,6 @@ class PeerEvent(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SessionOpened(PeerEvent, frozen=True, kw_only=True):
-    """The server has received the first observation of a session."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} flies, from {self.peer}"
 
@@ -321,7 +311,6 @@ class NoSession(PeerEvent, frozen=True, kw_only=True):
 
 class NoAnswer(PeerEvent, frozen=True, kw_only=True):
     waited_s: float
-    """Time since the first HELLO [s]."""
     secure: bool = False
     """Whether the vehicle has a key, so that only answers with that key count."""
 
@@ -349,7 +338,6 @@ class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
     """Packets of the server no longer arrive at a vehicle on the ground."""
 
     silent_s: float
-    """Time since the newest packet [s]."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: the server has been silent for {self.silent_s:.1f} s"
@@ -359,7 +347,6 @@ class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
     """Packets of the server arrive again at a vehicle on the ground."""
 
     silent_s: float
-    """Time without a packet [s]."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: the server is heard again, after {self.silent_s:.1f} s"
@@ -463,7 +450,6 @@ class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
     """The packets of a vehicle contradict the bounds of its clock's offset."""
 
     what: str
-    """Contradiction and its consequence, in words."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: {self.what}"
@@ -539,8 +525,6 @@ class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Finished(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has begun the last step of its flight."""
-
     steps: int
     missed: int
 

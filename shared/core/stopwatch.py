@@ -12,9 +12,7 @@ class Stopwatch:
         self._clock_ns = clock_ns or (lambda: 0)
         self._since_ns = 0
         self.spent_ns: Counter[str] = Counter()
-        """Sum of the laps of each name so far [ns]."""
         self.total_ns = 0
-        """Sum of all laps so far [ns]."""
 
     def start(self) -> None:
         self._since_ns = self._clock_ns()

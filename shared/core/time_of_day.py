@@ -5,7 +5,7 @@ from typing import NamedTuple
 from skytether.shared.base.units import SECOND_NS
 
 FRESH_NS = 10 * SECOND_NS
-"""Time for which the time of day is valid after it was learned."""
+"""Validity of a learned time of day."""
 DRIFT = 1000
 """Time in which two clocks drift apart by one unit: 0.1 %, for two hosts whose clocks are slewed by
 500 ppm each."""

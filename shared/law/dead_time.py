@@ -27,7 +27,6 @@ from skytether.shared.law.model import Array, Axis, advance, discretise
 
 class DeadTime(NamedTuple):
     steps: int
-    """Number of whole steps n."""
     rest: Axis | None
     """Model over the remainder r, eq. (4) with r for Δt; None without a remainder."""
     late: tuple[float, float]
@@ -46,11 +45,8 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
 
 
 class PendingInputs:
-    """Inputs that one vehicle has issued and that still act.
-
-    Args:
-        model: eq. (4) of each axis.
-        dead_times: dead time of each axis.
+    """Inputs that one vehicle has issued and that still act; the arguments
+    have one item per axis.
     """
 
     def __init__(self, model: Sequence[Axis], dead_times: Sequence[DeadTime]) -> None:
@@ -68,9 +64,9 @@ class PendingInputs:
         """Issue the input of a step, of each axis [m/s].
 
         Returns:
-            input acting at the end of this step on each axis [m/s], and the difference to the
-                input acting at its start, for the remainder r [m/s]; the latter None without a
-                remainder on any axis.
+            input acting at the end of this step on each axis [m/s]; and the input acting at its
+                start, for the remainder r, minus the former [m/s], None without a remainder on
+                any axis.
         """
         for issued, u in zip(self._issued, command.tolist(), strict=True):
             issued.append(u)

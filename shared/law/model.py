@@ -51,7 +51,6 @@ class Model(NamedTuple):
     b1: Array
 
     def axes(self) -> list[Axis]:
-        """The model of each axis in plain floats."""
         # numpy takes twice as long for sums of two or three numbers, and the vehicle's loops have
         # no longer ones.
         columns = [field.tolist() for field in self]

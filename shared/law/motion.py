@@ -31,7 +31,6 @@ class Motion(NamedTuple):
     first: int
     """Step of the first knot, a multiple of SPACING."""
     position: Knots
-    """Position of each knot [m]; shape (knots, axes)."""
     velocity: Knots
     """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
 
@@ -83,12 +82,10 @@ class Clearances(NamedTuple):
 
     @property
     def planned_apart_m(self) -> float:
-        """Distance of planned motions and goals from each other [m]."""
         return self.apart_m + self.margin_m
 
     @property
     def planned_clear_m(self) -> float:
-        """Distance of planned motions and goals from zones [m]."""
         return self.tube_m + self.margin_m
 
 
@@ -98,6 +95,5 @@ def bend_m(acceleration_mps2: float, dt_s: float) -> float:
 
 
 def resting(step: int, position: Array) -> Motion:
-    """Motion at rest at a position [m; shape (axes,)] from a step on."""
     at = np.array([position], dtype=np.float64)
     return Motion(step // SPACING * SPACING, at, np.zeros_like(at))

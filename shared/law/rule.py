@@ -44,7 +44,6 @@ class AxisHorizon(NamedTuple):
     brake: float
     """Decrease of speed per step when braking [m/s]; 0 repeats the last input for ever."""
     bound: float
-    """Bound u_max of the input [m/s]."""
     feeds_back: bool
     gain_p: float
     """K on position [1/s]."""
@@ -122,12 +121,8 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
 
 
 def reference_input(without_feedback: float, disturbance: float, share: float) -> float:
-    """Input that drives the reference state x̄ [m/s].
-
-    Args:
-        without_feedback: input without feedback [m/s].
-        disturbance: ŵ [m/s].
-        share: `remaining`; at 0, x̄ comes to rest.
+    """Input that drives the reference state x̄ [m/s]: with the disturbance ŵ, or 0 once braking has
+    ended (`share` is 0).
     """
     # With ŵ, x̄ would drift on for ever after the vehicle has braked.
     return without_feedback + disturbance if share > 0.0 else 0.0
@@ -172,7 +167,7 @@ def next_reference(
 
     Args:
         without_feedback, share: see `planned_input`.
-        ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
+        ref_p, ref_v: x̄ at this stage, position [m] and velocity [m/s].
     """
     return advance(
         horizon.model, ref_p, ref_v, reference_input(without_feedback, horizon.disturbance, share)

@@ -37,24 +37,20 @@ Knots = Sequence[float] | NDArray[np.floating[Any]]
 
 
 class AxisSpline(NamedTuple):
-    """Spline on one axis, and how it is flown."""
-
     model: Axis
     knots: Knots
     spacing: int
     """Steps from one knot to the next."""
     dt_s: float
-    """Length of a step [s]."""
     length: int
     """Number of stages at which it may be flown."""
     last: float
-    """Input ū at the last of them [m/s]."""
+    """Input ū at the last of these stages [m/s]."""
     speed: float
     """Magnitude of that input over all axes [m/s]."""
     brake: float
     """Decrease of speed per step when braking [m/s]; 0 continues along the spline for ever."""
     bound: float
-    """Bound u_max of the input [m/s]."""
     gain_p: float
     """K on position [1/s]."""
     gain_v: float

@@ -34,11 +34,9 @@ class Terms(NamedTuple):
     """Values on which both ends must agree before a flight: plain numbers and texts."""
 
     dt_ns: int
-    """Length of a step [ns]."""
     horizon: int
     """Number of steps planned ahead, H."""
     axes: int
-    """Number of spatial axes, 2 or 3."""
     tau_s: tuple[float, ...]
     """Time constant of the model, eq. (2)-(3), of each axis [s]."""
     gain: tuple[float, ...]
@@ -50,13 +48,11 @@ class Terms(NamedTuple):
     scheme: str
     """How the vehicle flies the messages of the server, one of FLOWN_AS."""
     feedback: bool
-    """Whether horizons contain feedback."""
     exhausted: str
     """Behaviour after a horizon's last input: "hold" or "brake"."""
     brake_mps2: float
     """Deceleration with which braking takes the desired velocity to zero [m/s²]."""
     age_max_s: float
-    """Largest age of the observation behind an input [s]."""
     join_s: float
     """Time after its first knot up to which a trajectory is accepted [s]; 0: at any time."""
     land_after_s: float
@@ -65,13 +61,12 @@ class Terms(NamedTuple):
     radius_m: float
     """Half the width of circle, figure-eight and square [m]."""
     period_s: float
-    """Time for one round of them [s]."""
+    """Time for one round of these shapes [s]."""
     altitude_m: float
     """Altitude of these shapes in 3-D [m]."""
     points: str
     """Digest of the waypoints."""
     speed_mps: float
-    """Speed between waypoints [m/s]."""
     loop: bool
     table: str
     """Digest of the content of the trajectory's CSV file."""

@@ -29,7 +29,6 @@ TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
-"""Largest number of steps of a trajectory that are checked against the fence."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 

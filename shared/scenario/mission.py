@@ -20,7 +20,6 @@ SWAP_AT_S = 2.0
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
 VEHICLES_MAX = 65_535
-"""Largest number of a vehicle."""
 CROWDED = 32
 """Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
@@ -68,7 +67,7 @@ class Mission:
 
     def __call__(self, t: NDArray[Any]) -> Array:
         t = np.asarray(t, dtype=np.float64)
-        if not t.ndim:  # of one vehicle at each step: no search in arrays
+        if not t.ndim:  # called for one vehicle at each step: no search in arrays
             state = np.zeros((self._axes, 2))
             state[:, 0] = self._points_m[max(bisect_right(self._times, float(t)) - 1, 0)]
             return state
@@ -100,7 +99,7 @@ class Mission:
         It minimises the sum of the squared distances to the next goals, so that paths cross less.
         The mission must be `in_step`.
         """
-        from scipy.optimize import linear_sum_assignment  # a client does without scipy
+        from scipy.optimize import linear_sum_assignment  # clients have no scipy
 
         times_s = next(iter(self._goals.values()))[0]
         wanted = np.stack([points_m for _, points_m in self._goals.values()], axis=1)
@@ -123,7 +122,6 @@ class _Stays(NamedTuple):
 
     @classmethod
     def of(cls, goals: Mapping[int, tuple[Array, Array]], height: float) -> "_Stays":
-        """Stays at the vehicles' goals, sorted by start time."""
         counts = [len(times_s) for times_s, _ in goals.values()]
         begin_s = np.concatenate([times_s for times_s, _ in goals.values()])
         ends_s = [np.append(times_s[1:], np.inf) for times_s, _ in goals.values()]
@@ -268,7 +266,7 @@ def parse_goals(text: str, axes: int) -> dict[int, Array]:
 
 
 def format_goals(goals: Mapping[int, Array]) -> str:
-    """Text from which `parse_goals` makes these goals."""
+    """Inverse of `parse_goals`."""
     return " & ".join(
         f"goal({vehicle}, {', '.join(f'{at:.6g}' for at in place)})"
         for vehicle, place in goals.items()

@@ -28,7 +28,7 @@ class Owner(Enum):
 
 
 class InFlight(Enum):
-    """Group of keys that may change in flight, together."""
+    """Group of keys that change together in flight."""
 
     TRIGGER = auto()
     POINT = auto()

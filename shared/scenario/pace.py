@@ -16,7 +16,6 @@ from skytether.shared.scenario.schema import Scenario
 STEPS_MAX = 100_000
 """Largest number of steps that are checked before a flight."""
 TINY = 1e-9
-"""Relative tolerance for rounding."""
 
 
 class TooFast(NamedTuple):
@@ -60,7 +59,9 @@ def first_too_fast(scenario: Scenario) -> TooFast | None:
         return None
     times_s = np.arange(min(scenario.steps, STEPS_MAX) + 1) * scenario.control.dt
     if not REFERENCES[REFERENCES.one(scenario.reference.shape).name].is_ours:
-        times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # as `sampled` checked it
+        times_s = SAMPLED_S[
+            scenario.duration >= SAMPLED_S
+        ]  # the times at which `sampled` checked the shape
     velocity = scenario.make_reference()(times_s)[..., 1]
     over = is_too_fast(scenario, velocity)
     if not over.any():

@@ -147,7 +147,6 @@ def to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def to_toml(scenario: Scenario) -> bytes:
-    """Content of a file from which `load` makes the scenario again."""
     return msgspec.toml.encode(to_table(scenario))
 
 

@@ -22,8 +22,8 @@ FAST_MPS = 1e6
 GRID_S = 0.05
 """Time between the random velocities of a target; they are interpolated linearly."""
 TURN_S = 3600.0
-"""Time after which a target's path is run backwards, then forwards again. This bounds the memory
-for the random walk."""
+"""Time after which a target's path is run backwards, then forwards again, to bound the memory for
+the random walk."""
 GRID_BLOCK = 1024
 COLUMNS_MAX = 64
 """Largest number of columns of a table, which bounds time and memory per line."""

@@ -108,9 +108,8 @@ class ControlConfig(Section, frozen=True):
     scheme: Term[Text] = "trajectory"
     """Delay compensation, see `skytether schemes`."""
     feedback: Term[bool] = True
-    """Whether the vehicle corrects deviations from the states predicted in a horizon. A vehicle
-    that can only play back inputs needs false and an `input_weight` of 3, see the scenario
-    `playback`."""
+    """Whether the vehicle corrects deviations from a horizon's states. If it can only play back
+    inputs: false, and `input_weight` 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
     """Longest time from making a horizon to flying it [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
@@ -120,9 +119,9 @@ class ControlConfig(Section, frozen=True):
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
     argument is also a key: `control.trigger.expected_gap = 0.1`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
-    """Largest data rate of the server to all vehicles together, IP and UDP headers included [B/s];
-    the horizons with the largest expected gain per byte are sent first. auto: the largest rate
-    without queueing, as measured; 0: no limit."""
+    """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
+    the largest gain per byte are sent first. auto: the largest measured rate without queueing; 0:
+    no limit."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
@@ -342,10 +341,9 @@ class MavlinkConfig(Section, frozen=True):
         Literal["takeoff", "autopilot"] | tuple[Position, ...],
         Key(Owner.VEHICLE, InFlight.ORIGIN),
     ] = "takeoff"
-    """Origin of the scenario: the point of arming, the autopilot's local origin, or a point in the
-    autopilot's local frame: north, east (and up) [m]. On a mission, the point of arming is the
-    vehicle's first goal, on the ground. After a restart in the air, `takeoff` is read from
-    `vehicle.memory`; without it the vehicle hovers until this key is set."""
+    """Origin of the scenario: the point of arming (on a mission, below the first goal), the
+    autopilot's local origin, or a point in its local frame: north, east (and up) [m]. A client that
+    restarts in the air without a saved origin hovers until this key is set."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
     """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
     land; or yield, as to a pilot."""
@@ -355,10 +353,10 @@ class MavlinkConfig(Section, frozen=True):
 
 class NetworkConfig(Section, frozen=True):
     uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
-    """Impairments from server to vehicle, combined with &, see `skytether impairments`; "": none.
-    An argument is also a key: `network.uplink.loss = 0.3`."""
+    """Impairments from server to vehicle, combined with &, see `skytether impairments`. An argument
+    is also a key: `network.uplink.loss = 0.3`."""
     downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
-    """Impairments from vehicle to server, in the same way."""
+    """Impairments from vehicle to server."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
     """Largest UDP payload that passes [B]; 1472 fills an Ethernet frame."""
 
@@ -379,11 +377,11 @@ class LinkConfig(Section, frozen=True):
     """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
     unknown. It bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission, for comparing clocks if both ends have one; host: the
-    host's clock, with its kernel's error bound, as set by chrony."""
+    """Source of the time of day on a mission, which compares clocks if both ends have one; host:
+    the host's clock, with an error bound from its kernel (chrony)."""
     timeout_s: OfEach[Interval] = 1.5
-    """Silence after which the vehicle brakes and asks for a new session, and the server frees the
-    vehicle's number, after twice this time with heartbeats "auto" [s]."""
+    """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
+    vehicle's number after the same time, or twice this time with heartbeats "auto"."""
     connect_s: OfVehicle[Interval] = 120.0
     """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
     minute."""
@@ -470,17 +468,14 @@ class Scenario(Section, frozen=True):
 
     @property
     def dt_ns(self) -> int:
-        """Length of a step [ns]."""
         return seconds_to_ns(self.control.dt)
 
     @property
     def steps(self) -> int:
-        """Number of steps in the whole flight."""
         return max(1, round(self.duration / self.control.dt))
 
     @property
     def settled_s(self) -> float:
-        """Time at which RMSE begins [s]."""
         return self.settle if self.settle < self.duration else self.duration / 2.0
 
     @property
@@ -504,12 +499,10 @@ class Scenario(Section, frozen=True):
 
     @property
     def true_gain(self) -> Array:
-        """The vehicle's gains; shape (axes,)."""
         return self._per_axis(self.model.gain if self.vehicle.gain == () else self.vehicle.gain)
 
     @property
     def true_dead_time_s(self) -> Array:
-        """The vehicle's dead times [s]; shape (axes,)."""
         own = self.vehicle.dead_time_s
         return self._per_axis(self.model.dead_time_s if own == () else own)
 
@@ -572,7 +565,6 @@ class Scenario(Section, frozen=True):
 
     @property
     def clearances(self) -> Clearances:
-        """Distances between motions of a mission, and from zones."""
         mission = self.mission
         most_mps2 = float(np.sqrt(self.model.axes)) * mission.acceleration_mps2
         return Clearances(

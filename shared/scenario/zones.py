@@ -25,7 +25,7 @@ from skytether.shared.scenario.registry import ZONES, File, Files
 ROUND = 24
 CORNERS_MAX = 1000
 EARTH_M = 6_378_137.0
-"""Radius of the earth at the equator, WGS 84 [m]."""
+"""Equatorial radius of the earth, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 """Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
 latter is less because degrees are projected onto a plane."""
@@ -43,9 +43,7 @@ class Zone(NamedTuple):
     corners: Array
     """Corners in order along the border [m]; shape (n, 2)."""
     low_m: float = -math.inf
-    """Lowest altitude [m]."""
     high_m: float = math.inf
-    """Highest altitude [m]."""
     is_fence: bool = False
     """True if vehicles stay within the zone, False if they keep out of it."""
 
@@ -311,7 +309,7 @@ def geojson(file: File) -> list[Zone]:
     for zone in _features(file.name.rpartition("/")[2], collection):
         zones.append(zone)
         corners += len(zone.corners)
-        if corners > CORNERS_MAX:  # checking a ring takes quadratic time in its corners
+        if corners > CORNERS_MAX:  # checking a ring takes quadratic time
             raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
     if not zones:
         raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")

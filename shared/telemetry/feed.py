@@ -32,7 +32,6 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""
     name: str
-    """Name of the scenario."""
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
@@ -54,7 +53,6 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     time_ns: int
-    """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event
 
 
@@ -62,7 +60,6 @@ class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Figures so far, about once a second."""
 
     time_ns: int
-    """Time of the figures [ns; CLOCK_MONOTONIC]."""
     figures: dict[str, Any]
     """Figures by name, see `Endpoint.figures`."""
 
@@ -72,7 +69,6 @@ Frame = Opened | Rows | Said | Figures
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Frame)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors of the decoder for invalid frames."""
 
 
 def pack(frame: Frame) -> bytes:

@@ -191,7 +191,6 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
 
 
 PIECE_ROWS = 1024
-"""Largest number of rows that a recorder passes to a sink in one piece."""
 
 UPLINK, DOWNLINK = 0, 1
 
@@ -222,7 +221,7 @@ class Sink(Protocol):
     """Destination of a part of the record, such as a binary file."""
 
     def write(self, piece: bytes, /) -> object:
-        """Write the header, or whole rows."""
+        pass
 
 
 class Recorder:

@@ -52,7 +52,6 @@ class VehicleKey:
 @dataclass(frozen=True, slots=True)
 class Keyring:
     name: str
-    """Name of the file, for messages."""
     keys: Mapping[tuple[int, int], VehicleKey] = field(repr=False)
 
     def __len__(self) -> int:

@@ -103,7 +103,6 @@ class Initiator:
     def __init__(self, psk: bytes, prologue: bytes, private: bytes, payload: bytes) -> None:
         self._ephemeral = X25519PrivateKey.from_private_bytes(private)
         self.public = self._ephemeral.public_key().public_bytes_raw()
-        """Public ephemeral key."""
         state = _begin(psk, prologue).mix_ephemeral(self.public)
         self._state, sealed = state.seal(payload)
         self.message = self.public + sealed
@@ -137,7 +136,6 @@ class Responder:
         """Public ephemeral key of the initiator."""
         state = _begin(psk, prologue).mix_ephemeral(self.public)
         self._state, self.payload = state.open(message[KEY_BYTES:])
-        """Payload of the first message."""
 
     def answer(self, private: bytes, payload: bytes) -> tuple[bytes, Keys]:
         """Second message, and the derived keys; `private` is an ephemeral key that was never used.

@@ -51,11 +51,9 @@ PAYLOAD_BYTES_MAX = 1200
 
 AXES_MAX = 3
 TEXT_MAX = 32
-"""Largest number of characters of a text in the terms."""
 INPUTS_MAX = 270
 """Largest number of inputs of all axes in one horizon, limited by the packet size."""
 KNOTS_MAX = 16
-"""Largest number of knots in one trajectory."""
 STAMPS = 2**32
 """Modulus of time stamps [µs]: 71 minutes."""
 
@@ -124,23 +122,21 @@ class Mode(IntEnum):
     """Mode of a vehicle, see `client.failsafe`."""
 
     INIT = 0
-    """No session yet."""
     SYNC = 1
     """Waits until the link has been good for long enough."""
     READY = 2
     """Waits for a horizon, and to be armed."""
     TRACK = 3
-    """Flies a horizon."""
     COAST = 4
     """Flies on along a horizon without a newer one."""
     BRAKE = 5
     """Brakes to a stop, beginning at its last input."""
     HOVER = 6
-    """Stands still."""
+    """At rest, holding the position."""
     LAND = 7
-    """Descends, and stays down."""
+    """Descends, and stays on the ground."""
     FAULT = 8
-    """Has a fault: stands still, and flies nothing more."""
+    """Has a fault: holds the position, and ignores horizons."""
     MANUAL = 9
     """Flown by a pilot or nobody: nothing is sent to its autopilot."""
     RETURN = 10
@@ -234,7 +230,6 @@ class Idle(IntEnum):
     DELAY = 2
     """The delay to the vehicle is longer than a horizon can cover."""
     UNSOLVED = 3
-    """The solver has found no plan."""
 
     def __str__(self) -> str:
         return IDLE_TEXTS[self]
@@ -254,7 +249,6 @@ class Heartbeat(NamedTuple):
     server_us: int
     """Time stamp: the server's clock when it was sent."""
     idle: int
-    """One of `Idle`."""
     degraded: int
     """1 if the server misses too many ticks, else 0."""
     number: int = 0

@@ -26,8 +26,6 @@ number."""
 
 
 class Delay(Impairment):
-    """Delay that is drawn from a distribution."""
-
     kind = "delay"
 
     def __init__(self, correlation_s: float = 0.0) -> None:
@@ -79,7 +77,6 @@ class Paper(Delay):
         self._fewest, self._cumulative = _poisson(slots_mean)
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         slots = self._fewest + bisect_right(self._cumulative, share)
         return self._least_ns + slots * self._slot_ns
 

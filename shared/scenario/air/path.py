@@ -18,11 +18,7 @@ PARTS_MAX = 16
 
 
 class Path:
-    """Impairments of one direction.
-
-    Args:
-        calls: calls of the impairments.
-        files: files that they name.
+    """Impairments of one direction, from their calls and the files that these name.
 
     Raises:
         GrammarError: an impairment refuses its arguments, or there are two queues.
@@ -35,7 +31,6 @@ class Path:
             for call, each in zip(calls, impairments, strict=True)
             if not isinstance(each, Ordered | Queued)
         )
-        """Impairments that act on packets one by one, with their names."""
         self.is_ordered = any(isinstance(each, Ordered) for each in impairments)
         finite = [each for each in impairments if isinstance(each, Queued)]
         if len(finite) > 1:
@@ -43,7 +38,6 @@ class Path:
                 " & ".join(each.text for each in calls), "one rate or deliveries in a direction"
             )
         self.queue: Queued | None = finite[0] if finite else None
-        """Finite rate with its queue; None without."""
         self.least_s = sum(each.least_s for each in impairments)
         self.mean_s = sum(each.mean_s for each in impairments)
         self.loss = 0.0

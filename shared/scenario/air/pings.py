@@ -28,7 +28,6 @@ LINE_MAX = 400
 EVERY_S = 1.0
 """Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
-"""Modulus of icmp_seq."""
 NEAR = 1000
 """Largest number of packets by which an answer is late, or that are lost where icmp_seq wraps."""
 BACK_MAX_S = 10.0
@@ -46,7 +45,6 @@ class Run:
     first: int | None = None
     """Number of the first packet; None if the log begins later."""
     numbered: bool = True
-    """Whether the log numbers its packets."""
     peer: str = ""
     """Host, in a log of fping."""
     trips: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -57,7 +55,6 @@ class Run:
     """Time between two packets [s]; None if unknown."""
     at_s: float = -np.inf
     copies: int = 0
-    """Number of further answers to a packet."""
 
     def answered(self) -> int:
         return sum(isfinite(trip_s) for _, trip_s in self.trips.values())
@@ -139,7 +136,6 @@ class Log:
             run.trips[placed] = at_s, trip_s
 
     def list_one(self, trip_s: float) -> None:
-        """Add a packet of a run without numbers."""
         run = self.run if self.run and self.in_list else self.begin(0, numbered=False)
         run.last += 1
         run.trips[run.last] = nan, trip_s

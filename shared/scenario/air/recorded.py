@@ -49,7 +49,6 @@ class RecordedPath:
     """One-way delays [s]; those of lost packets are interpolated; shape (n,)."""
     lost: Flags
     halved: bool = False
-    """Whether the delays are halves of round trips."""
     copies: int = 0
     """Number of further answers to a packet, if the file lists them."""
 
