@@ -1,3 +1,1 @@
-"""The client: receives horizons, chooses the input of each step, flies it, and reports the
-state.
-"""
+"""The client: receives plans, chooses the input of each step, flies it, and reports the state."""

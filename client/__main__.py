@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # before the imports below, which are slow
     sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
@@ -48,8 +48,6 @@ from skytether.shell.process import ProcessOptions
 
 @dataclass(frozen=True)
 class ClientOptions(ProcessOptions):
-    """Options of `skytether client`."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
@@ -99,7 +97,7 @@ def fly(argv: Sequence[str]) -> None:
         if keyring is None:
             return PlainLink()
 
-        from skytether.client.secure import SecureLink  # its ciphers take a while, and 6 MB
+        from skytether.client.secure import SecureLink  # its ciphers take 6 MB, and time to import
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
@@ -213,7 +211,7 @@ def _memory(
 def _before(
     memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
 ) -> SavedState | None:
-    """State saved by an earlier run; whether it was usable is added to `warnings`."""
+    """State saved by an earlier run. A warning for the log is added to `warnings`."""
     try:
         saved = memory.read()
         if saved is None:
@@ -221,7 +219,7 @@ def _before(
         before = recall(*saved, time.monotonic_ns(), scenario.terms())
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
-        # The vehicle may have been armed, so nothing arms it before an operator does.
+        # The vehicle may have been armed, so it is armed again only by an operator.
         return SavedState(frame=VehicleMemory(armed=True))
     warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
     return before

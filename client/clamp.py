@@ -1,17 +1,15 @@
-"""Last clamp: bounds every input, whichever part of the client chose it.
-
-Only the fence acts after it, which may change the input faster than this clamp allows: what leads
-back inside must not wait.
+"""Last bound of every input, whichever part of the client chose it.
 
 It shares no code with packet decoding or the choice of the input, so that a mistake there stops
-here.
+here. Only the fence acts after it: an input that leads back inside may change faster than this
+bound allows.
 """
 
 import math
 from collections.abc import Sequence
 
 ROUNDING = 1e-9
-"""Excess of speed that is put down to rounding [m/s]."""
+"""Excess of speed attributed to rounding [m/s]."""
 
 
 def clamped(
@@ -28,10 +26,9 @@ def clamped(
     Args:
         wanted: chosen input of each axis [m/s].
         before: input flown at the previous step, of each axis, within `u_max` [m/s].
-        u_max: bound of each axis [m/s].
         change_max: largest change from `before` on an axis [m/s]; may be infinite.
         without_feedback: part of `wanted` that is not feedback, of each axis [m/s].
-        speed_max: bound of the magnitude of that part over all axes, within `ROUNDING` [m/s].
+        speed_max: bound of the magnitude of that part over all axes [m/s].
     """
     # Before any min and max, whose results depend on the order of arguments if one is NaN.
     if not all(map(math.isfinite, (*wanted, *without_feedback))):

@@ -1,8 +1,8 @@
 """Uplink delay compensator, eq. (11): the input of the present step, from a horizon made earlier.
 
-It keeps the horizon in force: the one made for the latest step wins, in whatever order they arrive
-(E11). `client.followers` computes the input from it. Without a horizon the vehicle brakes from the
-last input; from a standstill that means it hovers.
+Of all horizons that arrived, the one made for the latest step is in force (E11). `client.followers`
+computes the input from it. Without a horizon the vehicle brakes from the last input, or hovers if
+it stands still.
 """
 
 import numpy as np
@@ -16,14 +16,13 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Trajectory
 
 UNENDING = 2**30
-"""Number of stages for which a position is held, so large that it never ends."""
+"""Number of stages for which a position is held: practically infinite."""
 
 
 class Compensator:
-    """Keeps the newest horizon and reads the input of any step from it.
+    """Keeps the newest horizon and computes the input of any step from it.
 
     Args:
-        terms: terms of the flight.
         regulator: K and λ of the feedback along a spline, see `shared.scenario.gain.regulator`;
             shape (axes, 3). Horizons of inputs contain their own feedback.
     """
@@ -37,42 +36,37 @@ class Compensator:
         self.begins = 0
         """Step of stage 0: the step that the horizon was made for, or at which it was dropped."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
-        """Follower of the horizon in force; without a horizon it brakes from the last input."""
+        """Follower of the horizon in force; without a horizon, of the braking curve."""
         self._chosen = 0
         self.in_force = NO_HORIZON
-        """Step that the horizon in force was made for, k_h, or NO_HORIZON."""
+        """Step that the horizon in force was made for, or NO_HORIZON."""
         self.newest = NO_HORIZON
-        """Step that the newest horizon so far was made for, even if it was dropped since."""
+        """Step that the newest horizon was made for, including horizons dropped since."""
         self.since = 0
         """First step whose input came from the horizon in force."""
         self._new = False
         self.observed = -1
-        """Step of the observation that the horizon in force was planned from, or -1."""
         self.covered = False
-        """Whether the horizon in force has an input for the latest chosen step; without one the
-        vehicle hovers, brakes, or repeats the last input."""
+        """Whether the horizon in force has an input for the latest chosen step."""
         self.stale = 0
         """Number of horizons that arrived after a newer one, or again."""
         self.repeated = 0
-        """Number of times that the horizon in force arrived again: the server may not know that it
-        did."""
+        """Number of times that the horizon in force arrived again, because the server did not know
+        that it had arrived."""
 
     def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
-        """Put a horizon in force unless a newer one has arrived.
+        """Put a horizon in force unless a newer one has arrived; return whether it is in force now.
 
         Args:
-            horizon: the horizon received.
+            horizon: horizon received.
             step: k, the next step whose input is chosen.
             observed: step of the observation that the horizon was planned from.
 
-        Returns:
-            Whether it is in force now.
-
         Raises:
-            ProtocolError: the horizon is too far ahead to be replaced later; its observation is in
-                the future, or too old for any input; it arrived so long after its committed steps
-                that other inputs were flown instead; or it is a mission's motion whose first knot
-                is still ahead.
+            ProtocolError: the horizon is too far in the future; its observation is in the
+                future, or too old for any input; it arrived so long after its committed steps
+                that other inputs were flown instead; or it is a mission's motion whose first
+                knot is in the future.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
@@ -112,7 +106,7 @@ class Compensator:
 
         Args:
             made_for: step of the first knot.
-            observed: step of the observation that it was planned from.
+            observed: step of the observation that the spline was planned from.
             spacing: steps from one knot to the next.
             knots: position [m] and velocity [m/s] of each knot; shape (axes, knots, 2).
         """
@@ -126,11 +120,8 @@ class Compensator:
         self.observed = observed
 
     def drop(self, step: int, flown_last: Array) -> None:
-        """Drop the horizon and brake from the last input; calling it again changes nothing.
-
-        Args:
-            step: latest step flown.
-            flown_last: its input [m/s]; shape (axes,).
+        """Drop the horizon and brake from `flown_last`, the input of `step` [m/s]. Calling it again
+        changes nothing.
         """
         self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
@@ -153,7 +144,6 @@ class Compensator:
 
     @property
     def rests(self) -> bool:
-        """Whether a position is held."""
         return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)
 
     def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
@@ -170,11 +160,10 @@ class Compensator:
     def choose(
         self, step: int, state: Array, disturbance: Array, before: Array
     ) -> tuple[list[float], list[float]]:
-        """Input u* of a step, and the same without feedback, on each axis [m/s].
+        """Input u* of a step, and the same without feedback, on each axis [m/s]; see
+        `Follower.input_at`.
 
-        Args:
-            step: k, never smaller than before.
-            state, disturbance, before: see `Follower.input_at`.
+        `step` never decreases.
 
         Source: eq. (11).
         """

@@ -2,7 +2,7 @@
 
 It combines `session` (the conversation with the server), `pilot` (which flies the vehicle) and
 `failsafe` (which decides what the vehicle may do). The flight runs on the client's own clock, so
-losing the server does not change its steps.
+losing the server does not shift its steps.
 """
 
 from collections import Counter
@@ -48,10 +48,10 @@ VEHICLE_SOCKET = 1
 ARMED = keys_of(InFlight.ARMED)
 """Key with which an operator allows plans to be flown."""
 HELD_AGAIN_NS = 5 * SECOND_NS
-"""Time after which the log repeats that the fence limits the vehicle [ns]."""
+"""Time after which the log repeats that the fence limits the vehicle."""
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
-"""Key with which an operator says which frame to use after a leap."""
+"""Key with which an operator chooses the frame to use after a leap of the position."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
@@ -64,12 +64,9 @@ class Client(Endpoint):
 
     Args:
         scenario: scenario of the vehicle; its terms must equal the server's.
-        flies: the vehicle, simulated or real.
         server: address of the server, or of the netem in front of it.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
-        link: converts messages to datagrams.
-        recorder: receives one row per step.
         keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
         before: state saved by the previous run of the client; None if there was none.
     """
@@ -125,28 +122,22 @@ class Client(Endpoint):
         )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
-        """Event at the end of a flight that had no plan."""
         self._land_after_s = scenario.vehicle.land_after_s
         self._reported_leap: tuple[float, ...] | None = None
-        """Latest leap that was reported."""
         self._ground = GroundReports(vehicle, server, self._timeout_ns, self._events)
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
-        """Time of day; None if the host does not know it."""
         self._time_due_ns = 0
         self.horizons = 0
         self.dropped: Counter[Drop] = Counter()
-        """Number of dropped datagrams by reason."""
 
     @property
     def failure(self) -> Failure | None:
-        """Event that ended the flight or prevents it."""
         return self._flies.failure or self._session.failure or self._not_flown
 
     @property
     def finished(self) -> bool:
-        """Whether the flight has ended, or cannot begin, and the vehicle is down."""
         pilot = self._pilot
         if pilot.next_ns is not None:
             return pilot.step >= pilot.steps and self._flies.is_down
@@ -154,17 +145,14 @@ class Client(Endpoint):
 
     @property
     def missed(self) -> int:
-        """Number of steps missed because the process was delayed."""
         return self._pilot.missed
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._pilot.began_ns
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._pilot.disturbance
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -195,8 +183,8 @@ class Client(Endpoint):
     def _begin(self, now_ns: int) -> None:
         """Begin the flight once the first session is open and the vehicle can be flown.
 
-        The flight of an earlier run continues at once, while the client asks for a session: the
-        vehicle follows the motion that was in force, or hovers.
+        The flight of an earlier run continues at once, before there is a session: the vehicle
+        follows the motion that was in force, or hovers.
         """
         before, flies = self._memory.before, self._flies
         if self._session.number is not None:
@@ -215,10 +203,9 @@ class Client(Endpoint):
         cause = Reason.RESUMED if motion else Reason.LOST
         self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
 
-    # -- what is kept ------------------------------------------------------------------------
+    # -- saved state -------------------------------------------------------------------------
 
     def _to_keep(self) -> SavedState:
-        """State that the next run of the client would need."""
         pilot, compensator = self._pilot, self._pilot.compensator
         if pilot.next_ns is None:  # the flight of the previous run may still continue
             return msgspec.structs.replace(self._memory.before, frame=self._flies.frame)
@@ -241,17 +228,12 @@ class Client(Endpoint):
         )
 
     def keep(self, *, now_ns: int) -> bytes | None:
-        """See `Endpoint`."""
         return self._memory.keep(self._to_keep(), now_ns=now_ns) if self.keeps else None
 
     def kept(self) -> None:
-        """See `Endpoint`."""
         self._memory.kept()
 
     def next_wake_ns(self) -> int | None:
-        """Start of the next step, time of the next HELLO before the flight, or the wake of the
-        port.
-        """
         due_ns = self._due_ns()
         if self._port is None or self.finished:
             return due_ns
@@ -267,7 +249,6 @@ class Client(Endpoint):
         return self._session.hello_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """Fly the step that is due, and send a HELLO if the server is not heard."""
         if self._port is not None:
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
@@ -287,9 +268,6 @@ class Client(Endpoint):
             self._attend(self._port, now_ns)
 
     def _attend(self, port: Endpoint, now_ns: int) -> None:
-        """Pass on datagrams and events of the vehicle's port; begin the flight if the vehicle is
-        up.
-        """
         if self._pilot.next_ns is None:
             self._begin(now_ns)
         if self._pilot.next_ns is None and not self.failure:
@@ -298,7 +276,6 @@ class Client(Endpoint):
         self._events += port.events()
 
     def _watch_ground(self, now_ns: int) -> None:
-        """Report what a vehicle on the ground waits for, and the state of its link."""
         session, waits_for = self._session, self._flies.waits_for
         if session.number is not None:
             self._ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
@@ -307,7 +284,6 @@ class Client(Endpoint):
         self._ground.wait(waits_for, now_ns=now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        """Fly the step that is due, and report to the server."""
         session, pilot = self._session, self._pilot
         pilot.fly(now_ns=now_ns)
         if pilot.is_held and now_ns >= self._fence_report_ns:
@@ -317,8 +293,8 @@ class Client(Endpoint):
             self._tell_leap(pilot.leap_m)
         if pilot.step >= pilot.steps:
             self._end(now_ns)
-        # Nothing is sent before the state is saved: otherwise the server would forget a motion that
-        # the next run flies.
+        # Nothing is sent before the state is saved: otherwise the server would not know which
+        # motion the next run flies.
         if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
             return
         observation = pilot.observation(session)
@@ -334,7 +310,6 @@ class Client(Endpoint):
             self._events.append(StateLeapt(vehicle=self.vehicle, by_m=leap_m, land_after_s=after_s))
 
     def _end(self, now_ns: int) -> None:
-        """Report how the flight ended, and land the vehicle."""
         self._flies.land()
         pilot, vehicle = self._pilot, self.vehicle
         if pilot.covered and pilot.without_ns <= self._timeout_ns:
@@ -346,7 +321,9 @@ class Client(Endpoint):
             self._events.append(self._not_flown)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`; after a leap, arming requires saying where the vehicle is."""
+        """After a leap, arming requires the operator to choose the frame, which says where the
+        vehicle is.
+        """
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
             return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
@@ -359,11 +336,9 @@ class Client(Endpoint):
         return self._flies.objection(scenario, keys)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; on a mission the server is told."""
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def _tell_time(self, now_ns: int) -> None:
-        """Tell the server, at intervals, the time of day at which step 0 began."""
         if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
             return
         error_ns = self._time.error_at(now_ns)
@@ -375,7 +350,6 @@ class Client(Endpoint):
         self._session.tell_time(self._pilot.flown, epoch_us, error_us)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """See `Endpoint`."""
         self._failsafe.armed = scenario.armed
         if keys & ARMED and scenario.armed:
             self._flies.arm()
@@ -418,18 +392,15 @@ class Client(Endpoint):
         self._events.append(changed)
 
     def _why_no_plan(self, now_ns: int) -> str:
-        """Why there is no newer horizon, as far as the vehicle knows."""
         reason = self._failsafe.reason
         if reason not in PLANLESS:
             return str(reason)
         return str(Reason.LOST) if self._failsafe.is_lost(now_ns) else self._session.idle
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return figures([self])
 
     def vehicle_figures(self) -> dict[str, Any]:
-        """Figures of the vehicle; ages are included while a horizon is in force."""
         pilot = self._pilot
         vehicle_figures = {
             "mode": str(self._failsafe.mode),
@@ -453,7 +424,7 @@ class Client(Endpoint):
 
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:
-    """Figures of several clients in one process, see `Endpoint.figures`."""
+    """Figures of the clients in one process, see `Endpoint.figures`."""
     others = clients[VEHICLES_TOLD_MAX:]
     return {
         "vehicles": len(clients),

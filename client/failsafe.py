@@ -1,11 +1,11 @@
 """Failsafe: the vehicle's mode, decided aboard by a transition table and a few timers.
 
-    INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, for good
+    INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, which is final
 
 `TABLE` maps mode and cause to the next mode; a pair that is missing changes nothing. `HOLD` is the
-table without a failsafe, for a vehicle that repeats its last input for ever, as the paper's does.
+table without a failsafe, for a vehicle that repeats its last input for ever, like the paper's.
 `Failsafe` detects the causes that take time: a good link, silence, late horizons, repeated errors.
-Time is an argument. `client.pilot` chooses the input in each mode.
+`client.pilot` chooses the input in each mode.
 """
 
 import math
@@ -19,28 +19,27 @@ from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 GOOD_NS = SECOND_NS
-"""Time for which the link has to be good before horizons are accepted [ns]."""
+"""Time for which the link has to be good before horizons are accepted."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which the present plan counts as too old, whatever the cause [ns]."""
+"""Lateness of a step above which the present plan counts as too old, whatever the cause."""
 LATE_NS = 500 * MILLISECOND_NS
-"""Time for which all horizons have to arrive late before the vehicle brakes [ns]."""
+"""Time for which all horizons have to arrive late before the vehicle brakes."""
 LATE_SHARE = 0.75
 """Share of a horizon's planned inputs that must have passed at its arrival for it to count as
 late."""
 WINDOW_NS = SECOND_NS
-"""Window in which errors of the server are counted [ns]."""
+"""Window in which errors of the server are counted."""
 MALFORMED_MAX = 5
 """Number of malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
-"""Number of horizons for impossible times within `WINDOW_NS` that make the client ask for a new
+"""Number of horizons from the future within `WINDOW_NS` after which the client opens a new
 session."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
-"""Time added to that of the braking curve for the longest time of braking [ns]."""
+"""Margin added to the time that braking takes."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
-"""Causes for which somebody else flies the vehicle, or nobody."""
+"""Causes for which a pilot flies the vehicle, or nobody."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
-"""Causes that make the vehicle brake and land."""
 BROKEN = frozenset(
     {
         Reason.LOST,
@@ -54,7 +53,7 @@ BROKEN = frozenset(
 )
 """Causes after which the link has to be good for `GOOD_NS` again, in every mode."""
 LOCKING = BROKEN | GROUNDING | YIELDING | {Reason.LATE, Reason.RETURNED}
-"""Causes of braking after which no horizon is accepted until the vehicle hovers and the link is
+"""Causes of braking after which horizons are refused until the vehicle hovers and the link is
 good."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session, so that another WELCOME is needed."""
@@ -62,12 +61,11 @@ DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.
 """Causes that drop the horizon in force."""
 
 HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
-"""Modes in which the vehicle stands still and waits."""
 KEPT = frozenset({Reason.BRAKED, Reason.WAITED})
-"""Causes that keep the previous reason: why the vehicle brakes or hovers stays the reason."""
+"""Causes that do not replace the reason for braking or hovering."""
 
 CALM = frozenset({Mode.TRACK, Mode.COAST, Mode.HOVER})
-"""Modes in which a vehicle may fly for many steps without a cause for another mode."""
+"""Modes in which a vehicle may fly for many steps without a change of mode."""
 
 Table = Mapping[tuple[Mode, Reason], Mode]
 
@@ -154,12 +152,12 @@ class Failsafe:
     Args:
         table: `TABLE` or `HOLD`.
         armed: whether horizons may be flown at all.
-        timeout_ns: time of silence after which the link counts as lost, and time without a newer
-            horizon after which the vehicle coasts [ns].
-        brake_ns: longest time of braking, after which the vehicle hovers even if it is still pushed
-            [ns].
-        land_after_ns: time of hovering after which the vehicle lands if what it needs to fly on,
-            such as a good link, does not return [ns]; 0: never.
+        timeout_ns: time of silence after which the link counts as lost, and time without a
+            newer horizon after which the vehicle coasts [ns].
+        brake_ns: longest time of braking, after which the vehicle hovers even if wind still
+            pushes it [ns].
+        land_after_ns: time of hovering after which the vehicle lands if, for example, the link
+            does not become good again [ns]; 0: never.
         returns: whether the vehicle returns home instead of landing if the server is silent.
         changed: called when mode or reason have changed, with the previous mode and reason, the
             cause, and the time.
@@ -178,39 +176,34 @@ class Failsafe:
     ) -> None:
         self._table = table
         self.armed = armed
-        """Whether horizons may be flown at all; may change in flight."""
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
         self._alone = Reason.HOMEWARD if returns else Reason.ALONE
-        """Cause that follows a long silence of the server."""
+        """Cause used after a long silence of the server."""
         self._changed = changed
         self.mode = Mode.INIT
         self.reason = Reason.BEGUN
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
         self._heard_ns: int | None = None
         self._good_ns = 0
-        """Time since which the link has been good; only meaningful while it is."""
+        """Time since which the link has been good; only valid while it is good."""
         self._horizon_ns = 0
-        """Time at which the newest horizon was accepted."""
         self._late_ns: int | None = None
-        """Time since which all horizons have been late; None if the newest was not."""
+        """Time since which all horizons have been late; None if the newest was in time."""
         self._began_ns = 0
-        """Time at which the current mode began."""
         self._waits_ns = 0
-        """Time since which the vehicle has waited for what it needs to fly on."""
+        """Start of the wait for a good link, a ready autopilot or an operator."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
-        """Times of the newest malformed messages."""
         self.has_leapt = False
         """Whether the measured state has leapt and the operator has not yet chosen a frame."""
         self.stays = False
         """Whether the vehicle hovers on after a leap instead of landing, as chosen by the
         operator."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
-        """Times of the newest horizons for impossible times."""
+        """Times of the newest horizons from the future."""
 
     @property
     def heard_ns(self) -> int | None:
-        """Time of the newest packet of the session; None without a session."""
         return self._heard_ns
 
     @property
@@ -225,20 +218,17 @@ class Failsafe:
         return self._table is TABLE
 
     def is_lost(self, now_ns: int) -> bool:
-        """Whether no packet of the session has arrived within the time-out, or there is no
-        session.
-        """
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns
 
     def _is_good(self, now_ns: int) -> bool:
         """Whether a packet of the session has arrived within two thirds of the time-out.
 
-        A heartbeat comes at least every third of it (`heartbeat.FEWEST`), so one may be lost. The
-        first comes a round trip after WELCOME, which may take a second.
+        A heartbeat comes at least every third of the time-out (`heartbeat.FEWEST`), so one may be
+        lost. The first comes a round trip after WELCOME, which may take a second.
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
-    # -- what arrives ------------------------------------------------------------------------
+    # -- messages and packets ----------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:
         """Note a packet of the session; on a secured link, an authenticated one."""
@@ -252,18 +242,14 @@ class Failsafe:
 
         Args:
             cause: RESUMED if its motion is flown on, LOST if there is none.
-            heard_ns: time at which that run last heard the server.
-            now_ns: time now.
+            heard_ns: time at which that run last received a packet from the server.
         """
         self._heard_ns = self._good_ns = self._horizon_ns = heard_ns
         self.meet(cause, now_ns=now_ns)
 
     def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
-        """Note a horizon newer than those before, accepted or not.
-
-        Args:
-            late: whether more than LATE_SHARE of it has passed.
-            now_ns: time of arrival.
+        """Note a horizon newer than all before, whether accepted or not; `late` if more than
+        LATE_SHARE of it has passed.
         """
         if not late:
             self._late_ns = None
@@ -273,23 +259,20 @@ class Failsafe:
             self.meet(Reason.LATE, now_ns=now_ns)
 
     def horizon_taken(self, *, now_ns: int) -> None:
-        """Note that a horizon was put in force."""
         self._horizon_ns = now_ns
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
-        """Note a malformed message from the server itself."""
+        """Note a malformed message that was sent by the server itself."""
         if _full(self._malformed, now_ns):
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
     def future(self, *, now_ns: int) -> None:
-        """Note a horizon that was made for an impossible step, or from an impossible
-        observation.
-        """
+        """Note a horizon made for a step in the future, or from an observation in the future."""
         if _full(self._future, now_ns):
             self.meet(Reason.RESYNC, now_ns=now_ns)
 
-    # -- what time brings --------------------------------------------------------------------
+    # -- timers ------------------------------------------------------------------------------
 
     def step(self, *, late_ns: int, hindrance: Reason | None, now_ns: int) -> None:
         """Handle the causes that hold at the start of a step.
@@ -297,9 +280,8 @@ class Failsafe:
         Args:
             late_ns: delay with which the step was started [ns].
             hindrance: cause on the vehicle's side that forbids following a plan.
-            now_ns: time now.
         """
-        # First: when a pilot takes over, none of the checks below may come before that.
+        # Hindrances first: when a pilot takes over, no check below may act before that.
         if hindrance is not None:
             self.meet(hindrance, now_ns=now_ns)
         elif self.mode is Mode.MANUAL:
@@ -324,7 +306,9 @@ class Failsafe:
         self._wait(lost=lost, good=good, now_ns=now_ns)
 
     def _wait(self, *, lost: bool, good: bool, now_ns: int) -> None:
-        """Land if what the vehicle needs to fly on does not return."""
+        """Land if the vehicle has waited too long for a good link, a ready autopilot or an
+        operator.
+        """
         # A link that is never good, or a silent autopilot, counts like a lost link.
         locked = self.reason in LOCKING or self.mode is Mode.SYNC
         waits = lost or (locked and not good) or (self.has_leapt and not self.stays)
@@ -336,8 +320,8 @@ class Failsafe:
             self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
-        """Note a leap of the state: no horizon is accepted until an operator has chosen the
-        frame.
+        """Note a leap of the state: no horizon is accepted until an operator
+        has chosen the frame.
         """
         # With HOLD there is no failsafe, and a leap stops nothing.
         self.has_leapt = self.brakes
@@ -345,11 +329,9 @@ class Failsafe:
             self.meet(Reason.LEAPT, now_ns=now_ns)
 
     def decide(self) -> None:
-        """Note that an operator has chosen the frame."""
         self.has_leapt = self.stays = False
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Change mode and reason as the table says for a cause."""
         after = self._table.get((self.mode, cause))
         if after is None:
             return
@@ -368,7 +350,7 @@ class Failsafe:
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:
-    """Add a time; True if the queue is now full of times within WINDOW_NS, and then empty it."""
+    """Add a time. Return whether the queue is full of times within WINDOW_NS; if so, empty it."""
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:

@@ -1,8 +1,8 @@
 """Fence: a region that the vehicle never leaves, whatever the server or any plan demands.
 
-It acts after everything that chooses an input, and uses the vehicle's own scenario file alone. From
-the state z = [p, v] in which the next input will take effect, a vehicle with zero input drifts on
-to
+The fence acts after everything that chooses an input, and uses the vehicle's own scenario file
+alone. From the state z = [p, v] in which the next input will take effect, a vehicle with zero input
+drifts on to
 
     s = p + τ v                 and with the input u, by eq. (1):   ṡ = g u + w
 
@@ -10,18 +10,17 @@ So s is where the vehicle would come to rest, and inputs move s as if there was 
 distance y = bound - s, the speed towards the bound is limited to
 
     φ(y) = y / T                   for y ≤ b T²; negative y gives a negative speed, back inside
-           √(2 b (y - b T² / 2))   beyond: the speed from which it can still stop with deceleration
-           b
+           √(2 b (y - b T² / 2))   beyond: from this speed it can still stop with deceleration b
 
 and the input to φ / g. T = τ + 2 Δt is slow enough for a loop whose parameters are slightly wrong.
 The bounds are moved inwards by
 
     m = 0.06 s · u_max + 1.25 W (T + θ + 0.1 s + Δt)
 
-where W [m/s] is the wind in which the fence must hold: its push moves the vehicle beyond where the
-input leads. The factor 1.25 covers a gain of 0.8; 0.1 s covers an error in the dead time θ; Δt
-covers wind that changes before the next input. Tests check this with time constants wrong by 30 %,
-gains by 20 % and dead times by 0.1 s.
+where W [m/s] is the wind in which the fence must hold: wind pushes the vehicle beyond the point to
+which the input leads. The factor 1.25 covers a gain of 0.8; 0.1 s covers an error in the dead time
+θ; Δt covers wind that changes before the next input. Tests check this with time constants wrong by
+30 %, gains by 20 % and dead times by 0.1 s.
 """
 
 import math
@@ -31,16 +30,10 @@ from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 
 ROUNDING = 1e-9
-"""Change of an input that is put down to rounding [m/s]."""
+"""Change of an input attributed to rounding [m/s]."""
 
 
 class Fence:
-    """Fence of a scenario's vehicle.
-
-    Args:
-        scenario: the vehicle's own keys and its model are used, nothing else.
-    """
-
     def __init__(self, scenario: Scenario) -> None:
         terms, fence, dt = scenario.terms(), scenario.fence, scenario.control.dt
         self._tau, self._gain = terms.tau_s, terms.gain
@@ -51,7 +44,8 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether a bound limited the latest requested input; being slowed alone does not count."""
+        """Whether a bound limited the latest requested input; a bound on the speed alone does not
+        count."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
@@ -60,8 +54,8 @@ class Fence:
 
         Args:
             wanted: chosen input of each axis [m/s].
-            state: state in which the input will take effect, of each axis [m, m/s]; the position of
-                the first call is home.
+            state: state in which the input will take effect, of each axis [m, m/s]; the
+                position of the first call is home.
             u_max: bound of each axis [m/s].
         """
         # The first known state, not the scenario's start: a real vehicle starts where it stands.
@@ -77,17 +71,14 @@ class Fence:
     def _inside(
         self, wanted: Sequence[float], rest: Sequence[float], u_max: Sequence[float]
     ) -> list[float]:
-        """Input of each axis that crosses no bound [m/s]."""
         axes = enumerate(zip(self._towards_home(wanted, rest), rest, u_max, strict=True))
         return [self._between(i, u, s, most) for i, (u, s, most) in axes]
 
     def _towards_home(self, wanted: Sequence[float], rest: Sequence[float]) -> Sequence[float]:
-        """Input whose component away from home is limited by the radius."""
         if self._home is None or math.isinf(self._radius):
             return wanted
         away = [s - home for s, home in zip(rest, self._home, strict=True)]
         distance = math.hypot(*away)
-        # At home itself there is no direction away from it.
         if not distance:
             return wanted
         n = [part / distance for part in away]
@@ -96,7 +87,6 @@ class Fence:
         return [u - max(0.0, excess) * part for u, part in zip(wanted, n, strict=True)]
 
     def _between(self, axis: int, wanted: float, rest: float, u_max: float) -> float:
-        """Input of one axis, limited by its two bounds."""
         (low, high), T, gain = self._bounds[axis], self._T[axis], self._gain[axis]
         least = -self._most(rest - low, T) / gain
         most = self._most(high - rest, T) / gain
@@ -114,7 +104,7 @@ def _slowed(back: Sequence[float], flown: Sequence[float], speed: float) -> list
     """Fastest input within `speed` on the line between an input that leads back and one that is too
     fast.
 
-    Both cross no bound, and the allowed region is convex, so no input between them crosses one.
+    Neither crosses a bound, and the allowed region is convex, so no input between them crosses one.
     """
     most = math.hypot(*back)
     if most >= speed:

@@ -29,7 +29,7 @@ from skytether.shared.law.model import Array, Axis, advance, white_acceleration
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
-"""Strength of the random walk of w as a share of q: w moves by DRIFT q √t in the time t."""
+"""Random walk of w relative to q: w moves by DRIFT q √t in the time t."""
 BEGIN_MPS = 1.0, 0.5
 """Initial standard deviation of a velocity that was not measured, and of w [m/s]."""
 # A variance of 0 would make the covariance singular.
@@ -38,7 +38,7 @@ LEAST = 1e-6
 
 
 class Spread(NamedTuple):
-    """Covariance P of the [p, v, w] of an axis; half of it, since it is symmetric."""
+    """Covariance P of [p, v, w] of an axis: its upper triangle."""
 
     pp: float
     pv: float
@@ -68,7 +68,6 @@ def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
 
 
 def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
-    """Gain and P after a measured position."""
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
@@ -80,7 +79,6 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
 
 
 def by_velocity(P: Spread, variance: float) -> tuple[Gain, Spread]:
-    """Gain and P after a measured velocity."""
     pp, pv, pw, vv, vw, ww = P
     total = vv + variance
     kp, kv, kw = pv / total, vv / total, vw / total
@@ -122,7 +120,6 @@ def corrected(
     Args:
         x, P: see `advanced`.
         measured: positions [m] and velocities [m/s]; shape (2, axes).
-        has_position, has_velocity: whether they were measured.
         variance_p, variance_v: variances of position [m²] and velocity [m²/s²].
     """
     for i in range(len(x)):
@@ -148,11 +145,8 @@ def _write(table: Table, i: int, spread: Spread) -> None:
 
 
 class Kalman:
-    """Kalman filter of a scenario's vehicle.
-
-    Args:
-        scenario: model, and the properties of the sensor.
-        delay: age of a measurement when it becomes available [steps].
+    """Kalman filter of a scenario's vehicle; `delay` is the age of a measurement when it arrives
+    [steps].
     """
 
     def __init__(self, scenario: Scenario, delay: int) -> None:
@@ -176,11 +170,11 @@ class Kalman:
         self._acted: deque[tuple[Array, Array | None]] = deque(
             [(np.zeros(axes), None)] * delay, delay + 1
         )
-        """Inputs that have acted since then, see `advance` [m/s]."""
+        """Inputs of the steps from there to the present, see `advance` [m/s]."""
         self._late = np.array([dead_time.late for dead_time in terms.dead_times])
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
-        """Start from the first measurement, which has a position; the vehicle stands still.
+        """Start from the first measurement, which has a position; the vehicle is at rest.
 
         Args:
             measured: the measurement.
@@ -199,7 +193,8 @@ class Kalman:
 
         Args:
             due: input acting at the end of the step, of each axis [m/s].
-            swing: difference of the input acting at its begin [m/s]; None if there is none.
+            swing: difference to the input acting at the start of the step [m/s]; None if there
+                is none.
         """
         self._acted.append((due, swing))
         inputs, more = self._acted.popleft()
@@ -208,7 +203,9 @@ class Kalman:
             self.x[:, :2] += self._late * more[:, None]
 
     def take(self, measured: Measurement, numbers: Array) -> None:
-        """Correct by a measurement of the step that the filter's state belongs to, see `begin`."""
+        """Correct by a measurement of the step that the filter's state belongs to; arguments as in
+        `begin`.
+        """
         _, position, velocity = measured
         has_position, has_velocity = position is not None, velocity is not None
         corrected(self.x, self.P, numbers, has_position, has_velocity, *self._variances)

@@ -11,23 +11,20 @@ from skytether.shared.core.events import Failure
 from skytether.shared.scenario.schema import Scenario
 
 START_NS = 5 * SECOND_NS
-"""Longest time within which all vehicles of a fleet start [ns]."""
+"""Longest time within which all vehicles of a fleet start."""
 
 
 def apart_ns(vehicles: int, dt_ns: int) -> int:
     """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
 
-    Vehicles that start together send all their packets together, which then queue.
+    Vehicles that start together would send all their packets together, which then queue.
     """
     return min(dt_ns, START_NS // vehicles)
 
 
 class ClientFleet(Endpoint):
-    """Clients driven as one endpoint; client n uses socket n.
-
-    Args:
-        clients: clients, none of which has been woken yet.
-        apart_ns: time from one start to the next [ns].
+    """Clients driven as one endpoint; client n uses socket n. No client may
+    have been woken before.
     """
 
     def __init__(self, clients: Sequence[Client], apart_ns: int = 0) -> None:
@@ -44,21 +41,17 @@ class ClientFleet(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether every vehicle has finished."""
         return not self._flying
 
     @property
     def failure(self) -> Failure | None:
-        """Event of the first failed vehicle."""
         return next((client.failure for client in self._clients if client.failure), None)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Pass a datagram to the client whose socket it came to."""
         self._clients[datagram.socket].receive(datagram, now_ns=now_ns)
         self._after(datagram.socket)
 
     def next_wake_ns(self) -> int | None:
-        """Earliest wake requested by a client."""
         heap, due_ns = self._heap, self._due_ns
         # Outdated wakes stay in the heap until their time: removing one earlier would need a
         # search.
@@ -67,7 +60,7 @@ class ClientFleet(Endpoint):
         return heap[0][0] if heap else None
 
     def wake(self, *, now_ns: int) -> None:
-        """Wake all clients that are due; the first call schedules when each starts."""
+        """Wake all clients that are due. The first call schedules their starts."""
         if self._apart_ns:
             self._heap = [(now_ns + n * self._apart_ns, n) for n in range(len(self._clients))]
             self._due_ns = [due_ns for due_ns, _ in self._heap]
@@ -79,28 +72,23 @@ class ClientFleet(Endpoint):
             self._after(n)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         for client in self._clients:
             client.learn_time(utc_ns, error_ns, now_ns=now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`; the objection of the first vehicle that has one."""
         said = (client.objection(scenario, keys) for client in self._clients)
         return next(filter(None, said), "")
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Change the scenario of every vehicle."""
         for client in self._clients:
             client.change(scenario, keys, now_ns=now_ns)
 
     def close(self, *, now_ns: int) -> None:
-        """Close every client."""
         for n, client in enumerate(self._clients):
             client.close(now_ns=now_ns)
             self._after(n)
 
     def _after(self, n: int) -> None:
-        """Collect a client's datagrams and events, and note its next wake."""
         client = self._clients[n]
         for payload, peer, _ in client.outbox():
             self._out.append(Datagram(payload, peer, n))
@@ -113,5 +101,4 @@ class ClientFleet(Endpoint):
         self._due_ns[n] = due_ns
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return figures(self._clients)

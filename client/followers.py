@@ -1,8 +1,7 @@
-"""Followers: inputs from a horizon of inputs or from a spline, eq. (11).
+"""Inputs computed from a horizon of inputs or from a spline, eq. (11).
 
-The rules themselves are in `shared.law.rule` and `shared.law.spline`, which the server uses as
-well; here they are applied aboard, to all axes of one vehicle. Stages count steps from the first
-step of a horizon.
+The equations are in `shared.law.rule` and `shared.law.spline`, which the server uses too; here they
+are applied aboard, to all axes of one vehicle. Stages count steps from the first step of a horizon.
 """
 
 import math
@@ -28,9 +27,7 @@ class Follower(Protocol):
     """Source of inputs: a horizon or a spline."""
 
     length: int
-    """Number of stages with an input."""
     feeds_back: bool
-    """Whether the input includes feedback."""
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
         """Input u*, and the same without feedback [m/s]; shape (2, axes).
@@ -55,11 +52,8 @@ class Follower(Protocol):
 
 
 class Constants(NamedTuple):
-    """Constants that all horizons and splines of a vehicle share."""
-
     terms: Terms
     model: Model
-    """Model of the terms, eq. (4)."""
     held: Array
     """Parameters of flight along a horizon that do not depend on it, in the columns of
     `shared.law.rule`; shape (axes, n)."""
@@ -69,13 +63,6 @@ class Constants(NamedTuple):
 
     @classmethod
     def of(cls, terms: Terms, regulator: Array) -> Self:
-        """Constants of a flight.
-
-        Args:
-            terms: terms of the flight.
-            regulator: K and λ along a spline, see `shared.scenario.gain.regulator`; shape (axes,
-                3).
-        """
         model = terms.model
         held = np.zeros((terms.axes, rule.DISTURBANCE + 1))
         held[:, : rule.MODEL] = np.stack(model, -1)
@@ -93,11 +80,9 @@ class HorizonFollower:
     """Follows a horizon of inputs.
 
     Args:
-        constants: constants of the vehicle.
         inputs: inputs [m/s]; shape (axes, n).
         length: number of inputs that may be flown.
-        feedback: feedback of the horizon, see `wire.protocol.Horizon`; shape (axes, 5); None
-            without.
+        feedback: feedback of the horizon, see `wire.protocol.Horizon`; shape (axes, 5).
     """
 
     def __init__(
@@ -131,7 +116,6 @@ class HorizonFollower:
         disturbance: Array,  # noqa: ARG002 - a horizon contains its own
         before: Array,  # noqa: ARG002 - used along a spline only
     ) -> Array:
-        """See `Follower`."""
         flown = np.empty((2, len(state)))
         rule.fly_horizon(
             self._table, self._inputs, self.reference, self._reference_stage, stage, state, flown
@@ -140,7 +124,6 @@ class HorizonFollower:
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
-        """See `Follower`."""
         if flown is not None:
             return self._model.step(state, flown + self._table[:, rule.DISTURBANCE])
         ahead = np.empty_like(state)
@@ -152,7 +135,6 @@ class SplineFollower:
     """Follows a spline.
 
     Args:
-        constants: constants of the vehicle.
         knots: position [m] and velocity [m/s] of each knot; shape (axes, n, 2).
         spacing: steps from one knot to the next.
         length: number of stages for which it may be flown.
@@ -166,7 +148,6 @@ class SplineFollower:
         terms = constants.terms
         self.length = length
         self.spacing, self.sent = spacing, knots
-        """Steps from knot to knot, and the knots as received."""
         self._knots = np.array(knots, np.float64, order="C").reshape(len(knots), -1)
         axes = zip(constants.model.axes(), self._knots, terms.u_max, strict=True)
         last = [
@@ -181,7 +162,6 @@ class SplineFollower:
         self._reference_stage = 0
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
-        """See `Follower`."""
         flown = np.empty((2, len(state)))
         spline.fly_spline(
             self._table,
@@ -198,7 +178,6 @@ class SplineFollower:
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:  # noqa: ARG002
-        """See `Follower`; the input flown is not used."""
         ahead = np.empty_like(state)
         spline.foresee_spline(self._table, self._knots, self.reference, stage, state, ahead)
         return ahead

@@ -1,4 +1,6 @@
-"""Reports of a vehicle on the ground: what it waits for, and whether its server is heard."""
+"""Log events of a vehicle on the ground: what prevents its flight, and whether its server is
+silent.
+"""
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.aboard import AutopilotWaits
@@ -6,42 +8,32 @@ from skytether.shared.core.endpoint import Address, Events
 from skytether.shared.core.events import ServerHeard, ServerSilent, Welcomed
 
 WAITED_NS = 2 * SECOND_NS
-"""Delay before the log says what a vehicle waits for that cannot be flown yet [ns]."""
+"""Delay before the log says what prevents the flight."""
 SILENT_NS = 3 * SECOND_NS
-"""Time beyond the time-out after which the server of a vehicle on the ground counts as silent [ns].
+"""Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
 The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
 of the packets each way."""
 
 
 class GroundReports:
-    """Reports of one vehicle that cannot be flown yet.
+    """Log events of one vehicle that cannot be flown yet, appended to `events`.
 
-    Args:
-        vehicle: number of the vehicle.
-        server: address of the server.
-        timeout_ns: time of silence after which the link counts as lost [ns].
-        events: list to which events are appended.
+    `timeout_ns` is the time of silence after which the link counts as lost.
     """
 
     def __init__(self, vehicle: int, server: Address, timeout_ns: int, events: Events) -> None:
         self._vehicle, self._server, self._events = vehicle, server, events
         self._silence_ns = timeout_ns + SILENT_NS
         self._waits_for, self._waits_ns, self._reported_wait = "", 0, ""
-        """What is missing before the vehicle can be flown, since when, and what of that was
-        logged."""
+        """What prevents the flight, since when, and what of it was logged."""
         self._welcomed: int | None = None
-        """Number of the session that was reported."""
         self._silent_ns: int | None = None
-        """Time of the newest packet before the server was reported as silent; None if it is not."""
+        """Time of the newest packet before the server was reported as silent; None if it is not
+        silent."""
 
     def wait(self, waits_for: str, *, now_ns: int) -> None:
-        """Report what the vehicle waits for, once it has waited for a while.
-
-        Args:
-            waits_for: what is missing, in words; empty if nothing is.
-            now_ns: time now.
-        """
+        """Report what prevents the flight (empty: nothing), once it has done so for a while."""
         if waits_for != self._waits_for:
             self._waits_for, self._waits_ns = waits_for, now_ns
         if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._reported_wait:
@@ -50,12 +42,11 @@ class GroundReports:
                 self._events.append(AutopilotWaits(vehicle=self._vehicle, waits_for=waits_for))
 
     def hear(self, session: int, newest_ns: int, *, now_ns: int) -> None:
-        """Report a new session, that its server falls silent, and that it is heard again.
+        """Report a new session, that its server falls silent, and that packets arrive again.
 
         Args:
             session: number of the session.
             newest_ns: time of the server's newest packet.
-            now_ns: time now.
         """
         if session != self._welcomed:
             self._welcomed, (host, port) = session, self._server

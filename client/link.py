@@ -8,10 +8,10 @@ from typing import Protocol
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 HELLO_NS = SECOND_NS
-"""Time between two HELLOs in plaintext until the server first answers [ns]."""
+"""Time between two HELLOs in plaintext until the server first answers."""
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time between two HELLOs otherwise [ns]: fewer than the five handshakes a second that a server
-grants."""
+"""Time between two HELLOs otherwise: fewer than the five handshakes a second that a server
+allows."""
 
 
 class ClientLink(Protocol):
@@ -23,21 +23,21 @@ class ClientLink(Protocol):
     """Time between two HELLOs until the server first answers [ns]."""
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
-        """Datagram that carries a HELLO."""
+        pass
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any other message."""
+        """Datagram that carries any message but a HELLO."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
         """Message in a datagram; None if it was part of the handshake, whose answer is in the
         outbox.
 
         Raises:
-            ProtocolError: it is not from the server.
+            ProtocolError: the datagram is not from the server.
         """
 
     def outbox(self) -> list[bytes]:
-        """Datagrams of the link itself for the server; each is returned once."""
+        """Datagrams of the handshake to send to the server; each is returned once."""
 
     def adopt(self, *, now_ns: int) -> None:
         """Use the keys of the latest WELCOME from now on."""
@@ -53,24 +53,19 @@ class PlainLink:
     hello_ns = HELLO_NS
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002 - same signature as in any `ClientLink`
-        """See `ClientLink`."""
         return payload
 
     def seal(self, payload: bytes) -> bytes:
-        """See `ClientLink`."""
         return payload
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes:  # noqa: ARG002
-        """See `ClientLink`."""
         return datagram
 
     def outbox(self) -> list[bytes]:
-        """See `ClientLink`."""
         return []
 
     def adopt(self, *, now_ns: int) -> None:
-        """See `ClientLink`."""
+        pass
 
     def wants_hello(self, now_ns: int) -> bool:  # noqa: ARG002
-        """See `ClientLink`."""
         return False

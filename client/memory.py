@@ -1,17 +1,17 @@
-"""Saved state of a client: what its next run needs to continue in the middle of a flight.
+"""Saved state of a client, with which its next run continues in the middle of a flight.
 
 A process may die at any time and be started again while its vehicle is in the air. So the client
 saves, outside the process:
 
-    the motion in force, on a mission     others keep clear of this motion alone
+    the motion in force, on a mission     other vehicles keep clear of this motion alone
     step 0, on the clock of the host      steps continue to count from it
-    the boot id of the conversation       the server sees the same client
+    the boot id of the conversation       the server recognizes the same client
     the origin of the vehicle's frame     otherwise the flight would be shifted
     whether the vehicle was armed         starting a process must not arm it
 
 A core opens no file: `Client.keep` returns bytes when they have changed, the shell writes them
-(`shell.memory`) and confirms by `Client.kept`. **Nothing is sent to the server before it is
-saved**: otherwise the server would forget a motion that the next run still flies.
+(`shell.memory`) and confirms by `Client.kept`. **Nothing is sent to the server before the state is
+saved**: otherwise the next run might fly a motion that the server no longer counts with.
 """
 
 from typing import Annotated, Self
@@ -25,9 +25,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import KNOTS_MAX
 
 TIME_MAX_NS = 2**62
-"""Largest time accepted from a file [ns]."""
 STEP_MAX = 2**40
-"""Largest step accepted from a file."""
 REFRESHES = 3
 """Number of times that the state is written again before it would be too old."""
 
@@ -37,14 +35,9 @@ Step = Annotated[int, msgspec.Meta(ge=0, lt=STEP_MAX)]
 
 
 class FlownMotion(msgspec.Struct, frozen=True, kw_only=True):
-    """Motion in force."""
-
     step: Step
-    """Step of its first knot."""
     observed: Step
-    """Step of the observation that it was planned from."""
     spacing: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
-    """Steps from one knot to the next."""
     numbers: Annotated[bytes, msgspec.Meta(max_length=4 * 3 * 2 * KNOTS_MAX)]
     """Position [m] and velocity [m/s] of each knot, float32 of shape (axes, knots, 2)."""
 
@@ -69,28 +62,23 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     boot_id: int | None = None
     """Boot id of the conversation with the server; None if it cannot continue."""
     began_ns: Time | None = None
-    """Start of step 0; None before the flight."""
     heard_ns: Time = 0
-    """Time at which the server was last heard."""
     motion: FlownMotion | None = None
-    """Motion in force; None if there is none."""
     frame: VehicleMemory = VehicleMemory()
-    """State saved for the vehicle itself."""
 
     def after(self, time_ns: int) -> "SavedState":
-        """Copy with all times shifted by `time_ns`."""
         began_ns = None if self.began_ns is None else self.began_ns + time_ns
         heard_ns = self.heard_ns + time_ns
         frame = msgspec.structs.replace(self.frame, at_ns=self.frame.at_ns + time_ns)
         return msgspec.structs.replace(self, began_ns=began_ns, heard_ns=heard_ns, frame=frame)
 
     def encode(self, written_ns: int) -> bytes:
-        """Bytes, with times relative to that of writing."""
+        """Bytes to save, with times relative to that of writing."""
         return msgspec.msgpack.encode(self.after(-written_ns))
 
     @classmethod
     def decode(cls, content: bytes, written_ns: int, axes: int) -> Self:
-        """State from the bytes that were written at a time.
+        """State from bytes that were written at `written_ns`.
 
         Raises:
             ValueError: the bytes are invalid; says why.
@@ -109,15 +97,14 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) -> SavedState:
-    """Saved state of an earlier run, as far as it still holds.
+    """Saved state of an earlier run, as far as it is still valid.
 
-    A flight that was saved longer ago than any motion lasts counts as lost.
+    A flight that was saved longer ago than any motion lasts is not continued.
 
     Args:
         content: bytes written by that run.
-        written_ns: time of writing [ns; the clock of the host]; None if the host has restarted its
-            clock since.
-        now_ns: time now.
+        written_ns: time of writing [ns; the clock of the host]; None if the clock has been
+            reset since, for example by a reboot.
         terms: terms of the flight, which have not changed.
 
     Raises:
@@ -132,7 +119,7 @@ def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) ->
 
 
 def age_max_ns(terms: Terms) -> int:
-    """Age from which on a saved state counts as lost [ns]: no motion is flown for longer."""
+    """Age above which a saved state is not used [ns]: no motion is flown for longer."""
     return terms.age_max * terms.dt_ns
 
 
@@ -140,7 +127,6 @@ class ClientMemory:
     """Decides when the state of a client has to be written.
 
     Args:
-        terms: terms of the flight.
         boot_id: number unique to this run.
         before: state saved by the previous run; None if there was none.
     """
@@ -148,21 +134,14 @@ class ClientMemory:
     def __init__(self, terms: Terms, boot_id: int, before: SavedState | None) -> None:
         self._age_max_ns = age_max_ns(terms)
         self.before = before or SavedState()
-        """State saved by the previous run."""
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
-        """Boot id of the conversation."""
         self._handed: tuple[SavedState, int] | None = None
         """State returned last for writing, and when."""
         self._written: tuple[SavedState, int] | None = None
         """State that was written last, and when it was returned."""
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
-        """Bytes to be written, if the state differs from the last one returned or that is old.
-
-        Args:
-            state: present state.
-            now_ns: time now.
-        """
+        """Bytes to be written, if the state has changed or the bytes returned last are old."""
         if self._handed is not None:
             handed, handed_ns = self._handed
             is_old = now_ns - handed_ns > self._age_max_ns // REFRESHES
@@ -172,14 +151,14 @@ class ClientMemory:
         return state.encode(now_ns)
 
     def kept(self) -> None:
-        """Note that the bytes returned last have been written."""
         self._written = self._handed
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
-        """Whether the server may be told: the next run will then follow the same motion, or none.
+        """Whether messages may be sent: the next run will follow the same motion as this state, or
+        none.
 
-        If the file cannot be written any more, the next run follows the old one until that is too
-        old.
+        If the file cannot be written any more, the next run follows the saved motion until it is
+        too old.
         """
         if self._written is None:
             if self.before.boot_id is None:  # no earlier state that a next run could follow
@@ -191,8 +170,8 @@ class ClientMemory:
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:
-    """Whether a next run would do the same with either: only times that advance by themselves
-    differ.
+    """Whether the next run would do the same with either state: times that only advance are
+    ignored.
     """
     return _lasting(one) == _lasting(other)
 

@@ -1,9 +1,9 @@
-"""Navigation: the vehicle's knowledge of its state, from measurements and the filter's estimate.
+"""Navigation: the estimate of the vehicle's state, from measurements and a filter.
 
-What is flown by and reported is not the state now but, with a dead time, the predicted state in
+With a dead time, feedback and observations use not the present state but the predicted state in
 which the next input will take effect (`shared.law.dead_time`). A sensor that measures the exact
-state at every step needs no filter, unless the filter's disturbance is needed: to predict over a
-dead time, and to follow a spline.
+state at every step needs no filter, unless the estimate of the disturbance is needed: to predict
+over a dead time, or to follow a spline.
 """
 
 import math
@@ -30,15 +30,14 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
-"""Longest time over which a measurement is extrapolated [ns]; an older one is extrapolated by this
+"""Longest time over which a measurement is extrapolated; an older one is extrapolated by this
 time."""
 SIGMAS = 10.0
-"""Number of standard deviations of sensor noise allowed in a change."""
+"""Standard deviations of sensor noise by which two measurements may differ without counting as a
+leap."""
 
 
 class Sensing(NamedTuple):
-    """Properties of a scenario's sensor."""
-
     delay: int
     """Delay of a measurement, D [steps]."""
     every_ns: tuple[int, int]
@@ -46,11 +45,10 @@ class Sensing(NamedTuple):
     prompt: bool
     """Whether it measures the whole state at every step without delay."""
     exact: bool
-    """Whether, moreover, it has no noise and no bias."""
+    """Whether it also has neither noise nor bias."""
 
 
 def sensing(scenario: Scenario) -> Sensing:
-    """Properties of a scenario's sensor."""
     sensor, dt_ns = scenario.sensor, scenario.dt_ns
     # Rounded up: a measurement is used at the first step at which it is available.
     delay = -(-seconds_to_ns(sensor.delay_s) // dt_ns)
@@ -65,31 +63,28 @@ def sensing(scenario: Scenario) -> Sensing:
 
 
 def filters(scenario: Scenario) -> bool:
-    """Whether a scenario's vehicle has a Kalman filter."""
     terms = scenario.terms()
     needs_disturbance = any(terms.dead_time_s) or terms.splines
     return scenario.sensor.filter == "kalman" and (needs_disturbance or not sensing(scenario).exact)
 
 
 class Navigation:
-    """Filter of a scenario's vehicle and its measurements."""
+    """Estimate of a vehicle's state, updated at every step."""
 
     def __init__(self, scenario: Scenario) -> None:
         sensor, axes = sensing(scenario), scenario.model.axes
         self._scenario, terms = scenario, scenario.terms()
         self.filter = Kalman(scenario, sensor.delay) if filters(scenario) else Newest(axes)
-        """Filter that turns measurements into an estimate."""
         late = any(terms.dead_time_s)
         self._inputs = PendingInputs(terms.model.axes(), terms.dead_times) if late else None
-        """Inputs that are not acting yet; None if the model has no dead time."""
+        """Inputs that do not act yet; None if the model has no dead time."""
         self._delay_ns = sensor.delay * scenario.dt_ns
         """Delay of measurements that the filter allows for [ns]."""
         self._tau_s, self._gain = np.array(terms.tau_s), np.array(terms.gain)
         self._begun = False
         self.leaps = Leaps(scenario)
-        """Check of each measurement against the previous one."""
         self.leapt = False
-        """Whether a measurement since the last step is further away than any vehicle could have
+        """Whether a measurement since the last step is farther away than any vehicle could have
         moved."""
         self._nothing = np.full((2, axes), math.nan)
         self.measured: Array = np.full((axes, 2), math.nan)
@@ -99,13 +94,13 @@ class Navigation:
         """Estimated present state, position [m] and velocity [m/s] of each axis; shape (axes,
         2)."""
         self.predicted = self.estimate
-        """State in which the next input will take effect; it is flown by and reported. Without a
-        dead time it is the estimate."""
+        """State in which the next input will take effect, used by feedback and in observations.
+        Without a dead time it is the estimate."""
         self.is_known = False
-        """Whether the estimate is finite, also as float32, and so can be flown by and reported."""
+        """Whether the estimate is finite, also as float32."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
-        """Advance to a step; before the first the vehicle stands still.
+        """Advance to a step; before the first the vehicle is at rest.
 
         Args:
             measurements: measurements that became available since the previous step.
@@ -137,7 +132,7 @@ class Navigation:
             self.estimate = self.predicted = self.filter.estimate()
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
-            # It is sent as float32: a larger number would reach the server as infinity.
+            # Observations carry float32: a larger number would reach the server as infinity.
             self.is_known = all_within(self.predicted, FLOAT_MAX)
 
     def begin_anew(self) -> None:
@@ -146,14 +141,13 @@ class Navigation:
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
-        """Measurement extrapolated to a later time by the model; an earlier time changes nothing.
+        """Measurement extrapolated by the model to a later time; an earlier time changes nothing.
 
-        A real vehicle measures at times of its own. If an older input than `due` acted during part
-        of that time, the filter has to correct the difference.
+        A real vehicle measures between steps. If an older input than `due` acted during part of the
+        extrapolation, the filter has to correct the difference.
 
         Args:
             measured: the measurement.
@@ -178,7 +172,7 @@ class Navigation:
 
 
 def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
-    """Measurements from the newest position on: the filter starts there.
+    """Measurements from the newest position on, from which the filter starts.
 
     Before the first step somebody else flew the vehicle, such as the autopilot during its climb.
     With our inputs the filter would mistake that for a disturbance.
@@ -193,8 +187,8 @@ class Leaps:
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         self.off_m: list[float] = []
-        """Displacement of the newest position from where the vehicle could have moved, on each axis
-        [m]; empty unless it has leapt."""
+        """Distance of the newest position from the nearest one that the vehicle could have reached,
+        on each axis [m]; empty unless it has leapt."""
         self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position = self._velocity = np.full(scenario.model.axes, math.nan)
@@ -202,7 +196,7 @@ class Leaps:
         self._position_ns = self._velocity_ns = 0
 
     def leaps(self, measured: Measurement, numbers: Array) -> bool:
-        """Store a measurement; True if it is further away than any vehicle could have moved.
+        """Store a measurement; return whether it is farther away than any vehicle could have moved.
 
         Args:
             measured: the measurement.
@@ -230,7 +224,6 @@ class Leaps:
 
 @compilable
 def all_within(table: Table, most: float) -> bool:
-    """Whether all numbers have at most this magnitude; False for NaN."""
     within = True
     for row in range(table.shape[0]):
         for column in range(table.shape[1]):
@@ -248,7 +241,7 @@ def has_leapt(
     noise_m: float,
     noise_mps: float,
 ) -> bool:
-    """Whether a measurement is further away than any vehicle could have moved; False for NaN.
+    """Whether a measurement is farther away than any vehicle could have moved; False for NaN.
 
     Args:
         position, velocity: previous measurement of each axis [m], [m/s].
@@ -274,23 +267,20 @@ class Newest:
         self._state = np.full((axes, 2), math.nan)
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
-        """Take the first measurement."""
         self.take(measured, numbers)
 
     def advance(self, due: Array, swing: Array | None = None) -> None:
-        """Advance by a step; the values stay as they are."""
+        pass
 
     def disturbance(self) -> Array:
         """Disturbance of each axis: unknown, so 0 [m/s]."""
         return self._zero
 
     def take(self, measured: Measurement, numbers: Array) -> None:
-        """Replace the previous measurement."""
         if measured.position is not None:
             self._state[:, 0] = numbers[0]
         if measured.velocity is not None:
             self._state[:, 1] = numbers[1]
 
     def estimate(self) -> Array:
-        """Position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
         return self._state.copy()

@@ -1,9 +1,9 @@
 """Pilot: flies the chosen input at every step, and records the step.
 
-The client's clock is the flight's clock: the epoch is the moment its session opened, step k begins
-at epoch + k Δt, and every time stamp used for control is taken here. `client.failsafe` decides what
-the vehicle may do, `client.compensator` which input of a horizon it flies, and `client.clamp`
-rejects what the vehicle must never do.
+The client's clock is the flight's clock: the epoch is the moment at which its session opened, step
+k begins at epoch + k Δt, and every time stamp used for control is taken here. `client.failsafe`
+decides what the vehicle may do, `client.compensator` which input of a horizon it flies, and
+`client.clamp` bounds that input.
 """
 
 import math
@@ -41,21 +41,13 @@ LAND_MPS = 0.5
 STOPPED = (Mode.FAULT, Mode.MANUAL)
 """Modes in which the input is zero at once."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
-"""Modes in which a vehicle holds its position, or descends on it."""
+"""Modes in which a vehicle holds its position, or descends from it."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
-"""Reasons for dropping a horizon that was made for an impossible time."""
+"""Reasons for dropping a horizon from the future."""
 
 
 class Pilot:
-    """Flies one vehicle, with a horizon or without.
-
-    Args:
-        scenario: scenario of the flight.
-        number: number of the vehicle.
-        vehicle: the vehicle, simulated or real.
-        failsafe: decides what the vehicle may do.
-        recorder: receives one row per step.
-    """
+    """Flies one vehicle, with a horizon or without."""
 
     def __init__(
         self,
@@ -76,8 +68,8 @@ class Pilot:
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
-        # The paper's vehicle bounds no change: with `exhausted = "hold"` the clamp only keeps the
-        # input finite and bounded.
+        # The paper's vehicle does not bound the change of the input: with `exhausted = "hold"` the
+        # clamp only keeps the input finite and bounded.
         self._change_max = (
             math.inf
             if self._terms.exhausted == "hold"
@@ -91,51 +83,39 @@ class Pilot:
         self.flown = 0
         """Present step; measurements up to its start are included."""
         self._flown_ns = 0
-        """Time at which it began."""
         self._takes_from: int | None = None
         """Step of the first observation that announced that horizons are accepted; None while they
         are not."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
-        """Magnitude of the part of it that is not feedback [m/s]."""
+        """Magnitude of its part without feedback [m/s]."""
         self.covered = 0
-        """Number of steps with a planned input."""
         self._covered_last = 0
         """Step after the last one with a planned input."""
         self.missed = 0
-        """Number of steps missed because the process was delayed."""
         self.leap_m: tuple[float, ...] | None = None
-        """Leap that the operator has not decided about: displacement on each axis [m], or empty if
-        only the velocity has leapt. None without one."""
+        """Leap about which the operator has not decided: displacement on each axis [m], or empty if
+        only the velocity has leapt. None without a leap."""
 
     @property
     def without_ns(self) -> int:
-        """Time without a planned input [ns]."""
         return (self.step - self._covered_last) * self._dt_ns
 
     @property
     def disturbance(self) -> Array:
-        """Disturbance ŵ estimated by the filter on each axis [m/s]; 0 without a filter."""
         return self._navigation.disturbance
 
     @property
     def began_ns(self) -> int:
-        """Time at which step 0 began [ns]; 0 before the flight."""
         return self._epoch_ns or 0
 
     def starts_ns(self, step: int) -> int:
-        """Time at which a step begins; the flight must have begun."""
         assert self._epoch_ns is not None
         return self._epoch_ns + step * self._dt_ns
 
     def begin(self, *, now_ns: int, began_ns: int | None = None) -> None:
-        """Begin the flight, or continue that of an earlier run.
-
-        Args:
-            now_ns: time now.
-            began_ns: start of step 0; None for now.
-        """
+        """Begin the flight, or continue that of an earlier run whose step 0 began at `began_ns`."""
         if began_ns is None:
             self._epoch_ns = self.next_ns = now_ns
             self._navigate(0)
@@ -150,13 +130,13 @@ class Pilot:
         """Put a horizon in force if it is the newest and may be flown.
 
         A horizon that was planned before the server knew that horizons are accepted is dropped: it
-        starts where the vehicle is not.
+        does not start at the vehicle's position.
 
         Raises:
-            ProtocolError: it is dropped.
+            ProtocolError: the horizon is dropped.
         """
         terms = self._terms
-        # A horizon that was overtaken is late anyway, and says nothing about the newest.
+        # An overtaken horizon is late anyway, and shows no delay of the newest.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
@@ -176,7 +156,6 @@ class Pilot:
             self._failsafe.horizon_taken(now_ns=now_ns)
 
     def mode_changed(self, cause: Reason) -> None:
-        """Drop the horizon, or stop accepting any, as the new mode or reason requires."""
         if not self._failsafe.takes:
             self._takes_from = None
         if cause in DROPPING:
@@ -213,15 +192,11 @@ class Pilot:
         self._record()
 
     def _navigate(self, step: int) -> None:
-        """Process the measurements up to the start of a step."""
         now_ns = self.starts_ns(step)
         measurements = self._vehicle.measurements(now_ns=now_ns)
         self._navigation.advance(measurements, self._input, now_ns=now_ns)
 
     def _choose(self, now_ns: int) -> Array:
-        """Choose the input of the present step [m/s], and note what follows from it; shape
-        (axes,).
-        """
         failsafe, compensator = self._failsafe, self.compensator
         navigation = self._navigation
         if not self._navigation.is_known:
@@ -267,7 +242,6 @@ class Pilot:
             flown: input of each axis that may be flown [m/s]; None if it is not finite.
             without_feedback: part of it that is not feedback, of each axis [m/s].
             speed_max: bound of the magnitude of that part [m/s].
-            now_ns: time now.
         """
         failsafe, compensator = self._failsafe, self.compensator
         if flown is None:
@@ -291,12 +265,13 @@ class Pilot:
         return np.array(flown)
 
     def _rest(self) -> None:
-        """Hold the position of a vehicle that hovers on a mission: the others keep clear of it."""
+        """Hold the position of a vehicle that hovers on a mission: other vehicles keep clear of
+        that position.
+        """
         if self._is_to_rest() and self._navigation.is_known:
             self.compensator.rest(self.step, self._navigation.predicted)
 
     def _is_to_rest(self) -> bool:
-        """Whether the vehicle hovers on a mission and does not yet hold a position."""
         hovers = self._is_mission and self._failsafe.mode in HOVERING
         compensator = self.compensator
         return hovers and compensator.in_force == NO_HORIZON and not compensator.rests
@@ -309,7 +284,6 @@ class Pilot:
         return within
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """Continue after a leap, see `Vehicle.decide`."""
         self._vehicle.decide(keeps_frame=keeps_frame)
         if not keeps_frame:
             self._navigation.begin_anew()
@@ -325,23 +299,17 @@ class Pilot:
     def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
         """Largest speed of the input without feedback [m/s]: without a plan the vehicle brakes.
 
-        Args:
-            had_plan: whether the previous step had a plan.
-            has_plan: whether this step has one.
+        `had_plan` is about the previous step, `has_plan` about this one.
         """
         brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
         if has_plan or not brakes:
             return math.inf
         return braked(self._speed, 0 if had_plan else 1, self._terms.brake)
 
-    # -- what is told of a step --------------------------------------------------------------
+    # -- observation and record --------------------------------------------------------------
 
     def observation(self, session: ServerSession) -> Observation | None:
-        """Observation of the step that has just begun; None if none is due or the state is unknown.
-
-        Args:
-            session: session that it is sent in.
-        """
+        """Observation of the present step; None if none is due or the state is unknown."""
         failsafe, compensator = self._failsafe, self.compensator
         states = self._navigation.predicted
         if session.number is None or not self._navigation.is_known:
@@ -394,9 +362,7 @@ class Pilot:
         )
 
     def _recorded_states(self) -> Sequence[float]:
-        """Estimated or true, measured and predicted state, and input, number by number, for the
-        record.
-        """
+        """Estimated or true, measured and predicted state, and input, flattened for the record."""
         navigation, truth = self._navigation, self._vehicle.truth()
         states = navigation.estimate if truth is None else truth
         recorded = (states, navigation.measured, navigation.predicted, self._input)

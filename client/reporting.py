@@ -1,8 +1,9 @@
-"""Reports of the vehicle's state: what the server predicts, and when an observation is sent.
+"""Reports of the vehicle's state: the state that the server predicts, and when to send an
+observation.
 
 The server predicts the state from the newest observation by the rule of flight (`shared.law.rule`).
-The vehicle does the same from the observation that it sent last and the horizon in force. While
-this prediction is close to the real state, the server needs no observation.
+The vehicle computes the same prediction from the observation that it sent last and the horizon in
+force. While the prediction is close to the real state, the server needs no observation.
 """
 
 import math
@@ -17,8 +18,8 @@ from skytether.shared.scenario.observing import Unreported, is_always, make_repo
 from skytether.shared.wire.protocol import Mode
 
 RETRY_STEPS = 4
-"""Number of steps after which a vehicle that waits for its first horizon reports again. Later the
-interval doubles, so that a long wait costs few packets."""
+"""Number of steps after which a vehicle that waits for its first horizon reports again. The
+interval then doubles, so that a long wait costs few packets."""
 
 
 @compilable
@@ -37,20 +38,15 @@ def distance_m(tau_s: Numbers, believed: Table, states: Table) -> float:
 
 
 class BelievedState:
-    """State that the server predicts for the vehicle, if no packet is lost.
-
-    Args:
-        terms: terms of the flight.
-        compensator: has the horizon in force.
-    """
+    """State that the server predicts for the vehicle, if no packet is lost."""
 
     def __init__(self, terms: Terms, compensator: Compensator) -> None:
         self._tau_s, self._compensator = np.array(terms.tau_s), compensator
         self._states = np.zeros((terms.axes, 2))
 
     def off_m(self, states: Array) -> float:
-        """Distance of the vehicle from the predicted state [m], see `distance_m`; states of
-        shape (axes, 2).
+        """Distance of the vehicle from the predicted state [m], see `distance_m`; states of shape
+        (axes, 2).
         """
         return distance_m(self._tau_s, self._states, states)
 
@@ -72,25 +68,22 @@ class Reporter:
     """Decides at each step whether to send an observation.
 
     Args:
-        terms: terms of the flight.
         report: `vehicle.report`.
-        compensator: has the horizon in force; the input of the step has been chosen from it.
+        compensator: has the horizon in force, from which the input of the step has been chosen.
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
         self._dt_s = terms.dt_s
         self._compensator = compensator
         self.always = is_always(report)
-        """Whether every step is reported."""
         self._wants = make_report(report)
         self.belief = BelievedState(terms, compensator)
-        """State that the server predicts for the vehicle."""
         self._session: int | None = None
         """Session of the newest observation; None before the first."""
         self._reported: tuple[int, Mode, int] | None = None
         """Horizon in force, mode and number of repeated horizons, as in the newest observation."""
         self._reported_step, self._step = 0, 0
-        """Step of the newest observation, and latest step asked about."""
+        """Step of the newest observation, and latest step for which `is_due` was called."""
         self._ready: int | None = None
         """Step since which the vehicle waits for a horizon; None while it does not."""
 
@@ -103,17 +96,18 @@ class Reporter:
         flown: Array,
         silence: int,
     ) -> bool:
-        """Whether to send an observation of this step; asked once a step, and True counts as sent.
+        """Whether to send an observation of this step. Called once a step; after True, the
+        observation counts as sent.
 
         Args:
             session: number of the session.
             step: k; it has just begun.
             mode: mode of the vehicle.
-            states: known state; shape (axes, 2).
-            flown: input flown from here on, of each axis [m/s].
-            silence: longest silence that the server asks for [half steps]; 0 for no bound.
+            states: estimated state; shape (axes, 2).
+            flown: input flown from this step on, of each axis [m/s].
+            silence: longest silence that the server allows [half steps]; 0 for no bound.
         """
-        if self.always:  # the server's prediction need not be known
+        if self.always:  # no prediction is needed
             return True
         situation = self._compensator.in_force, mode, self._compensator.repeated
         slept = step > self._step + 1
@@ -134,8 +128,9 @@ class Reporter:
     def _waits(self, step: int, mode: Mode) -> bool:
         """Whether a vehicle that waits for a horizon reports, at once or again.
 
-        The server plans only for a vehicle that it knows to be ready. Without this, a vehicle that
-        reports every 4 s began to fly up to 4 s late, and 8 s if one packet was lost.
+        The server plans only for a vehicle that has reported that it is ready. Without these
+        reports, a vehicle that reports every 4 s began to fly up to 4 s late, and 8 s if one packet
+        was lost.
         """
         if mode is not Mode.READY:
             self._ready = None

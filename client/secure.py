@@ -1,13 +1,13 @@
 """The vehicle's side of a secured link: handshakes with the server, and the channels they create.
 
 A handshake is one attempt with one ephemeral key. Its INITIATION is repeated with the newest cookie
-until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer to no open attempt is dropped,
-so that nobody can open a channel a second time, which would reset its counters.
+until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer to no open attempt is dropped:
+otherwise an attacker could open a channel a second time and so reset its counters.
 
 An attacker who copies an INITIATION to the server from another address receives a cookie valid for
 that address only, and may forward it to the vehicle, which cannot tell it from its own. So the
-vehicle tries each cookie at once and settles on none, but tries each no more often than it sends
-HELLOs.
+vehicle tries each cookie at once and never relies on a single one, but tries each no more often
+than it sends HELLOs.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, NoiseError
 
 ATTEMPT_NS = 60 * SECOND_NS
-"""Time for which an attempt is repeated before another one begins [ns]."""
+"""Time for which an attempt is repeated before another one begins."""
 COOKIES_MAX = 64
 """Number of cookies remembered per attempt; the one tried longest ago is replaced."""
 
@@ -41,7 +41,6 @@ class _Attempt:
     def __init__(self, noise: Initiator, hello: bytes, began_ns: int) -> None:
         self.noise = noise
         self.hello = hello
-        """HELLO message that it carries."""
         self.began_ns = began_ns
         self.tried_ns: dict[bytes, int] = {}
         """Time at which each cookie was last tried, oldest first [ns]."""
@@ -51,7 +50,6 @@ class SecureLink:
     """Link that only the holder of the vehicle's key can read or write.
 
     Args:
-        key: key of the vehicle.
         entropy: returns this many unpredictable bytes.
     """
 
@@ -86,7 +84,7 @@ class SecureLink:
         return self._initiation(attempt, now_ns)
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any other message; needs an adopted WELCOME."""
+        """Datagram that carries any message but a HELLO; needs an adopted WELCOME."""
         assert self._current is not None
         return self._current.seal(payload)
 
@@ -94,7 +92,8 @@ class SecureLink:
         """Message in a datagram; None for a CHALLENGE, whose answer is in the outbox.
 
         Raises:
-            ProtocolError: it is not from the server, is a repeat, or answers no open attempt.
+            ProtocolError: the datagram is not from the server, is a repeat, or answers no open
+                attempt.
         """
         match kind(datagram):
             case channel.DATA:
@@ -107,12 +106,10 @@ class SecureLink:
         raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def outbox(self) -> list[bytes]:
-        """See `ClientLink`."""
         answers, self._answers = self._answers, []
         return answers
 
     def adopt(self, *, now_ns: int) -> None:
-        """Use the channel of the newest WELCOME, and close the attempt."""
         assert self._candidate is not None
         if self._current is not None:
             self._current.retire(now_ns=now_ns)
@@ -144,7 +141,6 @@ class SecureLink:
         self._answers.append(self._initiation(attempt, now_ns))
 
     def _initiation(self, attempt: _Attempt, now_ns: int) -> bytes:
-        """INITIATION of an attempt, with the newest cookie."""
         tried_ns = attempt.tried_ns
         # Removed and inserted again: the dictionary is ordered by time.
         tried_ns.pop(self._cookie, None)
@@ -154,7 +150,6 @@ class SecureLink:
         return write_initiation(self._key, self._cookie, attempt.noise.message)
 
     def _response(self, packet: bytes, now_ns: int) -> bytes:
-        """WELCOME in a RESPONSE, whose channel may be adopted."""
         attempt = self._open_attempt()
         number, message = read_response(self._key, packet, attempt.noise.public)
         try:

@@ -4,7 +4,7 @@ it.
     HELLO → WELCOME, or a refusal → HORIZON, HEARTBEAT … → CLOSE, silence or another WELCOME
 
 The client echoes the time stamp of every packet of the session, from which the server estimates the
-delays. `client.failsafe` decides what packets and silence mean for the vehicle.
+delays. `client.failsafe` decides how packets and silence change the vehicle's mode.
 """
 
 from typing import Literal, NamedTuple
@@ -38,29 +38,29 @@ from skytether.shared.wire.protocol import (
 )
 
 SLEPT_NS = JUMP_NS // 2
-"""Advance of the server's clock over ours that shows that this machine was suspended [ns]; far more
-than changing delays cause."""
+"""Advance of the server's clock over the client's that shows that this machine was suspended; far
+more than changing delays cause."""
 UNANSWERED_NS = 5 * SECOND_NS
-"""Time without a first answer after which this is reported [ns]."""
+"""Time without a first answer after which the log reports it."""
 REFUSED = {
     Refusal.OTHER_TERMS: Drop.OTHER_TERMS,
     Refusal.FULL: Drop.FULL,
     Refusal.TAKEN: Drop.TAKEN,
 }
-"""Why a WELCOME that refuses the vehicle is dropped."""
+"""Reason for dropping a WELCOME that refuses the vehicle."""
 DEGRADED = "the server misses its deadlines"
-"""Why there is no newer horizon if the server plans and reports that it is degraded."""
+"""Why there is no newer horizon although the server plans: it reports that it is degraded."""
 
 
 class Echo(NamedTuple):
-    """Newest packet of the server, as the vehicle echoes it."""
+    """Newest packet of the server, as echoed in observations."""
 
     server_ns: int
     """Server time at which it was sent [ns]."""
     received_ns: int
     """Time of arrival [ns; our clock]."""
     heard: int
-    """Number of packets received including it, modulo NUMBERS."""
+    """Number of packets received up to and including that packet, modulo NUMBERS."""
 
 
 NEVER = Echo(0, 0, 0)
@@ -72,13 +72,10 @@ class ServerSession:
 
     Args:
         terms: terms that the server has to agree to.
-        vehicle: number of the vehicle.
         boot_id: number unique to this run of the client.
         server: address of the server, or of the netem in front of it.
         connect_s: time after which a vehicle that was never answered gives up [s].
-        link: converts messages to datagrams.
-        hearing: measures losses, and decides what silence to ask of the server.
-        failsafe: is told what was received.
+        hearing: measures losses, and chooses the longest silence to allow the server.
         out: list to which datagrams are appended.
         events: list to which events for the operator are appended.
     """
@@ -104,9 +101,9 @@ class ServerSession:
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
-        """Longest silence to ask of the server."""
+        """Measures losses, and chooses the longest silence to allow the server."""
         self.silence_asked = hearing.silence
-        """Longest silence that the server asks of us [half steps]; 0 for no bound."""
+        """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
         """Number of packets sent in the session, modulo NUMBERS."""
         self._failsafe = failsafe
@@ -116,31 +113,25 @@ class ServerSession:
         """Time before which no further HELLO is sent."""
         self._began_ns: int | None = None
         self._is_unanswered = False
-        """Whether the lack of a first answer was reported."""
         self.number: int | None = None
-        """Number of the session; None before the first."""
         self._is_open = False
         """Whether the session may continue; otherwise only a WELCOME is accepted."""
         self._server_boot_id: int | None = None
         self.echo = NEVER
-        """Newest packet of the server."""
         self.idle = str(Idle.PLANS)
         """Why no newer horizon comes, as the server last reported."""
         self._refusal: NoSession | None = None
         """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
-        """Event that rules out a session."""
+        """Event that makes a session impossible."""
 
-    # -- what is heard -----------------------------------------------------------------------
+    # -- receiving ---------------------------------------------------------------------------
 
     def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | Trajectory | None:
-        """Process a datagram of this session.
-
-        Returns:
-            The horizon or trajectory, if it contains one.
+        """Process a datagram of this session; return its horizon or trajectory, if it contains one.
 
         Raises:
-            ProtocolError: it must be dropped.
+            ProtocolError: the datagram must be dropped.
         """
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
@@ -168,7 +159,6 @@ class ServerSession:
         return None
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
-        """Message in a payload; the failsafe counts a malformed one if it is authenticated."""
         try:
             return decode(payload, self._terms)
         except ProtocolError:
@@ -225,7 +215,7 @@ class ServerSession:
     def _heard(self, message: Welcome | Horizon | Trajectory | Heartbeat, now_ns: int) -> None:
         """Note a packet of the session, and detect that this machine was suspended.
 
-        Our clock may have stood still, or its jump was mistaken for a clock that was set
+        The client's clock may have stood still, or its jump was mistaken for a clock that was set
         (`shared.core.steady`); the server's clock has gone on in both cases. After a suspension
         longer than time stamps can express, the server has forgotten the session, and its WELCOME
         contains the full time.
@@ -244,10 +234,10 @@ class ServerSession:
             self.silence_asked = message.silence
             self.hearing.hear(message.number, server_ns)
 
-    # -- what is said ------------------------------------------------------------------------
+    # -- sending -----------------------------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> None:
-        """Send HELLO if the server is not heard, or the link needs new keys."""
+        """Send HELLO if the server is silent, or the link needs new keys."""
         # The motion of an earlier run is flown before there is a session.
         silent = self.number is None or self._failsafe.is_lost(now_ns)
         wanted = silent or self.link.wants_hello(now_ns)
@@ -263,7 +253,6 @@ class ServerSession:
             self.hello_ns = now_ns + AGAIN_NS
 
     def send(self, message: Observation | Close) -> None:
-        """Send a message in the session."""
         self.sent = (self.sent + 1) % NUMBERS
         self._out.append(Datagram(self.link.seal(encode(message)), self._server))
 
@@ -279,7 +268,7 @@ class ServerSession:
 
     def wait(self, *, now_ns: int) -> bool:
         """Whether to go on waiting for the flight; fails after too long without a session."""
-        if self.number is not None:  # the vehicle is not up yet
+        if self.number is not None:  # the vehicle is still on the ground
             return True
         if self._began_ns is None:
             self._began_ns = now_ns

@@ -1,9 +1,9 @@
 """Interface of a vehicle to the pilot: it accepts a velocity and returns measurements.
 
 A vehicle measures at its own rate with its own time stamps, and may return measurements late or not
-at all; nothing else aboard knows its state. `client.simulated` contains simulated vehicles. A real
-one talks to its autopilot through a `port`, an endpoint like any other, driven by datagrams and
-time. `client.vehicles` has the table of all kinds.
+at all; the client knows its state from them alone. `client.simulated` contains simulated vehicles.
+A real one communicates with its autopilot through a `port`, an endpoint like any other, driven by
+datagrams and time. `client.vehicles` has the table of all kinds.
 """
 
 import math
@@ -49,15 +49,15 @@ class VehicleMemory(msgspec.Struct, frozen=True, kw_only=True):
     """Vehicle's own state, saved for the next run of its client, see `client.memory`."""
 
     armed: bool = False
-    """Whether a client has armed it since an operator last allowed arming."""
+    """Whether a client has armed the vehicle since an operator last allowed arming."""
     origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None if
     unknown."""
     leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Displacement in `origin` that the operator has not decided about, see `Vehicle.leap_m`
-    [m]."""
+    """Displacement in `origin` about which the operator has not decided, see
+    `Vehicle.leap_m` [m]."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
-    """Time since the autopilot's boot at which the above was last true [ms]."""
+    """Time since the autopilot's boot at which the fields above were last valid [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
     """Host's clock at that time [ns]; in the encoded bytes, relative to the time of writing."""
 
@@ -66,16 +66,16 @@ class Vehicle(ABC):
     """A vehicle that flies commanded velocities."""
 
     changeable: frozenset[str] = frozenset()
-    """Keys of its scenario that may change in flight."""
+    """Keys of the scenario that may change in flight."""
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware; None if there is none."""
     returns = False
-    """Whether it can return home by itself, see `return_home`."""
+    """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None
-    """Displacement of its measured position on each axis that the operator has not decided about
+    """Displacement of the measured position on each axis about which the operator has not decided
     [m]; it is subtracted meanwhile. None: no leap, or the vehicle does not detect any."""
     failure: Failure | None = None
-    """Event that makes the vehicle unusable, so that no session is asked for."""
+    """Event that makes the vehicle unusable, so that no session is requested."""
 
     @abstractmethod
     def fly(self, velocity: Array) -> None:
@@ -98,12 +98,12 @@ class Vehicle(ABC):
 
     @property
     def is_ready(self) -> bool:
-        """Whether a session may be asked for: the vehicle is present, and configured safely."""
+        """Whether a session may be requested: the vehicle is present, and configured safely."""
         return True
 
     @property
     def waits_for(self) -> str:
-        """What is missing before it can be flown, in words; empty if nothing is."""
+        """What prevents the flight, in words; empty if nothing does."""
         return ""
 
     def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - most fly from the start
@@ -116,8 +116,8 @@ class Vehicle(ABC):
 
     @property
     def took_off(self) -> bool:
-        """Whether it has taken off during this run of the client, so that no earlier motion
-        continues.
+        """Whether the vehicle has taken off during this run of the client, so that no earlier
+        motion continues.
         """
         return False
 
@@ -129,16 +129,16 @@ class Vehicle(ABC):
         """Decide about `leap_m` after a leap.
 
         Args:
-            keeps_frame: whether the displacement is subtracted for good (the old frame stays), or
-                the new frame is used.
+            keeps_frame: True if the displacement is subtracted for good (the old frame stays),
+                False if the new frame is used.
         """
 
     def land(self) -> bool:
-        """Land by itself from now on; False if it cannot and has to be flown down."""
+        """Land without further commands; False if the vehicle cannot, and has to be flown down."""
         return False
 
     def return_home(self) -> None:  # noqa: B027 - most cannot
-        """Return home by itself and land there; only called if it `returns`."""
+        """Return home without commands and land there; only called if `returns` is True."""
 
     @property
     def is_down(self) -> bool:
@@ -151,15 +151,15 @@ class Vehicle(ABC):
         return VehicleMemory()
 
     def recall(self, frame: VehicleMemory) -> None:  # noqa: B027 - most keep nothing
-        """Restore state saved by an earlier run of the client; called before anything else, if
-        at all.
+        """Restore state saved by an earlier run of the client; called before anything else, if at
+        all.
         """
 
     def arm(self) -> None:  # noqa: B027 - most need not be armed
-        """Allow arming, as an operator said in flight."""
+        """Allow arming, on an operator's order in flight."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
-        """Why a change of `changeable` keys is refused; empty if it is not."""
+        """Why a change of `changeable` keys is refused; empty if it is accepted."""
         return ""
 
     def truth(self) -> Array | None:

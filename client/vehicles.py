@@ -38,11 +38,6 @@ def mavlink(scenario: Scenario, number: int) -> Vehicle:
 
 
 def make(scenario: Scenario, number: int) -> Vehicle:
-    """Vehicle of a scenario with a number.
-
-    Raises:
-        ConfigError: the kind is unknown, or the vehicle cannot be made.
-    """
     try:
         named = VEHICLES.one(scenario.vehicle.kind)
     except GrammarError as error:

@@ -1,1 +1,1 @@
-"""Agreement of both ends of the link: endpoints, wire, model, reference, scenario, record."""
+"""Code of both ends of the link: endpoints, wire, model, reference, scenario, record."""

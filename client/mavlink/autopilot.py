@@ -2,7 +2,8 @@
 
     heartbeat → flavour → parameters, streams and clock → ready → launch
 
-What the autopilot says goes to the part that it is for; what the parts ask for is sent by `port`.
+Messages of the autopilot are distributed to these parts; the requests of the parts are sent by
+`port`.
 """
 
 from typing import NamedTuple
@@ -42,7 +43,7 @@ WARNING = int(dialect.MAV_SEVERITY_WARNING)
 
 
 class Parts(NamedTuple):
-    """What begins once it is known which autopilot it is."""
+    """Parts created once it is known which autopilot it is."""
 
     setup: Setup
     launch: Launch
@@ -50,19 +51,14 @@ class Parts(NamedTuple):
 
 
 class Autopilot:
-    """One autopilot, as far as it has been heard.
-
-    Args:
-        scenario: scenario, with its keys of `mavlink`.
-        vehicle: number of the vehicle, for events.
-        altitude: take-off altitude [m].
-        events: list to which events are appended.
+    """One autopilot and its state as known from its messages; `altitude` is
+    that of take-off [m].
     """
 
     parts: Parts | None = None
-    """None until an autopilot is heard that can be flown."""
+    """None until a heartbeat of a suitable autopilot has arrived."""
     _unfit: NotTakenOff | None = None
-    """Event that an unsuitable or silent vehicle is not flown."""
+    """Event that makes the vehicle unusable: unsuitable or silent."""
     _set_up_ns: int | None = None
     """Time at which everything but the clock was ready."""
     _began_ns: int | None = None
@@ -81,27 +77,23 @@ class Autopilot:
             origin=given_origin(scenario),
             leaps=Leaps(scenario),
         )
-        """Measurements."""
         self._texts = LoggedTexts(vehicle, events)
         self.sets_parameters = False
-        """Whether unsafe parameters are changed."""
         self.flavour: Flavour = ARDUPILOT
-        """Which autopilot it is, once `parts` are there."""
+        """Which autopilot it is; set with `parts`."""
         self._target = (0, 0)
         """Numbers of its system and component."""
         self._streams_refused = 0
-        """Number of refused requests for a stream."""
         self._was_armed = False
         """Whether a run of the client has armed it since an operator last allowed arming."""
 
     @property
     def is_ready(self) -> bool:
-        """Whether the autopilot is connected and configured safely."""
         return self.parts is not None and self.parts.setup.is_done and self.clock.is_known
 
     @property
     def waits_for(self) -> str:
-        """What is missing before the vehicle can be flown, in words; empty if nothing is."""
+        """What prevents the flight, in words; empty if nothing does."""
         if self.parts is None:
             return f"a heartbeat of its autopilot at {self._scenario.vehicle.address}"
         setup, launch, _ = self.parts
@@ -111,18 +103,15 @@ class Autopilot:
 
     @property
     def failure(self) -> AboardFailure | None:
-        """Event that makes the vehicle unusable."""
         if self._unfit or self.parts is None:
             return self._unfit
         return self.parts.setup.failure or self.parts.launch.failure
 
     def is_quiet(self, *, now_ns: int) -> bool:
-        """Whether the autopilot has been silent for a while."""
         since_ns = self.condition.heard_ns or self._began_ns or now_ns
         return now_ns - since_ns > QUIET_NS
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        """Continue the take-off, see `Launch`."""
         # If an earlier run has flown it since this boot, its parameters were safe.
         may_fly = self.is_ready or self.positions.is_recalled
         if self.parts is None or not may_fly or self.failure:
@@ -131,11 +120,9 @@ class Autopilot:
 
     @property
     def took_off(self) -> bool:
-        """Whether this run of the client has armed the autopilot."""
         return self.parts is not None and self.parts.launch.took_off
 
     def arm(self) -> None:
-        """Allow arming, as an operator said."""
         if self.parts is None:
             self._was_armed = False
             return
@@ -144,21 +131,17 @@ class Autopilot:
         self._was_armed = self._was_armed and bool(launch.why_not_armed)
 
     def recall(self, saved: VehicleMemory) -> None:
-        """Restore state saved by an earlier run of the client."""
         self._was_armed = saved.armed
         self.positions.recall(saved)
 
     @property
     def frame(self) -> VehicleMemory:
-        """State that the next run of the client needs."""
         return self.positions.frame(armed=self._was_armed or self.took_off)
 
     def meet(self, heartbeat: Message, target: tuple[int, int]) -> None:
         """Begin with the autopilot that sent a heartbeat, if it can be flown.
 
-        Args:
-            heartbeat: its first heartbeat.
-            target: numbers of its system and component.
+        `target` are the numbers of its system and component.
         """
         if why := unfit(heartbeat):
             self._fail("not flown", why)
@@ -172,7 +155,6 @@ class Autopilot:
             self._set_up()
 
     def _set_up(self) -> None:
-        """Start to check the parameters, and to request streams."""
         keys, flavour = self._scenario.mavlink, self.flavour
         self._set_up_ns = None
         setup = Setup(
@@ -201,7 +183,7 @@ class Autopilot:
         self.parts = Parts(setup, launch, streams)
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message of the autopilot; ignored from one that cannot be flown."""
+        """Process a message of the autopilot; ignored from an unsuitable one."""
         if self.parts is None:
             return
         condition, (setup, launch, streams) = self.condition, self.parts
@@ -231,7 +213,6 @@ class Autopilot:
                 setup.hear(message)
 
     def _hear_interval(self, result: int, stream: str) -> None:
-        """Count a refused stream, and report the first."""
         if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._streams_refused:
@@ -241,7 +222,6 @@ class Autopilot:
         self._streams_refused += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Questions and commands that are due now."""
         if self._began_ns is None:
             self._began_ns = now_ns
         self._texts.tick(now_ns=now_ns)
@@ -270,7 +250,6 @@ class Autopilot:
             self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
 
     def _give_up(self, doing: str, why: str) -> None:
-        """Fail because something did not arrive in time."""
         self._fail(f"{doing} in {self._scenario.mavlink.patience_s:g} s", why)
 
     def _fail(self, doing: str, why: str) -> None:

@@ -1,6 +1,6 @@
 """The autopilot's clock from TIMESYNC: time since its boot, converted to the client's clock.
 
-    the client asks at t₁ and hears at t₂ that the autopilot's clock showed b in between:
+    the client asks at t₁; the answer, at which the autopilot's clock showed b, arrives at t₂:
     offset = (t₁ + t₂) / 2 - b, with an error of at most (t₂ - t₁) / 2
 
 Answers much slower than the fastest of the window are left out. A line through the rest gives
@@ -21,17 +21,16 @@ from typing import NamedTuple
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 WINDOW = 64
-"""Number of answers kept."""
 KNOWN = 4
-"""Number of answers from which on the clock is known."""
+"""Number of answers needed for a usable clock."""
 ASKED_MAX = 16
 """Number of open questions; older ones are given up."""
 ROUND_TRIP_MAX_NS = SECOND_NS
-"""Longest round trip of an answer that is used, for an autopilot aboard [ns]."""
+"""Longest round trip of an answer that is used, for an autopilot aboard."""
 SPREAD_NS = MILLISECOND_NS
-"""An answer counts if its round trip is at most 1.5 times the shortest, plus this [ns]."""
+"""An answer is used if its round trip is at most 1.5 times the shortest, plus SPREAD_NS."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
-"""Time span of the answers from which on drift is fitted [ns]."""
+"""Time span of the answers above which drift is fitted."""
 DRIFT_MAX = 0.02
 """Largest drift that is followed: PX4's own simulator runs 0.9 % slow."""
 WANDER = 500e-6
@@ -39,16 +38,12 @@ WANDER = 500e-6
 RATED = 8
 """Number of newest answers that give the rate of a clock that cannot be followed."""
 JUMP_NS = 100 * MILLISECOND_NS
-"""Deviation of an answer, beyond its round trip, that suggests a jump of the clock [ns]."""
+"""Deviation of an answer, beyond its round trip, that suggests a jump of the clock."""
 JUMPS = 3
-"""Number of deviating answers in a row that confirm a jump."""
 BOOT_MAX_NS = 2**62
-"""Largest time since boot that is accepted [ns]."""
 
 
 class Sample(NamedTuple):
-    """Answer to a question for the time."""
-
     local_ns: int
     """Midpoint between question and answer [ns; the client's clock]."""
     offset_ns: int
@@ -58,11 +53,7 @@ class Sample(NamedTuple):
 
 
 class BootClock:
-    """Converts the time since the autopilot's boot to the client's clock.
-
-    Args:
-        round_trip_max_ns: longest round trip of an answer that is used [ns].
-    """
+    """Converts the time since the autopilot's boot to the client's clock."""
 
     def __init__(self, round_trip_max_ns: int = ROUND_TRIP_MAX_NS) -> None:
         self._round_trip_max_ns = round_trip_max_ns
@@ -71,34 +62,29 @@ class BootClock:
         self._taken = 0
         """Number of answers used since the clock was started."""
         self._deviating: list[Sample] = []
-        """Newest deviating answers in a row."""
         self._line = (0, 0.0, 0.0)
         """Reference time [ns; the client's clock], offset at that time [ns], and drift."""
         self.round_trip_ns: int | None = None
-        """Shortest round trip of the window [ns]."""
         self.drift = 0.0
         """Rate at which the client's clock gains on the autopilot's."""
         self._answers: deque[tuple[int, int]] = deque(maxlen=RATED)
         """Newest answers, whether or not the line fits them: the client's clock and time since boot
         [ns]."""
         self.jumps = 0
-        """Number of restarts of the autopilot's clock, as after a reboot."""
+        """Number of jumps of the autopilot's clock, mostly reboots."""
 
     @property
     def is_known(self) -> bool:
-        """Whether enough answers have arrived."""
         return self._taken >= KNOWN
 
     @property
     def heard_ns(self) -> int:
-        """Time of the newest answer [ns; the client's clock]; the clock must be known."""
+        """Time of the newest answer [ns; the client's clock]; needs `is_known`."""
         return self._answers[-1][0]
 
     @property
     def wrong_rate(self) -> float | None:
-        """Rate of the autopilot's clock relative to ours if it cannot be followed; otherwise
-        None.
-        """
+        """Rate of the autopilot's clock relative to the client's; None if normal."""
         if len(self._answers) < KNOWN:
             return None
         (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._answers[0], self._answers[-1]
@@ -119,17 +105,16 @@ class BootClock:
         return "" if rate is None else f"{rate:.3g}, expected 1 within {DRIFT_MAX:.0%}"
 
     def ask(self, *, now_ns: int) -> int:
-        """Time stamp for a question sent now."""
         self._questions.append(now_ns)
         return now_ns
 
     def hear(self, boot_ns: int, stamp_ns: int, *, now_ns: int) -> bool:
-        """Process an answer; False if it was not asked for, is a duplicate, late or impossible.
+        """Process an answer. Return False if the answer is unrequested, a duplicate, late or
+        impossible.
 
         Args:
             boot_ns: time since boot in the answer.
             stamp_ns: time stamp of the question.
-            now_ns: time now.
         """
         if stamp_ns not in self._questions:
             return False
@@ -195,7 +180,7 @@ class BootClock:
         return offset_ns + drift * (local_ns - origin_ns)
 
     def local_ns(self, boot_ns: int) -> int:
-        """Client's time at a time since boot; the clock must be known."""
+        """Client's time at a time since boot; needs `is_known`."""
         origin_ns, offset_ns, drift = self._line
         # local = boot + offset + drift * (local - origin), solved for local
         since_ns = boot_ns + int(offset_ns) - origin_ns
@@ -205,7 +190,7 @@ class BootClock:
 def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
     """Newest answers that are consistent, and the smallest and largest drift that they allow.
 
-    Older ones date from before the drift changed, or before the clock stood still for a while.
+    Older answers date from before the drift changed, or before the clock stood still for a while.
     """
     least, most = -DRIFT_MAX, DRIFT_MAX
     newest = samples[-1]
@@ -223,7 +208,6 @@ def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
 
 
 def _slope(quick: list[Sample]) -> float:
-    """Drift of the line through some answers."""
     newest = quick[-1]
     times = [float(sample.local_ns - newest.local_ns) for sample in quick]
     offsets = [float(sample.offset_ns - newest.offset_ns) for sample in quick]

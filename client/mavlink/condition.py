@@ -7,23 +7,22 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ASTRAY_NS = 500 * MILLISECOND_NS
-"""Time for which the estimate has to be bad [ns]: flags flicker when a receiver changes
-satellites."""
+"""Time for which the estimate has to be bad: flags flicker when a receiver changes satellites."""
 LOW_NS = 2 * SECOND_NS
-"""Time for which the battery has to be low [ns]: its voltage sags under thrust."""
+"""Time for which the battery has to be low: its voltage sags under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
-"""Age up to which a heartbeat counts as current [ns]: one may be lost."""
+"""Age up to which a heartbeat counts as current: one may be lost."""
 NUMBERS = 256
-"""Number of sequence numbers of frames, which then start again."""
+"""Range of the sequence numbers of frames, which wrap around."""
 OVERTAKEN_NS = SECOND_NS
-"""Longest time for which a frame with a lower number counts as overtaken [ns]; after a longer pause
-its sender may have restarted."""
+"""Longest time for which a frame with a lower number counts as overtaken; after a longer pause its
+sender may have restarted."""
 KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
 """Flag of an estimate with a valid velocity."""
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
 """Flags of an estimate with a valid position; one is enough."""
 STANDS_IN = dialect.ESTIMATOR_CONST_POS_MODE
-"""Flag of an estimate that assumes a standing vehicle for lack of data."""
+"""Flag of an estimate without data, which assumes that the vehicle stands still."""
 UNKNOWN_MV, UNKNOWN_PERCENT = 65535, -1
 BATTERY_BAD = range(
     int(dialect.MAV_BATTERY_CHARGE_STATE_LOW), int(dialect.MAV_BATTERY_CHARGE_STATE_UNHEALTHY) + 1
@@ -32,7 +31,7 @@ BATTERY_BAD = range(
 
 
 class Condition:
-    """Condition of the autopilot and its vehicle, as far as known.
+    """Condition of the autopilot and its vehicle, as far as reported.
 
     Args:
         battery_min: share of the battery's charge below which it is low.
@@ -42,22 +41,17 @@ class Condition:
     def __init__(self, battery_min: float, battery_min_v: float) -> None:
         self._battery_min, self._battery_min_v = battery_min, battery_min_v
         self.heard_ns: int | None = None
-        """Time of the autopilot's newest message."""
         self.heartbeat_ns: int | None = None
-        """Time of its newest heartbeat."""
         self._number = 0
-        """Sequence number of the newest frame."""
         self._number_ns: int | None = None
-        """Time of its arrival."""
         self.mode = -1
-        """Number of its mode; -1 if unknown."""
+        """Number of its flight mode; -1 if unknown."""
         self.armed = False
         self.landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
         """MAV_LANDED_STATE."""
         self.charge: float | None = None
         """Charge of the battery, from 0 to 1; None if unknown."""
         self.voltage: float | None = None
-        """Voltage of the battery [V]; None if unknown."""
         self.home: tuple[float, float, float] | None = None
         """Latitude and longitude of home [°], and its altitude above the sea [m]."""
         self.home_up = 0.0
@@ -65,11 +59,9 @@ class Condition:
         self._is_bad: dict[str, bool] = {}
         """Whether the estimate is bad, by reporting message."""
         self._astray_ns: int | None = None
-        """Time since which the estimate has been bad; None if it is good."""
         self._is_low: dict[str, bool] = {}
         """Whether the battery is low, by reporting message."""
         self._low_ns: int | None = None
-        """Time since which the battery has been low; None if it is not."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Process a message of the autopilot, unless a newer one arrived before it.
@@ -126,15 +118,12 @@ class Condition:
 
     @property
     def battery_is_weak(self) -> bool:
-        """Whether the battery is low now, even if only for a moment."""
         return self._low_ns is not None
 
     def battery_is_low(self, *, now_ns: int) -> bool:
-        """Whether the battery has been low for LOW_NS."""
         return self._low_ns is not None and now_ns - self._low_ns >= LOW_NS
 
     def is_astray(self, *, now_ns: int) -> bool:
-        """Whether the autopilot has reported a bad estimate for ASTRAY_NS."""
         return self._astray_ns is not None and now_ns - self._astray_ns >= ASTRAY_NS
 
     def is_fresh(self, *, now_ns: int) -> bool:
@@ -143,7 +132,6 @@ class Condition:
 
     @property
     def is_airborne(self) -> bool:
-        """Whether the autopilot reports that it is in the air."""
         return self.landed in (
             dialect.MAV_LANDED_STATE_IN_AIR,
             dialect.MAV_LANDED_STATE_TAKEOFF,
@@ -152,12 +140,11 @@ class Condition:
 
     @property
     def is_flying(self) -> bool:
-        """Whether it is armed and in the air, neither taking off nor landing."""
         return self.armed and self.landed == dialect.MAV_LANDED_STATE_IN_AIR
 
 
 def _since(before_ns: int | None, now_so: bool, now_ns: int) -> int | None:
-    """Start of a condition that holds now; None if it does not."""
+    """Start of a condition that holds now; None if it does not hold."""
     if not now_so:
         return None
     return now_ns if before_ns is None else before_ns

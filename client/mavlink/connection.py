@@ -1,7 +1,8 @@
-"""Connection to the autopilot: its address, its numbers, and whose messages a datagram brings.
+"""Connection to the autopilot: its address, its numbers, and the sender of each message.
 
-The first heartbeat of an autopilot decides whom we talk to. An autopilot that falls silent and is
-heard at another address has restarted: on a UDP line it is followed there if it stands disarmed.
+The first autopilot from which a heartbeat arrives is flown. If that autopilot falls silent and its
+heartbeats then come from another address, it has restarted: on a UDP line it is followed to the new
+address if it is disarmed.
 """
 
 from collections import Counter
@@ -25,35 +26,23 @@ class Arrivals(NamedTuple):
     """Messages of one datagram, by sender."""
 
     heard: Sequence[Message] = ()
-    """Messages of the autopilot to us, or to every system."""
+    """Messages of the autopilot to the client, or to every system."""
     others: Sequence[Message] = ()
-    """Those of others than the autopilot and us, once the autopilot is known."""
+    """Messages of other senders than autopilot and client, once the autopilot is known."""
     met: Message | None = None
-    """Heartbeat by which the autopilot has just become known."""
+    """First heartbeat of the autopilot."""
     moved: bool = False
-    """Whether the autopilot has restarted at a new address."""
 
 
 class Connection:
-    """Connection to one autopilot.
-
-    Args:
-        scenario: scenario, with its keys of `mavlink`.
-        vehicle: number of the vehicle, for events.
-        line: address of the autopilot.
-        events: list to which events are appended.
-    """
-
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, events: Events) -> None:
         self._keys = keys = scenario.mavlink
         self._vehicle, self._events = vehicle, events
         self.line = scenario.vehicle.address
-        """Address of the autopilot, as given."""
         self._may_move = line.kind == "udp"
         self.peer: Address | None = line.peer
-        """Address of the autopilot; None while unknown."""
         self.target: tuple[int, int] | None = None
-        """Numbers of the autopilot's system and component; None until it is heard."""
+        """Numbers of the autopilot's system and component; None until its first heartbeat."""
         self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self.counts: Counter[str] = Counter()
         """Number of messages `heard`, `foreign` and `for_others`, and of datagrams from
@@ -65,9 +54,8 @@ class Connection:
         """Sort the messages of a datagram.
 
         Args:
-            datagram: the datagram.
             is_quiet: whether the autopilot has been silent for a while.
-            armed: whether it was armed when last heard.
+            armed: whether its newest heartbeat reported it armed.
         """
         if self.peer is not None and datagram.peer != self.peer:
             self.counts["elsewhere"] += 1
@@ -107,15 +95,12 @@ class Connection:
         )
 
     def _is_for_us(self, message: Message) -> bool:
-        """Whether a message is addressed to us, or to every system."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         return system in (0, self._keys.system) and component in (0, self._keys.component)
 
     def _hear_elsewhere(self, datagram: Datagram, armed: bool) -> Arrivals:
-        """Follow the autopilot to a new address if that is allowed; otherwise report what
-        arrived.
-        """
+        """Follow the autopilot to a new address if that is allowed; otherwise report the sender."""
         messages = Codec(self._keys.system, self._keys.component).decode(datagram.payload)
         for message in messages:
             same = _sender(message) == self.target and message.get_type() == "HEARTBEAT"
@@ -129,7 +114,6 @@ class Connection:
         return Arrivals()
 
     def _move(self, peer: Address) -> None:
-        """Continue at the autopilot's new address."""
         assert self.peer is not None
         before, after = address_text(*self.peer), address_text(*peer)
         self._events.append(AutopilotMoved(vehicle=self._vehicle, before=before, after=after))
@@ -151,13 +135,11 @@ class Connection:
 
 
 def _sender(message: Message) -> tuple[int, int]:
-    """Numbers of a sender's system and component."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 
 def _content(messages: Sequence[Message]) -> str:
-    """Content of a datagram in words."""
     if not messages:
-        return "what is no MAVLink"
+        return "data that is not MAVLink"
     system, component = _sender(messages[-1])
     return f"{messages[-1].get_type()} of system {system}, component {component}"

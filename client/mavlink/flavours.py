@@ -19,44 +19,34 @@ AIRBORNE = frozenset(
         int(dialect.MAV_TYPE_DECAROTOR),
     }
 )
-"""Types of vehicles that can hover, and so be flown."""
+"""Types of vehicles that can hover; others are not flown."""
 
 
 class LaunchStep(Enum):
-    """Step of the take-off sequence."""
-
     HOLD = auto()
-    """Wait for a mode that flies by itself, none of a pilot's."""
+    """Wait for a mode of the autopilot that needs no pilot, such as holding the position."""
     GUIDE = auto()
     """Wait for the mode that follows set-points."""
     ARM = auto()
-    """Wait until armed."""
     LIFT = auto()
-    """Wait until the command to take off is accepted."""
     CLIMB = auto()
-    """Wait until the take-off altitude is reached."""
 
 
 @dataclass(frozen=True)
 class Flavour:
-    """Properties in which the autopilots differ."""
-
     name: str
     guided: int
     """Number of the mode that follows set-points."""
     land: int
-    """Number of the mode that lands."""
     back: int
     """Number of the mode that returns home and lands there."""
     hold: int
-    """Number of the mode that holds the position."""
     own: frozenset[int]
     """Numbers of the modes allowed between arming and following set-points."""
     steps: tuple[LaunchStep, ...]
-    """Take-off sequence."""
     streams_first: bool
-    """Whether set-points have to be sent before it enters its guided mode; they also bring it back
-    there."""
+    """Whether set-points have to be sent before the autopilot enters its guided mode; they also
+    bring it back there."""
     words_for_stations: bool
     """Whether it sends status texts to ground stations only."""
     time_out: str
@@ -68,14 +58,11 @@ class Flavour:
     submodes: bool
     """Whether a mode's number has two parts."""
     modes: dict[int, str]
-    """Names of the modes by number."""
 
     def mode_name(self, mode: int) -> str:
-        """Name of a mode."""
         return self.modes.get(mode, f"mode {mode}")
 
     def mode_parts(self, mode: int) -> tuple[float, float, float]:
-        """Parameters of the command that sets a mode."""
         if self.submodes:
             return CUSTOM, float(mode >> 16 & 0xFF), float(mode >> 24)
         return CUSTOM, float(mode), 0.0
@@ -152,7 +139,6 @@ FLAVOURS = {
     int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA): ARDUPILOT,
     int(dialect.MAV_AUTOPILOT_PX4): PX4,
 }
-"""Flavours by MAV_AUTOPILOT of a heartbeat."""
 
 
 def unfit(heartbeat: Message) -> str:

@@ -21,20 +21,11 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 FRESH_NS = 200 * MILLISECOND_NS
-"""Age up to which a velocity is compared with the command [ns]."""
+"""Age up to which a velocity is compared with the command."""
 
 
 class Hindrances:
-    """Watches one autopilot in flight.
-
-    Args:
-        scenario: scenario of the flight.
-        vehicle: number of the vehicle, for events.
-        condition: status of the autopilot.
-        positions: its measurements.
-        clock: its clock.
-        events: list to which events are appended.
-    """
+    """Watches one autopilot in flight for reasons not to follow a plan."""
 
     def __init__(
         self,
@@ -53,25 +44,23 @@ class Hindrances:
         self._clock, self._events = clock, events
         self.rivals, self._obedience = Rivals(), Obedience(scenario)
         self._yields = False
-        """Whether a second commander has the vehicle, so that nothing is sent."""
+        """Whether a second commander flies the vehicle, so that nothing is sent."""
         self._was_disarmed = False
         """Whether it was disarmed since it flew, so that it is not flown again."""
         self._reported_ns: dict[Reason, int] = {}
-        """Times at which a second commander was reported, by how it was detected."""
+        """Times at which a second commander was reported, by kind of detection."""
         self._reported_unusable = False
-        """Whether it was reported that positions cannot be used."""
 
     @property
     def bar_setpoints(self) -> bool:
-        """Whether no set-point may be sent: the vehicle was disarmed, or another one has it."""
+        """Whether no set-point may be sent: the vehicle was disarmed, or a second commander flies
+        it.
+        """
         return self._was_disarmed or self._yields
 
     def command(self, velocity: Vector, *, now_ns: int) -> None:
-        """Compare the vehicle's velocity with its commands.
-
-        Args:
-            velocity: velocity commanded from now on, in our axes [m/s].
-            now_ns: time now.
+        """Compare the vehicle's velocity with its commands; `velocity` is commanded from now on, in
+        our axes [m/s].
         """
         came_ns = self._positions.came_ns
         if came_ns is not None and now_ns - came_ns <= FRESH_NS:
@@ -80,11 +69,8 @@ class Hindrances:
             self._obedience.begin()
 
     def reason(self, guided: int, *, now_ns: int) -> Reason | None:
-        """Reason that forbids following a plan now.
-
-        Args:
-            guided: number of the mode that follows set-points.
-            now_ns: time now.
+        """Reason that forbids following a plan now; `guided` is the number of the mode that follows
+        set-points.
         """
         condition = self._condition
         if not condition.armed or self._was_disarmed:
@@ -104,7 +90,7 @@ class Hindrances:
         return self._silence(now_ns)
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """How a second commander was detected; None if there is none."""
+        """Second commander, by the way it was detected; None if there is none."""
         event: AboardEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest
@@ -123,7 +109,7 @@ class Hindrances:
         return cause
 
     def _silence(self, now_ns: int) -> Reason | None:
-        """Reason why the autopilot sends nothing usable; None if it does."""
+        """Reason why there is no usable message of the autopilot; None if there is one."""
         if not self._is_past(self._positions.came_ns, now_ns):
             self._reported_unusable = False
             return None if self._condition.is_fresh(now_ns=now_ns) else Reason.MUTE
@@ -133,11 +119,9 @@ class Hindrances:
         return Reason.UNUSABLE
 
     def _is_past(self, came_ns: int | None, now_ns: int) -> bool:
-        """Whether something arrived longer ago than the autopilot may be silent."""
         return came_ns is None or now_ns - came_ns > self._silence_ns
 
     def _report_unusable(self) -> None:
-        """Report once why no position can be used."""
         why = self._positions.fault
         if self._reported_unusable or not why:
             return

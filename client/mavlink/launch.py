@@ -2,9 +2,9 @@
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's own state says so; until then its command is repeated. Only a
-vehicle on the ground whose scenario is armed is armed, and a pilot's mode is left alone: once the
-vehicle is armed, its mode is changed only if it is one of ours.
+A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
+is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by a pilot is
+not changed: once the vehicle is armed, only a mode of `Flavour.own` is replaced.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
@@ -28,25 +28,23 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = SECOND_NS
-"""Time after which a command is repeated [ns]."""
 STREAM_NS = 500 * MILLISECOND_NS
-"""Time for which set-points are sent before requesting a mode that needs them [ns]."""
+"""Time for which set-points are sent before requesting a mode that needs them."""
 FRESH_NS = 500 * MILLISECOND_NS
-"""Age up to which a position counts as current [ns]."""
+"""Age up to which a position counts as current."""
 LAND_MAX_NS = 120 * SECOND_NS
-"""Longest wait for a landing [ns]."""
 RETURN_MAX_NS = 600 * SECOND_NS
-"""Longest wait for a return [ns]."""
 REFUSED_NS = 4 * SECOND_NS
-"""Time after which a vehicle that ignores the command to return is told to land [ns]."""
+"""Time after which a vehicle that ignores the command to return is commanded to land."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot that is reported as the reason why a step is not done [ns]."""
+"""Silence of the autopilot after which that silence is reported as the reason for a step not
+done."""
 SILENT_MAX_NS = 10 * SECOND_NS
-"""Silence of the autopilot after which a landing is no longer waited for [ns]."""
+"""Silence of the autopilot after which the end of a landing is no longer awaited."""
 THERE_M = 0.3
-"""Largest difference from the take-off altitude at which the climb is over [m]."""
+"""Largest difference from the take-off altitude at which the climb is over."""
 STILL_MPS = 0.3
-"""Vertical speed below which the climb is over [m/s]."""
+"""Vertical speed below which the climb is over."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
 ARM = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM)
 TAKE_OFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
@@ -55,13 +53,11 @@ RESULTS = {
     number: entry.name.removeprefix("MAV_RESULT_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_RESULT"].items()
 }
-"""Words for the results of commands."""
-SILENT = "nothing is heard of it"
-"""Reason why a step is not done if the autopilot is silent."""
+SILENT = "it is silent"
 WORDS = {SET_MODE: "change its mode", ARM: "arm", TAKE_OFF: "take off"}
 NOT_DONE = {
     LaunchStep.HOLD: "not in a mode that holds",
-    LaunchStep.GUIDE: "not in the mode that obeys us",
+    LaunchStep.GUIDE: "not in the mode that follows set-points",
     LaunchStep.ARM: "not armed",
     LaunchStep.LIFT: "not taken off",
     LaunchStep.CLIMB: "not at the altitude of take-off",
@@ -69,8 +65,6 @@ NOT_DONE = {
 
 
 class Phase(Enum):
-    """Phase of a flight."""
-
     GROUND = auto()
     CLIMBING = auto()
     FLYING = auto()
@@ -81,15 +75,10 @@ class Launch:
     """Take-off and landing of one vehicle.
 
     Args:
-        vehicle: number of the vehicle, for events.
-        flavour: which autopilot.
-        target: numbers of its system and component.
+        target: numbers of the autopilot's system and component.
         altitude: take-off altitude above the ground [m].
         patience_ns: time that each step may take [ns].
         from_takeoff: whether our origin is where the vehicle is armed.
-        condition: status of the autopilot.
-        positions: its measurements.
-        events: list to which events are appended.
     """
 
     def __init__(
@@ -111,46 +100,41 @@ class Launch:
         self._condition, self._positions, self._events = condition, positions, events
         self.phase = Phase.GROUND
         self._step = 0
-        """Index of the current step of the take-off sequence."""
         self._since_ns: int | None = None
-        """Time since which the current step is waited for."""
+        """Start of the current step."""
         self._asked_ns: int | None = None
         """Time at which its command was last sent."""
         self._accepted = False
-        """Whether the take-off command was accepted."""
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
         self._asked_to_arm = False
-        """Whether the operator was told so."""
         self._hovers_ns: int | None = None
-        """Time since which it hovers until the origin is given; None while it does not."""
+        """Time since which the vehicle hovers because the origin is unknown; None while it does
+        not."""
         self.took_off = False
-        """Whether this run of the client has armed it."""
         self._closed = False
-        """Whether nothing may begin any more."""
+        """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
-        """Number of the mode in which it comes down."""
+        """Number of the mode in which it descends."""
         self.waits_for = ""
-        """What is missing before it takes off, in words; empty if nothing is."""
+        """What prevents the take-off, in words; empty if nothing does."""
         self._stated_reason = ""
         """Reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
         """Refusals reported in this step: command and result."""
         self.failure: NotTakenOff | None = None
 
-    # -- into the air ------------------------------------------------------------------------
+    # -- take-off --------------------------------------------------------------------------
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
         """Continue the take-off; returns whether the vehicle can be flown.
 
-        Args:
-            may_arm: whether a vehicle on the ground is armed.
-            now_ns: time now.
+        `may_arm` allows arming a vehicle on the ground.
         """
         if self._is_flying and not self.failure:
             is_placed = self._is_placed(now_ns)
             if not is_placed:
-                self._wait("not flown", "it does not tell where it is", now_ns)
+                self._wait("not flown", "its position is unknown", now_ns)
             return is_placed
         if self.failure or self._closed or self.phase is Phase.LANDING:
             return False
@@ -165,20 +149,19 @@ class Launch:
         return self.phase is Phase.FLYING
 
     def _is_placed(self, now_ns: int) -> bool:
-        """Whether the present position is known."""
         came_ns = self._positions.came_ns
         return came_ns is not None and now_ns - came_ns <= FRESH_NS
 
     def _begin(self, may_arm: bool, now_ns: int) -> None:
-        """Begin the climb when possible, or find that the vehicle is flying already."""
+        """Begin the climb when possible; a vehicle in the air is flown from there."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
         if self._silence(now_ns):
             self._wait("not ready", SILENT, now_ns)
         elif not condition.is_fresh(now_ns=now_ns) or not condition.landed:
-            self._wait("not ready", "it does not say whether it is on the ground", now_ns)
+            self._wait("not ready", "it does not report whether it is on the ground", now_ns)
         elif not self._is_placed(now_ns):
-            self._wait("not ready", "it does not tell where it is", now_ns)
+            self._wait("not ready", "its position is unknown", now_ns)
         elif condition.is_flying and condition.mode == flavour.guided:
             self._go_on(now_ns)
         elif condition.armed and condition.is_airborne:
@@ -211,18 +194,17 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # it is under our control, and lands
-            self._fail(waited, "nobody has said where its origin is, see mavlink.origin", now_ns)
+            self._enter(Phase.FLYING, now_ns)  # the vehicle is under our control, and lands
+            self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
-        """Report once that an operator has to allow arming."""
         self._since_ns, self.waits_for = None, "armed = true"
         if not self._asked_to_arm:
             self._asked_to_arm = True
             self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.why_not_armed))
 
     def arm(self) -> None:
-        """Allow arming, as an operator said; ignored unless the vehicle is on the ground."""
+        """Allow arming, on an operator's order; ignored unless the vehicle is on the ground."""
         condition = self._condition
         if self.phase is Phase.GROUND and not (condition.armed or condition.is_airborne):
             self.why_not_armed, self._asked_to_arm = "", False
@@ -237,7 +219,6 @@ class Launch:
         self._refused.clear()
 
     def _climb(self, now_ns: int) -> None:
-        """Advance to the first step that is not done."""
         condition, steps = self._condition, self._flavour.steps
         while self._step < len(steps):
             armed_before = steps.index(LaunchStep.ARM) < self._step
@@ -275,7 +256,7 @@ class Launch:
                 return there and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
-        """Wait for the autopilot, and fail when it takes too long."""
+        """Wait for the autopilot; give up after too long."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if self.phase is Phase.GROUND:
@@ -287,11 +268,11 @@ class Launch:
             self._fail(waited, self._silence(now_ns) or self._stated_reason or why, now_ns)
 
     def _silence(self, now_ns: int) -> str:
-        """Sentence about a silent autopilot; empty if it is heard."""
+        """Message about a silent autopilot; empty if it is not silent."""
         heard_ns = self._condition.heard_ns
         if heard_ns is None or now_ns - heard_ns <= QUIET_NS:
             return ""
-        return f"nothing is heard of its autopilot for {(now_ns - heard_ns) / SECOND_NS:.0f} s"
+        return f"no message from its autopilot for {(now_ns - heard_ns) / SECOND_NS:.0f} s"
 
     def _fail(self, doing: str, why: str, now_ns: int) -> None:
         self.failure = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)
@@ -309,7 +290,7 @@ class Launch:
             return False
         return self._flavour.steps[self._step] is LaunchStep.GUIDE
 
-    # -- down again --------------------------------------------------------------------------
+    # -- landing ----------------------------------------------------------------------------
 
     def return_home(self, *, now_ns: int) -> None:
         """Return home and land there, if the vehicle is under our control and in the air."""
@@ -323,16 +304,14 @@ class Launch:
             self._enter(Phase.LANDING, now_ns)
 
     def close(self, *, now_ns: int) -> list[Message]:
-        """End the launch; returns messages that make the vehicle land if it is under our
-        control.
-        """
+        """End the launch; returns messages that land the vehicle if it is under our control."""
         self._closed = True
         if self.phase is Phase.GROUND or not self._is_ours(now_ns):
             return []
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether it is armed and in a mode of ours, as far as is currently known."""
+        """Whether the vehicle is armed and in a mode of ours, as far as is currently known."""
         condition = self._condition
         in_ours = condition.mode in self._flavour.own and condition.armed
         return in_ours and condition.is_fresh(now_ns=now_ns)
@@ -350,10 +329,9 @@ class Launch:
         most_ns = LAND_MAX_NS if self._landing_mode == self._flavour.land else RETURN_MAX_NS
         return lost or not obeys or now_ns - self._since_ns > most_ns
 
-    # -- what is asked and heard -------------------------------------------------------------
+    # -- commands and their answers ---------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Commands that are due now."""
         if self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS:
             return []
         command = self._command(now_ns)
@@ -406,7 +384,6 @@ class Launch:
         return dialect.MAVLink_command_long_message(*self._target, command, 0, *padded)
 
     def hear(self, message: Message) -> None:
-        """Process the answer to one of our commands."""
         command, result = message.command, message.result
         if command not in WORDS or result == IN_PROGRESS:
             return
@@ -427,5 +404,4 @@ class Launch:
         self._stated_reason = self._stated_reason or answer
 
     def hear_text(self, text: str) -> None:
-        """Note a text from the autopilot as the reason why a step is not done."""
         self._stated_reason = text

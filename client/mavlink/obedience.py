@@ -22,27 +22,21 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.scenario.schema import Scenario
 
 LATER_NS = 300 * MILLISECOND_NS
-"""Time by which an input may act later than the dead time says [ns]."""
+"""Time by which an input may act later than the model's dead time."""
 ERROR = 0.25
-"""Relative error of the gain."""
 SLOW_MPS2 = 1.0
 """Acceleration of the slowest vehicle [m/s²]."""
 MARGIN_MPS = 1.0
-"""Deviation of velocity allowed in calm air [m/s]."""
+"""Deviation of velocity allowed in calm air."""
 NOTICED_NS = 100 * MILLISECOND_NS
-"""Time for which the deviation has to be larger [ns]."""
+"""Time for which the deviation has to be larger."""
 QUIET_NS = SECOND_NS
-"""Time without such a deviation after which the vehicle counts as obedient again [ns]."""
+"""Time without such a deviation after which the vehicle counts as obedient again."""
 COMMANDS_MAX = 256
-"""Number of commanded velocities kept."""
 
 
 class Obedience:
-    """Compares one vehicle's velocity with its commands.
-
-    Args:
-        scenario: its model, and the wind in which its fence must hold.
-    """
+    """Compares one vehicle's velocity with its commands."""
 
     def __init__(self, scenario: Scenario) -> None:
         terms, axes = scenario.terms(), 3 - scenario.model.axes
@@ -50,29 +44,24 @@ class Obedience:
         self._late_ns = seconds_to_ns(max(terms.dead_time_s)) + LATER_NS
         self._margin = MARGIN_MPS + scenario.fence.wind_mps
         self._commands: deque[tuple[int, Vector]] = deque(maxlen=COMMANDS_MAX)
-        """Recent commanded velocities, with their times."""
         self._low = self._high = [0.0, 0.0, 0.0]
         self._stepped_ns: int | None = None
-        """Time of the newest step; None after `begin`."""
         self._outside_ns: int | None = None
-        """Time since which the velocity has been outside; None if it is not."""
+        """Time since which the velocity has been outside the bounds; None while it is inside."""
         self._strayed_ns: int | None = None
-        """Newest time at which it had been outside for long enough; None for never."""
+        """Newest time at which the velocity had been outside for NOTICED_NS; None for never."""
         self.off_mps = 0.0
         """Newest distance of the velocity from its bounds [m/s]."""
 
     def begin(self) -> None:
-        """Start again: somebody else has flown the vehicle until now."""
+        """Start again after somebody else has flown the vehicle."""
         self._commands.clear()
         self._stepped_ns = self._outside_ns = self._strayed_ns = None
 
     def step(self, command: Vector, velocity: Vector, *, now_ns: int) -> None:
-        """Compare the velocity with the commands.
+        """Compare a velocity with the commands, both in our axes [m/s].
 
-        Args:
-            command: velocity commanded from now on, in our axes [m/s].
-            velocity: measured velocity, in our axes [m/s].
-            now_ns: time now.
+        `command` applies from now on.
         """
         before_ns, self._stepped_ns = self._stepped_ns, now_ns
         self._commands.append((now_ns, command))
@@ -98,5 +87,4 @@ class Obedience:
             self._strayed_ns = now_ns
 
     def strays(self, *, now_ns: int) -> bool:
-        """Whether the vehicle does not follow its commands."""
         return self._strayed_ns is not None and now_ns - self._strayed_ns <= QUIET_NS

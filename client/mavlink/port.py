@@ -1,8 +1,8 @@
 """The connection to the autopilot as an endpoint: all messages from it and to it.
 
-Its own loop sends a heartbeat each second and, while the pilot flies, the desired velocity, never a
-position. If this loop ends, so do the set-points, and the autopilot's own time-out acts: nothing
-here repeats the command of a pilot that is gone.
+The endpoint's own loop sends a heartbeat each second and, while the pilot flies, the desired
+velocity, never a position. If this loop ends, no set-point is sent any more, and the autopilot's
+own time-out acts: no set-point is repeated after the pilot has stopped.
 """
 
 from typing import Any
@@ -23,22 +23,14 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 TICK_NS = 100 * MILLISECOND_NS
-"""Interval between checks of what is due beside set-points [ns]."""
+"""Interval between checks for due messages other than set-points."""
 HEARTBEAT_NS = SECOND_NS
-"""Interval between our heartbeats [ns]."""
 CLOSES = 3
-"""Number of times that a vehicle in the air is told to land when the process ends."""
+"""Number of times that a vehicle in the air is commanded to land when the process ends."""
 
 
 class Port(Endpoint):
-    """Connection to one autopilot.
-
-    Args:
-        scenario: scenario, with its keys of `mavlink`.
-        vehicle: number of the vehicle, for events.
-        line: address of the autopilot.
-        altitude: take-off altitude [m].
-    """
+    """Connection to one autopilot; `altitude` is that of take-off [m]."""
 
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, altitude: float) -> None:
         super().__init__()
@@ -54,25 +46,20 @@ class Port(Endpoint):
         )
         self._setpoints = Setpoints(scenario.dt_ns)
         self.now_ns = 0
-        """Time of the newest call."""
         self._tick_ns = self._heartbeat_ns = 0
-        """Times of the next check and of the next heartbeat."""
 
-    # -- what the vehicle asks ---------------------------------------------------------------
+    # -- for the vehicle --------------------------------------------------------------------
 
     @property
     def is_down(self) -> bool:
-        """Whether the vehicle needs no more control."""
         parts = self.autopilot.parts
         return parts is None or parts.launch.is_down(now_ns=self.now_ns)
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        """Continue the take-off, see `Launch`."""
         self.now_ns = now_ns
         return self.autopilot.take_off(may_arm=may_arm, now_ns=now_ns)
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """Reason that forbids following a plan now."""
         self.now_ns = now_ns
         return self._hindrances.reason(self.autopilot.flavour.guided, now_ns=now_ns)
 
@@ -83,21 +70,18 @@ class Port(Endpoint):
             self._send_setpoint()
 
     def return_home(self) -> None:
-        """Command the autopilot to return home by itself and land there."""
         if (parts := self.autopilot.parts) is not None:
             parts.launch.return_home(now_ns=self.now_ns)
             self._tick_ns = self.now_ns
 
     def land(self) -> None:
-        """Command the autopilot to land by itself."""
         if (parts := self.autopilot.parts) is not None:
             parts.launch.land(now_ns=self.now_ns)
             self._tick_ns = self.now_ns
 
-    # -- what comes --------------------------------------------------------------------------
+    # -- received ---------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self.now_ns = now_ns
         autopilot = self.autopilot
         is_quiet, armed = autopilot.is_quiet(now_ns=now_ns), autopilot.condition.armed
@@ -114,10 +98,9 @@ class Port(Endpoint):
         for message in arrivals.others:
             self._hindrances.rivals.hear(message, target[0], now_ns=now_ns)
 
-    # -- what goes ---------------------------------------------------------------------------
+    # -- sent -------------------------------------------------------------------------------
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self.now_ns = now_ns
         if now_ns >= self._tick_ns:
             self._tick_ns = now_ns + TICK_NS
@@ -129,12 +112,10 @@ class Port(Endpoint):
             self._send_setpoint()
 
     def next_wake_ns(self) -> int:
-        """See `Endpoint`."""
         setpoint_ns = self._setpoints.due_ns(self._sends(), now_ns=self.now_ns)
         return self._tick_ns if setpoint_ns is None else min(self._tick_ns, setpoint_ns)
 
     def _send_heartbeats(self, now_ns: int) -> None:
-        """Send a heartbeat if it is due."""
         if now_ns < self._heartbeat_ns or self._connection.peer is None or self._is_given_up():
             return
         self._heartbeat_ns = now_ns + HEARTBEAT_NS
@@ -143,18 +124,19 @@ class Port(Endpoint):
             self._say(_heartbeat(dialect.MAV_TYPE_GCS))
 
     def _is_given_up(self) -> bool:
-        """Whether it does not obey the command to land: without our heartbeats its own failsafe
-        lands it.
+        """Whether the vehicle ignores the command to land: without the client's heartbeats its own
+        failsafe lands it.
         """
         parts, condition = self.autopilot.parts, self.autopilot.condition
         lands = parts is not None and parts.launch.phase is Phase.LANDING
         return lands and not condition.is_fresh(now_ns=self.now_ns)
 
     def _may_be_station(self) -> bool:
-        """Whether to announce ourselves to PX4 as a ground station too: only those receive its
-        texts.
+        """Whether to announce the client to PX4 as a ground station too: PX4 sends its texts to
+        stations only.
 
-        Not if PX4 reacts to losing its ground station: it would miss the loss of another one.
+        Not if PX4 reacts to losing its ground station: then it would not notice the loss of another
+        one.
         """
         parts = self.autopilot.parts
         return (
@@ -165,7 +147,6 @@ class Port(Endpoint):
         )
 
     def _sends(self) -> Sends:
-        """Set-points that the autopilot is sent at present."""
         parts, condition = self.autopilot.parts, self.autopilot.condition
         if parts is None:
             return Sends.NOTHING
@@ -177,7 +158,6 @@ class Port(Endpoint):
         return Sends.NOTHING
 
     def _send_setpoint(self) -> None:
-        """Send a set-point, if one may be sent."""
         parts, flavour = self.autopilot.parts, self.autopilot.flavour
         if parts is None or self._connection.target is None:
             return
@@ -198,7 +178,7 @@ class Port(Endpoint):
             self.send(self._connection.codec.encode(message), self._connection.peer)
 
     def close(self, *, now_ns: int) -> None:
-        """See `Endpoint`; a vehicle in the air under our control lands by itself."""
+        """A vehicle in the air under our control lands by itself."""
         self.now_ns = now_ns
         if (parts := self.autopilot.parts) is not None:
             for message in parts.launch.close(now_ns=now_ns) * CLOSES:
@@ -207,7 +187,6 @@ class Port(Endpoint):
     # -- figures -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`; unknown figures are left out."""
         autopilot, counts = self.autopilot, self._connection.counts
         condition, clock, parts = autopilot.condition, autopilot.clock, autopilot.parts
         port_figures: dict[str, Any] = {
@@ -238,6 +217,5 @@ class Port(Endpoint):
 
 
 def _heartbeat(kind: int) -> Message:
-    """Heartbeat of a MAV_TYPE that is not an autopilot."""
     active = dialect.MAV_STATE_ACTIVE
     return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, active, 3)

@@ -1,4 +1,4 @@
-"""Measurements from LOCAL_POSITION_NED: in our axes, by our clock, in order and without
+"""Measurements from LOCAL_POSITION_NED: in our axes, by the client's clock, in order and without
 duplicates.
 """
 
@@ -19,17 +19,17 @@ from skytether.shared.scenario.schema import Scenario
 WAITING_MAX = 64
 """Number of measurements waiting to be read; the oldest are dropped."""
 AHEAD_NS = 20 * MILLISECOND_NS
-"""Time by which a stamp may lie in the future, from errors of the clock [ns]; more is
-impossible."""
+"""Time by which a stamp may lie in the future because of clock errors; stamps further ahead are
+dropped."""
 OLD_NS = SECOND_NS
-"""Largest age of a measurement that is used, for an autopilot aboard [ns]."""
+"""Largest age of a measurement that is used, for an autopilot aboard."""
 RECALLED_MAX_NS = 600 * SECOND_NS
-"""Longest time for which an origin saved by an earlier run is valid [ns]."""
+"""Longest time for which an origin saved by an earlier run is valid."""
 REBOOT_NS = SECOND_NS
-"""Allowed difference between the autopilot's clock and ours since it was saved, beside drift
-[ns]."""
+"""Allowed difference between the advances of the two clocks since the origin was saved, beside
+drift."""
 DRIFT_PARTS = 40
-"""One over the allowed drift since then: 2.5 %."""
+"""Inverse of the allowed drift since then: 2.5 %."""
 SPEED_MAX = 1e3
 """Largest speed on an axis that is accepted [m/s]."""
 
@@ -42,7 +42,6 @@ FAULTS = {
     "old": f"they are older than {OLD_NS / SECOND_NS:g} s",
     "late": "older ones come after newer ones",
 }
-"""Reasons for dropping a position, in words."""
 
 Vector = tuple[float, float, float]
 
@@ -64,7 +63,7 @@ def given_origin(scenario: Scenario) -> Vector | None:
             return 0.0, 0.0, 0.0
         case (x, y, *up):
             return float(x), float(y), float(up[0]) if up else 0.0
-    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused anything else
+    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused all other values
 
 
 class Positions:
@@ -75,8 +74,8 @@ class Positions:
         clock: the autopilot's clock.
         old_ns: age above which a measurement is dropped [ns].
         start: position of take-off in our axes, used by `begin` [m].
-        origin: origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None
-            if it is only known after `begin`.
+        origin: origin of the scenario's frame in the autopilot's local frame, in our axes [m];
+            None if known only after `begin`.
         leaps: check of each measurement against the previous one; None: unchecked.
     """
 
@@ -93,19 +92,18 @@ class Positions:
         self._waiting: deque[Measurement] = deque(maxlen=WAITING_MAX)
         self._newest_boot_ms = -1
         self._newest_ns: int | None = None
-        """Stamp of the newest measurement."""
+        """Stamp of the newest measurement [ns; the client's clock]."""
         self._leaps = leaps
         self._is_flown = False
         """Whether the vehicle is flown by its measurements, so that a leap counts."""
         self.leap_m: Vector | None = None
-        """Displacement of its position that the operator has not decided about, in our axes [m];
-        None without one. The origin has been displaced by the same, so the vehicle keeps its old
-        frame."""
+        """Displacement of the position about which the operator has not decided, in our axes [m];
+        None without a leap. The origin has been displaced by the same vector, so the vehicle keeps
+        its old frame."""
         self._jumps = 0
         self.origin: Vector = origin or (0.0, 0.0, 0.0)
         """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]."""
         self.has_origin = origin is not None
-        """Whether the origin is known."""
         self.is_recalled = False
         """Whether the origin was saved by an earlier run since this boot of the autopilot."""
         self._recalled: VehicleMemory | None = None
@@ -117,19 +115,17 @@ class Positions:
         self.velocity: Vector = (0.0, 0.0, 0.0)
         """Newest velocity, in our axes [m/s]."""
         self.came_ns: int | None = None
-        """Arrival of the newest measurement."""
+        """Arrival of the newest measurement that was used."""
         self.heard_ns: int | None = None
         """Arrival of the newest measurement, used or dropped."""
         self.taken = 0
-        """Number of measurements used."""
         self.dropped: Counter[str] = Counter()
-        """Number of dropped measurements by reason."""
         self._fault = ""
-        """Why the newest was dropped; empty if it was used."""
+        """Why the newest measurement was dropped; empty if it was used."""
 
     @property
     def fault(self) -> str:
-        """Why the newest was dropped, in words; empty if it was used."""
+        """Why the newest measurement was dropped, in words; empty if it was used."""
         return FAULTS.get(self._fault, "")
 
     @property
@@ -138,7 +134,6 @@ class Positions:
         return self.position[2] - self.origin[2] if self.position else 0.0
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message, or drop and count it."""
         self.heard_ns = now_ns
         self._fault = reason = self._wrong(message, now_ns)
         if reason:
@@ -165,8 +160,8 @@ class Positions:
         )
 
     def _watch(self, leaps: Leaps, measured: Measurement) -> None:
-        """Displace the origin together with a position that leapt: the vehicle has not moved so
-        far.
+        """After a leap of the position, displace the origin by the same vector: the vehicle has not
+        moved so far.
         """
         if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self._is_flown:
             dx, dy, dz = leaps.off_m
@@ -188,7 +183,6 @@ class Positions:
         return self._clock.local_ns(boot_ms * MILLISECOND_NS + MILLISECOND_NS // 2)
 
     def _wrong(self, message: Message, now_ns: int) -> str:
-        """Why a message is dropped; empty if it is used."""
         if self._jumps != self._clock.jumps:
             self._jumps = self._clock.jumps
             self._newest_boot_ms, self._newest_ns = -1, None
@@ -200,7 +194,6 @@ class Positions:
         return self._untimely(message.time_boot_ms, now_ns)
 
     def _untimely(self, boot_ms: int, now_ns: int) -> str:
-        """Error of a time stamp; empty if there is none."""
         if not self._clock.is_known:
             return "unsynchronised"
         if boot_ms == self._newest_boot_ms:
@@ -219,7 +212,6 @@ class Positions:
             self.place((x, y, z))
 
     def place(self, origin: Vector) -> None:
-        """Set our origin [m; the autopilot's local frame, in our axes]."""
         self.origin, self.has_origin, self._recalled = origin, True, None
         self._waiting.clear()
 
@@ -230,7 +222,7 @@ class Positions:
 
     def _recall(self, saved: VehicleMemory, boot_ms: int, now_ns: int) -> None:
         """Restore an origin if both clocks have advanced alike: a reboot resets the autopilot's
-        to 0.
+        clock to 0.
         """
         self._recalled = None
         passed_ns = now_ns - saved.at_ns
@@ -242,11 +234,7 @@ class Positions:
             self.is_recalled = True
 
     def frame(self, *, armed: bool) -> VehicleMemory:
-        """State of the origin that the next run needs.
-
-        Args:
-            armed: see `VehicleMemory`.
-        """
+        """State of the origin for the next run of the client; `armed` as in `VehicleMemory`."""
         if not self.has_origin or self.came_ns is None:
             saved = self._recalled or VehicleMemory()
             return msgspec.structs.replace(saved, armed=armed)

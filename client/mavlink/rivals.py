@@ -1,8 +1,7 @@
-"""Second commanders: others on the network that command our autopilot.
+"""Second commanders: other systems on the network that command our autopilot.
 
-An autopilot obeys the latest command without saying whose it was. Here other commanders are
-detected from the messages that a router or radio passes on to us; `obedience` detects the others by
-their effect.
+An autopilot obeys the latest command of any sender. This module detects commanders whose messages a
+router or radio passes on to the client; `obedience` detects the others by their effect.
 """
 
 from collections import deque
@@ -12,11 +11,12 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import SECOND_NS
 
 WINDOW_NS = SECOND_NS
-"""Window in which set-points are counted [ns]."""
+"""Window in which set-points are counted."""
 LEAST = 2
-"""Number of set-points in the window that make a second commander; a single one may be a stray."""
+"""Number of set-points in the window that count as a second commander; a single one may be a
+stray."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence after which a second commander counts as gone [ns]."""
+"""Silence after which a second commander counts as gone."""
 STREAMS = frozenset(
     {
         "SET_POSITION_TARGET_LOCAL_NED",
@@ -34,19 +34,19 @@ GOTO = frozenset(
         int(dialect.MAV_CMD_OVERRIDE_GOTO),
     }
 )
-"""Commands that move a vehicle in its present mode, and are sent once. A change of mode is seen in
-heartbeats."""
+"""Commands that move a vehicle in its present mode, and are sent once. A change of mode is detected
+from heartbeats."""
 GUIDED_ITEM = (2, 3)
 """Values of `current` of a mission item that is flown to at once, or sets an altitude."""
 STICK = 50
-"""Stick deflection that counts, of 1000, or of 500 µs."""
+"""Smallest stick deflection that counts, of 1000, or of 500 µs."""
 CENTRE_US = 1500
 UNUSED_US = (0, 65535)
 """Pulse widths of a channel that is not overridden [µs]."""
 
 
 class Rivals:
-    """Others that command our autopilot, as far as their messages reach us."""
+    """Other systems that command our autopilot, as far as their messages arrive here."""
 
     def __init__(self) -> None:
         self._times_ns: deque[int] = deque(maxlen=LEAST)
@@ -56,13 +56,7 @@ class Rivals:
         """Numbers of its system and component, and the type of its newest message."""
 
     def hear(self, message: Message, system: int, *, now_ns: int) -> None:
-        """Process a message of another sender.
-
-        Args:
-            message: the message.
-            system: number of our autopilot's system.
-            now_ns: time now.
-        """
+        """Process a message of another sender; `system` is the number of our autopilot's system."""
         weight = _weight(message, system)
         for _ in range(weight):
             self._times_ns.append(now_ns)
@@ -72,12 +66,10 @@ class Rivals:
             self.newest = *sender, message.get_type()
 
     def are_there(self, *, now_ns: int) -> bool:
-        """Whether there is a second commander now."""
         return self._active_ns is not None and now_ns - self._active_ns <= QUIET_NS
 
 
 def _weight(message: Message, system: int) -> int:
-    """Number of set-points that a message counts as."""
     kind = message.get_type()
     named = message.target if kind == "MANUAL_CONTROL" else getattr(message, "target_system", None)
     if named not in (0, system):
@@ -97,5 +89,4 @@ def _weight(message: Message, system: int) -> int:
 
 
 def _is_moved(pulse_us: int) -> bool:
-    """Whether a channel is overridden with a stick that is not centred."""
     return pulse_us not in UNUSED_US and abs(pulse_us - CENTRE_US) > STICK

@@ -1,8 +1,8 @@
 """Parameters that decide how an autopilot reacts to silence: their meaning and safe values.
 
-**Safe means that the flight ends by itself.** Without set-points the vehicle may fly on for one
-second at most, and once our process is gone it has to come down; hovering or flying on for ever is
-unsafe.
+**Safe means that the flight ends without commands.** Without set-points the vehicle may fly on for
+one second at most, and once the client's process has ended it has to come down; hovering or flying
+on for ever is unsafe.
 
 A required parameter that the autopilot does not have makes it unsafe; any other is reported as
 missing.
@@ -17,9 +17,9 @@ from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
 
 SILENCE_MAX_S = 1.0
-"""Longest time for which a vehicle may fly on without set-points [s]."""
+"""Longest time for which a vehicle may fly on without set-points."""
 SILENCE_MIN_S = 0.2
-"""Shortest usable time-out if set-points arrive at 10 Hz [s]."""
+"""Shortest usable time-out if set-points arrive at 10 Hz."""
 TOLERANCE = 1e-6
 """Rounding error of a decimal number stored as float32."""
 
@@ -35,19 +35,14 @@ def returns_below_m(scenario: Scenario) -> float | None:
 
 
 class Rule(NamedTuple):
-    """Requirement on a parameter."""
-
     names: tuple[str, ...]
     """Names of the parameter in versions of the autopilot, newest last."""
     meaning: Callable[[float], str]
-    """Meaning of a value, in words."""
     is_safe: Callable[[float], bool] = lambda _: True
     wanted: str = ""
-    """Safe values, in words."""
     value: float = 0.0
-    """Value to set if the present one is unsafe."""
     required: bool = False
-    """Whether the parameter must be known."""
+    """Whether a missing parameter makes the autopilot unsafe."""
 
 
 def _table(meanings: Mapping[int, str], other: str) -> Callable[[float], str]:
@@ -116,7 +111,7 @@ def _options(value: float) -> str:
 
 
 CLEAR_M = 1.0
-"""Distance below the fence of the return altitude that is set [m]."""
+"""Distance below the fence of the return altitude that is set."""
 
 
 def _below(value: float, below_m: float) -> bool:
@@ -127,8 +122,7 @@ def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
     """Rule that a vehicle returns below the fence.
 
     Args:
-        name: name of the parameter.
-        what: what the vehicle does at that altitude.
+        what: what the vehicle does at that altitude, such as "returns home".
         below_m: altitude of the fence [m]; infinite without one.
         scale: number of the parameter's units in a metre.
     """
@@ -143,7 +137,6 @@ def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
 
 
 def _ardupilot_returns(below_m: float | None) -> tuple[Rule, ...]:
-    """Rules for the return of ArduCopter; none if it does not return."""
     if below_m is None:
         return ()
     return (
@@ -160,7 +153,6 @@ def _ardupilot_returns(below_m: float | None) -> tuple[Rule, ...]:
 
 
 def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
-    """Rules for the return of PX4; none if it does not return."""
     if below_m is None:
         return ()
     return (
@@ -176,11 +168,9 @@ def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
 
 
 def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for ArduCopter.
+    """Rules for ArduCopter, for `system` as the client's own MAVLink system.
 
-    Args:
-        system: number of our own system.
-        returns_below_m: altitude below which it has to return home, if it does [m].
+    `returns_below_m` is the altitude below which the vehicle has to return home, if it does.
     """
     return (
         *_ardupilot_returns(returns_below_m),
@@ -203,7 +193,7 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
         Rule(
             ("SYSID_MYGCS", "MAV_GCS_SYSID"),
             lambda v: (
-                f"it notices that system {v:g} is gone, and heeds a joystick of no other; ours is "
+                f"it watches for system {v:g} alone, and accepts a joystick from no other; ours is "
                 f"{system}"
             ),
             _among(system),
@@ -228,14 +218,14 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
         ),
         Rule(
             ("BATT_FS_LOW_ACT",),
-            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+            _table({0: "a low battery is only reported"}, "with a low battery it acts by itself"),
         ),
         Rule(("FENCE_ENABLE",), _table(_FENCES, "its own fence is on")),
         Rule(("FENCE_TYPE",), _fence_types),
         Rule(
             ("FENCE_ACTION",),
             _table(
-                {0: "beyond its fence it only says so", 4: "beyond its fence it brakes"},
+                {0: "beyond its fence it only reports it", 4: "beyond its fence it brakes"},
                 "beyond its fence it returns home or lands",
             ),
         ),
@@ -245,10 +235,8 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
 
 
 def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for PX4.
-
-    Args:
-        returns_below_m: altitude below which it has to return home, if it does [m].
+    """Rules for PX4; `returns_below_m` is the altitude below which it has to return home, if it
+    does.
     """
     return (
         *_px4_returns(returns_below_m),
@@ -285,12 +273,12 @@ def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
         Rule(("COM_DL_LOSS_T",), lambda v: f"a ground station is lost after {v:g} s"),
         Rule(
             ("COM_LOW_BAT_ACT",),
-            _table({0: "a low battery is only told"}, "with a low battery it acts by itself"),
+            _table({0: "a low battery is only reported"}, "with a low battery it acts by itself"),
         ),
         Rule(
             ("GF_ACTION",),
             _table(
-                {0: "beyond its fence it goes on", 1: "beyond its fence it only says so"},
+                {0: "beyond its fence it goes on", 1: "beyond its fence it only reports it"},
                 "beyond its fence it acts by itself",
             ),
         ),
@@ -304,11 +292,8 @@ def _limit(value: float, where: str) -> str:
 
 
 def judged(rule: Rule, values: Mapping[str, float]) -> AutopilotParameter:
-    """Parameter of a rule, its meaning, and whether it is safe.
-
-    Args:
-        rule: the rule.
-        values: values of the parameters that the autopilot has, by name.
+    """Parameter of a rule, its meaning, and whether it is safe; `values` are the autopilot's
+    parameters by name.
     """
     for name in rule.names:
         value = values.get(name)

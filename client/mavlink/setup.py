@@ -25,12 +25,11 @@ from skytether.shared.core.aboard import (
 from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time after which a question is repeated [ns]."""
 TRIES = 10
 """Number of times that a question is asked; with 10 % loss each way, one in ten million stays
 open."""
 AT_ONCE = 4
-"""Number of open questions: a serial line takes no more."""
+"""Number of open questions at a time: a serial line takes no more."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
@@ -40,13 +39,9 @@ class Setup:
     """Checks the parameters of an autopilot, and sets unsafe ones if allowed.
 
     Args:
-        vehicle: number of the vehicle, for events.
-        flavour: which autopilot.
-        target: numbers of its system and component.
-        system: number of our own system.
-        sets: whether unsafe parameters are set.
-        returns_below_m: altitude below which it has to return home, if it does [m].
-        events: list to which events are appended.
+        target: numbers of the autopilot's system and component.
+        system: number of the client's own system.
+        returns_below_m: altitude below which the vehicle has to return home, if it does [m].
     """
 
     def __init__(
@@ -69,33 +64,27 @@ class Setup:
         )
         self._bytewise = flavour.bytewise
         self._version: str | None = None
-        """Name and version; None while unknown."""
         self._version_tries = 0
         self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
-        """Times that each unknown parameter was asked for, or set."""
+        """Times that each unknown parameter was requested, or set."""
         self._values: dict[str, float] = {}
         self._kinds: dict[str, int] = {}
-        """Types of the known parameters."""
         self._setting: dict[str, tuple[float, float]] = {}
         """Old and new values of parameters that are being set."""
         self._changed: list[tuple[str, float, float]] = []
         self._asked_ns: int | None = None
         self.is_done = False
-        """Whether all is safe."""
         self.failure: ParametersUnsafe | None = None
 
     @property
     def fence(self) -> dict[str, float]:
-        """Known parameters of the autopilot's own fence: values by name."""
         return {name: value for name, value in self._values.items() if name[:3] in ("FEN", "GF_")}
 
     def value(self, name: str) -> float | None:
-        """Value of a parameter; None if unknown."""
         return self._values.get(name)
 
     @property
     def waits_for(self) -> str:
-        """What is not known yet, in words."""
         if self._version is None:
             return "the version of its autopilot"
         return f"parameters of its autopilot: {', '.join(list(self._tries)[:AT_ONCE])}"
@@ -103,7 +92,6 @@ class Setup:
     # What is heard
 
     def hear(self, message: Message) -> None:
-        """Process a message of the autopilot."""
         match message.get_type():
             case "AUTOPILOT_VERSION" if self._version is None:
                 can, number = message.capabilities, message.flight_sw_version
@@ -140,7 +128,6 @@ class Setup:
     # What is asked
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Questions that are due now."""
         if self.is_done or self.failure:
             return []
         if self._version is not None and not self._tries:
@@ -174,7 +161,7 @@ class Setup:
         ]
 
     def _question(self, name: str) -> Message:
-        """Message that asks for a parameter, or sets it; the answer is its value in both cases."""
+        """Message that reads a parameter, or sets it; the answer is its value in both cases."""
         if name not in self._setting:
             return dialect.MAVLink_param_request_read_message(*self._target, name.encode(), -1)
         kind, (_, wanted) = self._kinds[name], self._setting[name]
@@ -185,7 +172,7 @@ class Setup:
     # What follows
 
     def _judge(self) -> None:
-        """Report what has been read; then finish, set what is unsafe, or fail."""
+        """Report all parameters; then finish, set the unsafe ones, or fail."""
         judged = {rule: safety.judged(rule, self._values) for rule in self._rules}
         parameters = tuple(judged.values())
         unsafe = {rule: parameter for rule, parameter in judged.items() if parameter.wanted}

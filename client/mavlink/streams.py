@@ -11,7 +11,7 @@ SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
 SHARE = 0.7
 """Share of the requested rate at which a stream counts as present."""
 WINDOW_NS = 2 * SECOND_NS
-"""Window in which messages are counted [ns], longer if LEAST messages need more time."""
+"""Window in which messages are counted, longer if LEAST messages need more time."""
 LEAST = 3.0
 BACK_OFF_MAX = 8
 """Longest window, as a multiple of the shortest: some streams are silent for long."""
@@ -27,12 +27,7 @@ RATES = {
 
 
 def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
-    """Requested rate of each message [Hz], by its number.
-
-    Args:
-        flavour: which autopilot.
-        positions_hz: rate of positions [Hz].
-    """
+    """Requested rate of each message [Hz], by its number; `positions_hz` is that of positions."""
     estimate = (
         dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
         if flavour is ARDUPILOT
@@ -43,22 +38,14 @@ def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
 
 
 class _Stream:
-    """Stream of one type of message.
-
-    Args:
-        rate: requested rate [Hz].
-    """
-
     def __init__(self, rate: float) -> None:
         self.rate = rate
         self.count = 0
-        """Number of messages in this window."""
         self.least_ns = max(WINDOW_NS, round(LEAST / rate * SECOND_NS))
-        """Shortest window [ns]."""
         self.window_ns = 0
         """Length of this window [ns]; 0 before the first."""
         self.until_ns = 0
-        """End of this window, when the stream is requested again unless enough arrived."""
+        """End of this window, when the stream is requested again unless enough messages arrived."""
 
 
 class Streams:
@@ -72,11 +59,9 @@ class Streams:
     def __init__(self, rates: Mapping[int, float], target: tuple[int, int]) -> None:
         self._target = target
         self.newest = ""
-        """Name of the message requested last."""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
 
     def hear(self, number: int) -> None:
-        """Count a message."""
         if number in self._streams:
             self._streams[number].count += 1
 

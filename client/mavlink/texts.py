@@ -7,33 +7,25 @@ from skytether.shared.core.aboard import AutopilotText, TextsOmitted
 from skytether.shared.core.endpoint import Events
 
 SAME_TEXT_NS = 30 * SECOND_NS
-"""Time for which a text is not logged again [ns]."""
+"""Time for which a text is not logged again."""
 TEXTS_KEPT = 16
 """Number of texts remembered, and largest number logged at once."""
 TEXT_NS = 2 * SECOND_NS
-"""Time after which one more may be logged [ns]."""
+"""Time after which one more may be logged."""
 
 
 class LoggedTexts:
-    """Log of one autopilot's texts.
-
-    Args:
-        vehicle: number of the vehicle, for events.
-        events: list to which events are appended.
-    """
-
     def __init__(self, vehicle: int, events: Events) -> None:
         self._vehicle, self._events = vehicle, events
         self._texts = Texts()
         self._logged_ns: dict[str, int] = {}
-        """Times at which texts were logged."""
         self._left, self._left_ns = TEXTS_KEPT, 0
         """Number of texts that may be logged now, and time of its last change."""
         self._omitted = 0
-        """Number of texts left out since that was last reported."""
+        """Number of texts left out since the last report of such texts."""
 
     def hear(self, message: Message, *, now_ns: int) -> str:
-        """Log the text that a STATUSTEXT completes; returns it, empty if it completes none."""
+        """Log the text that a STATUSTEXT completes; return the text, empty if none is complete."""
         text = _printable(self._texts.take(message) or "")
         if not text or self._is_known(text, now_ns):
             return text
@@ -47,7 +39,7 @@ class LoggedTexts:
         return text
 
     def _is_known(self, text: str, now_ns: int) -> bool:
-        """Whether a text came before within SAME_TEXT_NS; it is remembered."""
+        """Whether the text was logged within the last SAME_TEXT_NS; stores it."""
         logged_ns = self._logged_ns.pop(text, None)
         if logged_ns is not None and now_ns - logged_ns < SAME_TEXT_NS:
             self._logged_ns[text] = logged_ns

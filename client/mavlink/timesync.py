@@ -1,4 +1,6 @@
-"""Questions for the autopilot's clock, and reports of a clock that restarts or is not answered."""
+"""TIMESYNC requests for the autopilot's clock, and reports of a clock that
+restarts or is silent.
+"""
 
 from skytether.client.mavlink.clock import BootClock
 from skytether.mavlink.codec import Message
@@ -8,33 +10,24 @@ from skytether.shared.core.aboard import ClockSilent
 from skytether.shared.core.endpoint import Events
 
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
-"""Interval between questions [ns]: before the clock is known, and after."""
+"""Interval between questions before the clock is known, and after."""
 SILENT_NS = 10 * SECOND_NS
-"""Time without an answer after which that is reported [ns]."""
+"""Time without an answer after which the missing answers are reported."""
 
 
 class Timesync:
-    """Asks one autopilot for its clock.
-
-    Args:
-        clock: clock that is set by the answers.
-        vehicle: number of the vehicle, for events.
-        events: list to which events are appended.
-    """
+    """Asks one autopilot for its clock, which the answers set."""
 
     def __init__(self, clock: BootClock, vehicle: int, events: Events) -> None:
         self._clock, self._vehicle, self._events = clock, vehicle, events
         self._next_ns = 0
-        """Time of the next question."""
         self._jumps = 0
-        """Number of the clock's restarts that `hear` has told."""
+        """Number of the clock's restarts already reported by `hear`."""
         self._reported_silent = False
         self.untimely = 0
-        """Number of answers that were not used."""
 
     @property
     def fault(self) -> str:
-        """What is missing until the clock is known, in words."""
         if fault := self._clock.rate_fault:
             return f"a clock of its autopilot that can be followed: its speed is {fault}"
         return "an answer of its autopilot to TIMESYNC"
@@ -49,8 +42,8 @@ class Timesync:
         return True
 
     def ask(self, *, is_heard: bool, now_ns: int) -> list[Message]:
-        """Question, if it is due; that an autopilot which is heard does not answer is reported
-        once.
+        """Question, if it is due. An autopilot that sends messages but no
+        answers is reported once.
         """
         clock, was_reported = self._clock, self._reported_silent
         silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0

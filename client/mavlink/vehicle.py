@@ -17,18 +17,13 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 PLANE_ALTITUDE_M = 3.0
-"""Altitude of a vehicle that is flown in the plane [m]."""
+"""Altitude of a vehicle that is flown in the plane."""
 ORIGIN = keys_of(InFlight.ORIGIN)
 ALTITUDE_MIN_M = 0.5
-"""Least altitude of take-off [m]."""
 
 
 class MavlinkVehicle(Vehicle):
     """A vehicle flown by an autopilot.
-
-    Args:
-        scenario: scenario of the flight.
-        number: number of the vehicle.
 
     Raises:
         ConfigError: the address of the autopilot is invalid, or the flight begins on the ground.
@@ -45,95 +40,79 @@ class MavlinkVehicle(Vehicle):
 
     @property
     def failure(self) -> AboardFailure | None:  # type: ignore[override] # it comes of itself
-        """See `Vehicle`."""
         return self._autopilot.failure
 
     def set_parameters(self) -> bool:
-        """See `Vehicle`."""
         self._autopilot.sets_parameters = True
         return True
 
     def fly(self, velocity: Array) -> None:
-        """See `Vehicle`; in the plane it keeps its altitude."""
+        """In the plane the vehicle keeps its altitude."""
         x, y, *up = velocity.tolist()
         self._port.fly((x, y, up[0] if up else 0.0))
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """See `Vehicle`."""
         return self._autopilot.positions.take(now_ns=now_ns)
 
     @property
     def is_ready(self) -> bool:
-        """See `Vehicle`."""
         return self._autopilot.is_ready
 
     @property
     def waits_for(self) -> str:
-        """See `Vehicle`."""
         return self._autopilot.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """See `Vehicle`; a vehicle on the ground is armed only if its scenario is."""
+        """A vehicle on the ground is armed only if its scenario is."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
 
     def is_up(self, *, now_ns: int) -> bool:
-        """See `Vehicle`."""
         return self._port.take_off(may_arm=False, now_ns=now_ns)
 
     @property
     def took_off(self) -> bool:
-        """See `Vehicle`."""
         return self._autopilot.took_off
 
     @property
     def frame(self) -> VehicleMemory:
-        """See `Vehicle`."""
         return self._autopilot.frame
 
     def recall(self, frame: VehicleMemory) -> None:
-        """See `Vehicle`."""
         self._autopilot.recall(frame)
 
     def arm(self) -> None:
-        """See `Vehicle`."""
         self._autopilot.arm()
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """See `Vehicle`."""
         return self._port.hindrance(now_ns=now_ns)
 
     @property
     def leap_m(self) -> tuple[float, ...] | None:  # type: ignore[override] # it comes of itself
-        """See `Vehicle`."""
         return self._autopilot.positions.leap_m
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """See `Vehicle`."""
         self._autopilot.positions.decide(keeps_frame=keeps_frame)
 
     def land(self) -> bool:
-        """See `Vehicle`; by the autopilot's landing mode."""
         self._port.land()
         return True
 
     def return_home(self) -> None:
-        """See `Vehicle`; by the autopilot's return mode."""
         self._port.return_home()
 
     @property
     def is_down(self) -> bool:
-        """See `Vehicle`."""
         return self._port.is_down
 
     def change(self, scenario: Scenario) -> None:
-        """See `Vehicle`; arming the scenario lets the vehicle take off."""
+        """Arming the scenario lets the vehicle take off."""
         self._may_arm = scenario.armed
         origin, positions = given_origin(scenario), self._autopilot.positions
         if origin is not None and not positions.has_origin:
             positions.place(origin)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Vehicle`; a known origin stays, since changing it would move the fence in flight."""
+        """A known origin cannot be changed, since that would move the fence in flight."""
         if keys & ORIGIN and self._autopilot.positions.has_origin:
             x, y, z = self._autopilot.positions.origin
             known = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"

@@ -8,27 +8,23 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 BLOCK = 256
-"""Number of steps in a block."""
 
 
 class Normals:
     """Normal random numbers of a stream, step by step.
 
     Args:
-        rng: stream that they are drawn from; nothing else may draw from it before `give_back`.
+        rng: stream to draw from; nothing else may draw from it before `give_back`.
         shape: shape of the numbers of a step.
     """
 
     def __init__(self, rng: np.random.Generator, shape: tuple[int, ...]) -> None:
         self._rng, self._shape = rng, shape
         self._before = rng.bit_generator.state
-        """State of the stream before the block was drawn."""
         self._block = np.empty((0, *shape))
         self._used = 0
-        """Number of steps of the block that have been used."""
 
     def next(self) -> Array:
-        """Numbers of the next step."""
         if self._used == len(self._block):
             self._before = self._rng.bit_generator.state
             self._block = self._rng.standard_normal((BLOCK, *self._shape))

@@ -22,7 +22,7 @@ def moved(x: Table, model: Table, inputs: Numbers) -> None:
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         model: rows of `Axis`.
-        inputs: what acts as input on each axis [m/s].
+        inputs: input that acts on each axis [m/s].
     """
     for i in range(len(x)):
         axis = Axis(model[i, 0], model[i, 1], model[i, 2], model[i, 3])
@@ -31,9 +31,6 @@ def moved(x: Table, model: Table, inputs: Numbers) -> None:
 
 class FirstOrderPlant:
     """First-order vehicle with the true time constants, gain and dead time of a scenario.
-
-    Args:
-        weather: wind and gusts.
 
     Source: eq. (1).
     """
@@ -48,18 +45,16 @@ class FirstOrderPlant:
         ]
         self._late = np.array([each.late for each in late])
         self._inputs = PendingInputs(model.axes(), late) if any(late_s) else None
-        """Inputs that are not acting yet; None without a dead time."""
+        """Inputs that do not act yet; None without a dead time."""
         self.weather = weather
         self.x = np.zeros((len(tau), 2))
         """Present position [m] and velocity [m/s], in the world frame; shape (axes, 2)."""
         self.x[:, 0] = scenario.start_m(number)
 
     def state(self) -> Array:
-        """Present position [m] and velocity [m/s], in the world frame; shape (axes, 2)."""
         return self.x.copy()
 
     def advance(self, command: Array) -> None:
-        """Fly one step with this desired velocity [m/s]; shape (axes,)."""
         push = self.weather.push()
         due, swing = command, None
         if self._inputs is not None:
@@ -70,5 +65,4 @@ class FirstOrderPlant:
         self.weather.shove(self.x)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Change the winds from the next step on."""
         self.weather.change(vehicle)

@@ -1,6 +1,6 @@
 """Simulated quadrotor: rigid body, rotors, control loops and air, see `quadrotor`.
 
-In the plane it keeps its altitude by itself.
+With two axes it holds its altitude by itself.
 """
 
 import numpy as np
@@ -12,18 +12,13 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 GAINS = {"crazyflie": CRAZYFLIE, "1.5kg": ARDUPILOT, "sih": PX4}
-"""Gains of the autopilot for each frame."""
+"""Gains of the autopilot, by frame (`vehicle.frame`)."""
 ALTITUDE_M = 5.0
 """Altitude of a flight in the plane [m]."""
 
 
 class QuadrotorPlant:
-    """Quadrotor of a scenario, hovering at the start.
-
-    Args:
-        rng: random stream of its gusts.
-        number: number of the vehicle.
-    """
+    """Quadrotor of a scenario, hovering at the start; `rng` draws its gusts."""
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator, number: int) -> None:
         vehicle, self._dt_ns = scenario.vehicle, scenario.dt_ns
@@ -38,16 +33,13 @@ class QuadrotorPlant:
         self.change(vehicle)
 
     def state(self) -> Array:
-        """Present position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
         quadrotor = self._quadrotor
         return np.stack((quadrotor.position(), quadrotor.velocity()), -1)[: self._axes]
 
     def advance(self, command: Array) -> None:
-        """Fly one step with this desired velocity [m/s]; shape (axes,)."""
         if self._axes == 2:
             command = np.append(command, ALTITUDE_M - self._quadrotor.position()[2])
         self._quadrotor.advance(command, self._dt_ns)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Change the winds from the next step on."""
         self._quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)

@@ -38,11 +38,7 @@ def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, measured: Ta
 
 
 class Sensor:
-    """Sensor of a scenario's vehicle.
-
-    Args:
-        rng: random stream of its noise.
-    """
+    """Sensor of a scenario's vehicle; `rng` draws its noise."""
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         sensor, self._dt_ns = scenario.sensor, scenario.dt_ns
@@ -62,7 +58,6 @@ class Sensor:
         self._drawn = np.zeros_like(self._bias)
         """Numbers n if only one has noise; shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)
-        """Measurements that are not available yet, oldest first; each of shape (axes, 2)."""
         self._step = 0
 
     def measure(self, state: Array, *, began_ns: int = 0) -> Measurement:
@@ -70,7 +65,7 @@ class Sensor:
 
         Args:
             state: true position [m] and velocity [m/s] at the step, of each axis; shape (axes, 2).
-            began_ns: begin of step 0 [ns; the client's clock].
+            began_ns: start of step 0 [ns; the client's clock].
         """
         step, self._step = self._step, self._step + 1
         stamp_ns = began_ns + max(0, step - self.delay) * self._dt_ns

@@ -16,12 +16,9 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 WIND = keys_of(InFlight.WIND)
-"""Keys of wind and gusts."""
 
 
 class Plant(Protocol):
-    """Simulated vehicle, advanced step by step."""
-
     def state(self) -> Array:
         """Present position [m] and velocity [m/s] of each axis; shape (axes, 2)."""
 
@@ -33,13 +30,7 @@ class Plant(Protocol):
 
 
 class SimulatedVehicle(Vehicle):
-    """Plant that is measured at the start of each step.
-
-    Args:
-        dt_ns: length of a step [ns].
-        plant: the plant, in its present state.
-        sensor: its sensor.
-    """
+    """Simulated vehicle: a plant, measured at the start of each step."""
 
     changeable = WIND
 
@@ -48,21 +39,20 @@ class SimulatedVehicle(Vehicle):
         self.plant, self.sensor = plant, sensor
         self._began_ns = 0
         self._step = -1
-        """Step at whose start the plant's state is; -1 before the flight."""
+        """Step at whose start the plant's state is valid; -1 before the flight."""
         self._velocity = np.zeros(len(plant.state()))
 
     def fly(self, velocity: Array) -> None:
-        """See `Vehicle`; flown from the start of the step on."""
         self._velocity = velocity
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """See `Vehicle`; first flies all steps that have begun by now."""
+        """Measurements that became available; first advances the plant to the present step."""
         available: list[Measurement] = []
         if self._step < 0:
             self._began_ns, self._step = now_ns, 0
             self._measure(available)
-        # The plant's state is that of the start of a step, and is advanced when needed: it has no
-        # clock of its own.
+        # The plant's state is that of the start of a step. The plant has no clock and is advanced
+        # on demand.
         while self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             self.plant.advance(self._velocity)
             self._step += 1
@@ -70,23 +60,21 @@ class SimulatedVehicle(Vehicle):
         return available
 
     def _measure(self, available: list[Measurement]) -> None:
-        """Append the measurement that is available at the step, if there is one."""
         measured = self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
         if measured.position or measured.velocity:
             available.append(measured)
 
     def truth(self) -> Array:
-        """See `Vehicle`."""
         return self.plant.state()
 
     def change(self, scenario: Scenario) -> None:
-        """See `Vehicle`."""
         self.plant.change(scenario.vehicle)
 
 
 def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
-    """Quadrotor of a scenario, with random gusts and noise of its own."""
-    from skytether.client.simulated.quadrotor import QuadrotorPlant  # numba takes a second
+    from skytether.client.simulated.quadrotor import (
+        QuadrotorPlant,
+    )  # importing numba takes a second
 
     plant = QuadrotorPlant(scenario, stream(scenario.seed, "turbulence", number), number)
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
@@ -94,7 +82,6 @@ def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
 
 
 def simulated(scenario: Scenario, number: int) -> SimulatedVehicle:
-    """First-order vehicle of a scenario, with random winds and noise of its own."""
     weather = Weather(scenario, stream(scenario.seed, "wind", number))
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
     return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather, number), sensor)

@@ -32,11 +32,7 @@ def shoved(x: Table, white: Table, drawn: Table) -> None:
 
 
 class Weather:
-    """Weather of a scenario.
-
-    Args:
-        rng: random stream of wind and gusts of one vehicle.
-    """
+    """Weather of a scenario; `rng` draws wind and gusts of one vehicle."""
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -48,7 +44,6 @@ class Weather:
         self.change(scenario.vehicle)
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Change the winds from the next step on."""
         self._normals.give_back()
         L = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self._white = np.stack((L[:, 0, 0], L[:, 1, 0], L[:, 1, 1]), -1) if vehicle.wind else None
@@ -60,7 +55,6 @@ class Weather:
         if self._gust_mps2 == 0.0:
             self._gust = None
         self._push = self._pushed()
-        """Push of steady wind and gust now."""
 
     def push(self) -> Array:
         """Push w + τ a over the next step, which acts like an input [m/s]; shape (axes,)."""
@@ -69,10 +63,9 @@ class Weather:
         return self._push
 
     def shove(self, x: Array) -> None:
-        """Add the effect of white acceleration over that step to a state, in place.
+        """Add the effect of white acceleration over that step to `x`, in place.
 
-        Args:
-            x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
+        `x` has position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
         if self._white is None:
             return
@@ -82,7 +75,6 @@ class Weather:
         shoved(x, self._white, drawn)
 
     def _gusts(self) -> None:
-        """Start and end gusts at random, each in one constant direction."""
         # Drawn at every step, so that the times of gusts do not depend on their strength.
         chance = self._rng.random()
         if self._gust is not None:

@@ -1,6 +1,6 @@
-"""Functions that run aboard as plain Python, and compiled in virtual time.
+"""Functions that are interpreted as plain Python aboard, and compiled in virtual time.
 
-A vehicle takes a step every few milliseconds and needs no compiler; a laboratory flies thousands of
+A vehicle takes a step every few milliseconds and needs no compiler; simulations fly thousands of
 vehicles in one process. Both call the same functions: `shared.base.kernel.compile_all` replaces
 those marked here by machine code, with results equal to the last bit.
 """
@@ -25,8 +25,8 @@ COMPILABLE: list[Any] = []
 def compilable(function: F) -> F:
     """Mark a function that `compile_all` may replace by machine code.
 
-    Its parameters are ints, floats, bools, `Numbers` and `Table`, all positional and contiguous; it
-    makes no arrays, and writes its results into those that it is given.
+    Its parameters are ints, floats, bools, `Numbers` and `Table`, all positional and contiguous;
+    the function creates no arrays, and writes its results into arrays passed to it.
     """
     call: Any = partial(function)
     COMPILABLE.append(call)

@@ -1,4 +1,4 @@
-"""Optional extras: the packages that each extra of pyproject.toml adds."""
+"""Optional extras of pyproject.toml: which extra provides a missing module."""
 
 import re
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from importlib import util
 
 MODULES = {"pillow": "PIL"}
-"""Modules of packages whose import name differs."""
+"""Import names of packages, where they differ."""
 
 
 class ExtraMissing(ModuleNotFoundError):
@@ -37,11 +37,7 @@ def named() -> Iterator[None]:
 
 
 def need(extra: str) -> None:
-    """Check that an extra is installed.
-
-    Raises:
-        ExtraMissing: it is not, or not completely.
-    """
+    """Check that an extra is installed completely; raises ExtraMissing otherwise."""
     for module in _extras()[extra]:
         if util.find_spec(module) is None:
             raise ExtraMissing(module, extra)
@@ -49,7 +45,7 @@ def need(extra: str) -> None:
 
 def _extras() -> dict[str, list[str]]:
     """Modules of each extra, named like their packages, except for MODULES."""
-    from importlib import metadata  # a tenth of what flies; wanted where something is missing
+    from importlib import metadata  # importing it takes a tenth of the client's start-up time
 
     extras: dict[str, list[str]] = {}
     for requirement in metadata.requires("skytether") or ():

@@ -4,11 +4,11 @@ Everything that a command writes is a plain file: a device, a pipe or a link in 
 refused. Otherwise `--out /dev/sda`, or a link left there by somebody else, would write elsewhere.
 
 - New content is written beside the old file and takes its name once it is complete (`replacing`): a
-  full disk or a killed process leaves the old file as it was.
+full disk or a killed process leaves the old file as it was.
 - A file that grows during a flight (`Growing`) has its own name from the start, unless an older
-  file has it.
+file has it.
 - No command writes a file that it reads, and no two commands write the same file (`apart`,
-  `claim`).
+`claim`).
 
 Nothing else in this package opens a file for writing; tests/whole/test_writes.py checks it.
 """
@@ -40,19 +40,16 @@ Inode = tuple[int, int]
 
 @dataclass(slots=True)
 class _Command:
-    """Files of one command."""
-
     inputs: set[Inode] = field(default_factory=set)
-    """Files that it has read."""
     outputs: set[Inode] = field(default_factory=set)
-    """Files and folders that it will write, each locked."""
+    """Files and folders that the command will write, each locked."""
     ending: ExitStack = field(default_factory=ExitStack)
     """Releases locks, and removes new files to which nothing was written."""
 
 
 _commands: list[_Command] = []
-"""Running command, after those that called it; empty outside `apart`, when files are only read and
-written."""
+"""Stack of running commands, the newest last, since a command may call another; empty outside
+`apart`."""
 
 
 @contextmanager
@@ -70,10 +67,10 @@ def apart() -> Iterator[None]:
 
 
 def note(path: Path, file: BinaryIO) -> None:
-    """Note that the command reads an open file, which it may then not write.
+    """Note that the command reads an open file, and so must not write it.
 
     Raises:
-        OSError: the command will write it.
+        OSError: the command has claimed the file for writing.
     """
     inode = _inode(os.fstat(file.fileno()))
     for each in _commands:
@@ -88,12 +85,11 @@ def claim(path: Path, *, is_input: bool = False) -> None:
     A new file that is still empty at the end is removed.
 
     Args:
-        path: the file.
         is_input: whether the command reads the file as well; then it is not created.
 
     Raises:
-        OSError: it cannot be written, the command reads it, another option names it, or another
-            command has locked it.
+        OSError: the file cannot be written, the command reads it, another option names it, or
+            another command has locked it.
     """
     made = check(path, is_input=is_input) is None
     if made and is_input:
@@ -115,7 +111,7 @@ def claim_folder(path: Path) -> None:
     """Lock a folder for writing files until the command ends; a missing one is created.
 
     Raises:
-        OSError: it cannot be created, or another command has locked it.
+        OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -170,16 +166,14 @@ def _inode(status: os.stat_result) -> Inode:
 
 
 def read(path: Path, most: int, *, private: bool = False) -> bytes:
-    """Content of a file.
+    """Content of a file of at most `most` bytes.
 
     Args:
-        path: the file.
-        most: largest size of the file [B].
         private: whether only its owner may be able to read, write or replace it.
 
     Raises:
-        OSError: it cannot be read, is too large, is a pipe or device (which might never end), is
-            not private as required, or will be written by the command.
+        OSError: the file cannot be read, is too large, is a pipe or device (which might never
+            end), is not private as required, or will be written by the command.
         ValueError: the name is invalid.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
@@ -202,10 +196,8 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
 
 
 def check_private(path: Path) -> None:
-    """Refuse a private file if others can put another file in its place.
-
-    That is the case for a link, in a folder that anybody may write to, and in a folder that anybody
-    may replace.
+    """Refuse a private file if others can put another file in its place: if it is a link, or in a
+    folder that anybody may write to or replace.
 
     Raises:
         OSError: says what was found and what was expected.
@@ -229,14 +221,13 @@ def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
     """Refuse a path at which no plain file can be written.
 
     Args:
-        path: the path.
         is_input: whether the file may be one that the command reads.
 
     Returns:
         status of the present file; None if there is none.
 
     Raises:
-        OSError: says what is there.
+        OSError: the message names the kind of object at that path.
     """
     try:
         status = path.lstat()
@@ -253,7 +244,6 @@ def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file completely, or not at all; see `replacing`."""
     with replacing(path) as file:
         file.write(content)
 
@@ -270,7 +260,7 @@ def replacing(
     """File for new content, which takes its name at the end of the block; after an error nothing
     has changed.
 
-    It has no name until then if the file system supports that, so that a killed process leaves
+    If the file system supports it, the file has no name until then, so that a killed process leaves
     nothing. It has the permissions of the file that it replaces.
 
     Args:
@@ -317,7 +307,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file for reading and appending, locked until it is closed.
 
     Raises:
-        OSError: it cannot be written, is no plain file, or another command has locked it.
+        OSError: the file cannot be written, is no plain file, or another command has locked it.
     """
     check(path)
     file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE), "r+b")
@@ -330,11 +320,10 @@ def appending(path: Path) -> BinaryIO:
 class Growing:
     """File that grows during a flight, and may be read meanwhile.
 
-    It has its own name from the start. If an older file has that name, it is written beside that
-    file, as NAME.part1.SUFFIX, until it is complete: see `end`.
+    It has its own name from the start. If an older file has that name, the new one is written
+    beside it as NAME.part1.SUFFIX until it is complete, see `end`.
 
     Args:
-        path: file to write.
         buffering: as in `open`; 0 for none.
 
     Raises:
@@ -345,13 +334,11 @@ class Growing:
         self._path = path
         status = check(path)
         self.at = path
-        """Present path of the file."""
         if status and status.st_size:
             self.at, descriptor = _unused(path, _new)
         else:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE)
         self.file: BinaryIO = os.fdopen(descriptor, "r+b", buffering=buffering)
-        """Open file, for writing and reading."""
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size:
             self.file.close()
@@ -379,20 +366,11 @@ class Growing:
 
 
 def _new(path: Path, mode: int = MODE) -> int:
-    """Descriptor of a new file.
-
-    Raises:
-        OSError: it exists, or cannot be created.
-    """
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, mode)
 
 
 def _link(descriptor: int, path: Path) -> None:
-    """Give an open file a name.
-
-    Raises:
-        OSError: the name is in use.
-    """
+    """Give an open file a name; raises OSError if the name is in use."""
     # link(2) would not follow the link in /proc; with `src_dir_fd` Python calls linkat(2).
     own = f"/proc/self/fd/{descriptor}"
     os.link(own, path, src_dir_fd=descriptor, follow_symlinks=True)

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 
 def hint(given: str, known: Iterable[str]) -> str:
-    """Ask for the most similar known name; if none is similar, list them all."""
-    import difflib  # for mistakes alone
+    """Question for the most similar known name; if none is similar, a list of all."""
+    import difflib  # imported only after a user's mistake
 
     close = difflib.get_close_matches(given, known, n=1)
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"

@@ -2,16 +2,16 @@
 
 A kernel's signature is taken from its annotations, so that mypy and numba check the same types: an
 array is annotated with one of the types below, an array of records with one made from its dtype,
-and arrays that belong together with their NamedTuple. A record is described by a class with a line
-per field, which is never instantiated but is its type for mypy. A part is a function that only
-kernels call, and is compiled into each of them.
+and arrays that belong together with their NamedTuple. A record is described by a class with one
+annotated field per line, which is never instantiated but is the record's type for mypy. A part is a
+function that only kernels call, and is compiled into each of them.
 
-What must not wait in flight compiles them earlier: `missing` lists the kernels without machine
-code, `load` prepares all of them. Importing compiles nothing.
+What must not wait in flight compiles its kernels earlier: `missing` lists the kernels without
+machine code, `load` prepares all of them. Importing compiles nothing.
 
 Machine code is stored on disk, beside the sources or in NUMBA_CACHE_DIR. Numba itself only checks
-whether the kernel's own file has changed; here every function and constant that a kernel uses
-counts, in any module, so that no outdated machine code is used.
+whether the kernel's own file has changed; here every function and constant that a kernel uses is
+checked, in any module, so that no outdated machine code is used.
 """
 
 import hashlib
@@ -56,11 +56,9 @@ SCALARS = {int: numba.int64, float: numba.float64, bool: numba.boolean}
 
 
 CODES = {int: "i8", float: "f8", bool: "?"}
-"""Numpy's type codes of record fields by annotation."""
 
 
 def record(kind: type) -> np.dtype[np.void]:
-    """Numpy dtype of a record, one field per annotation of the class."""
     fields = [(name, CODES[hint]) for name, hint in get_type_hints(kind).items()]
     return np.dtype(fields, align=True)
 
@@ -73,14 +71,13 @@ def records(dtype: np.dtype[np.void], ndim: int) -> Any:
 def kernel(function: F) -> F:
     """Function that is compiled on its first call, for the types of its annotations.
 
-    It cannot make arrays: numba counts no references in it. Counting them is an atomic instruction
-    per array and slice, and took half of the time of a plan.
+    It cannot create arrays, since it is compiled without reference counts: they are an atomic
+    instruction per array and slice, and took half of the time of a plan.
     """
     return _at_first_call(numba.njit(error_model="numpy", _nrt=False)(function))
 
 
 def making_kernel(function: F) -> F:
-    """Kernel that makes arrays of its own."""
     return _at_first_call(numba.njit(error_model="numpy")(function))
 
 
@@ -122,25 +119,20 @@ def check_types() -> None:
 
 
 KERNELS: list[Any] = []
-"""Kernels of all imported modules, compiled or not."""
 
 
 class Missing(NamedTuple):
     """Kernel without machine code in memory or on disk."""
 
     name: str
-    """Module and name of the kernel, for `compile_named`."""
     is_stored: bool
-    """Whether the machine code will be stored on disk."""
     compile: Callable[[], None]
-    """Function that compiles it, or loads what another process has compiled since."""
+    """Function that compiles it, or loads machine code compiled by another process since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:
-    """Kernels without machine code in memory or on disk, the slowest to compile first.
-
-    Args:
-        without: names of the modules whose kernels are not needed.
+    """Kernels without machine code in memory or on disk, the slowest to compile first; `without`
+    names modules to leave out.
     """
     uncompiled = [
         each
@@ -156,7 +148,6 @@ def missing(without: Collection[str] = ()) -> list[Missing]:
 
 
 def compile_named(name: str) -> None:
-    """Compile the kernel with this `Missing.name`."""
     import_module(name.partition(":")[0])
     (dispatcher,) = (each for each in KERNELS if _name(each) == name)
     _compile(dispatcher)
@@ -167,7 +158,7 @@ def _name(dispatcher: Any) -> str:
 
 
 def _extent(dispatcher: Any) -> int:
-    """Number of arguments, including the parts of tuples, with which the compile time grows."""
+    """Number of arguments, including the parts of tuples; the compile time grows with it."""
 
     def parts(kind: Any) -> int:
         return sum(map(parts, kind)) if isinstance(kind, numba.types.BaseTuple) else 1
@@ -176,10 +167,8 @@ def _extent(dispatcher: Any) -> int:
 
 
 def load(without: Collection[str] = ()) -> None:
-    """Load or compile every kernel, so that none has to be compiled in flight.
-
-    Args:
-        without: names of the modules whose kernels are not needed.
+    """Load or compile every kernel, so that none has to be compiled in flight; `without` names
+    modules to leave out.
     """
     for each in KERNELS:
         if each.__module__ not in without:
@@ -187,7 +176,6 @@ def load(without: Collection[str] = ()) -> None:
 
 
 def _is_stored(dispatcher: Any) -> bool:
-    """Whether the machine code of a kernel is on disk."""
     _store_on_disk(dispatcher)
     cache = dispatcher._cache
     if isinstance(cache, caching.NullCache):
@@ -198,7 +186,6 @@ def _is_stored(dispatcher: Any) -> bool:
 
 @global_compiler_lock  # type: ignore[untyped-decorator]
 def _compile(dispatcher: Any) -> None:
-    """Load the machine code of a kernel from disk, or compile it, once."""
     if dispatcher.overloads:
         return
     _store_on_disk(dispatcher)
@@ -216,7 +203,6 @@ def _compile(dispatcher: Any) -> None:
 
 
 def _store_on_disk(dispatcher: Any) -> None:
-    """Store machine code on disk, if a folder is writable."""
     if isinstance(dispatcher._cache, KernelCache):
         return
     with suppress(RuntimeError):  # no folder is writable
@@ -224,14 +210,12 @@ def _store_on_disk(dispatcher: Any) -> None:
 
 
 def _signature(dispatcher: Any) -> tuple[Any, ...]:
-    """Numba types of the annotated parameters."""
     hints = get_type_hints(dispatcher.py_func, include_extras=True)
     hints.pop("return", None)
     return tuple(map(_type, hints.values()))
 
 
 def _type(hint: Any) -> Any:
-    """Numba type of an annotation."""
     if hasattr(hint, "__metadata__"):
         kind = hint.__metadata__[0]
         # Code that flies aboard does not import numba: there a number of dimensions stands for the
@@ -244,13 +228,12 @@ def _type(hint: Any) -> Any:
 
 
 def part(function: F) -> F:
-    """Function called by kernels, for example once per vehicle or axis; it makes no arrays."""
+    """Function called by kernels, for example once per vehicle or axis; it creates no arrays."""
     compiled: F = numba.njit(error_model="numpy", _nrt=False)(function)
     return compiled
 
 
 def making_part(function: F) -> F:
-    """Part that makes arrays of its own."""
     compiled: F = numba.njit(error_model="numpy")(function)
     return compiled
 
@@ -263,13 +246,12 @@ class Disjoint(compiler.Compiler):  # type: ignore[misc]
     """
 
     def define_pipelines(self) -> Any:
-        """Numba's passes, with that guarantee."""
         self.state.flags.noalias = True
         return super().define_pipelines()
 
 
 def lanes(function: F) -> F:
-    """Part whose innermost loops run over vehicles, vectorised.
+    """Part whose innermost loops iterate over vehicles, and are vectorised.
 
     No two of its arrays may share memory, unless both are only read.
     """
@@ -293,7 +275,6 @@ def shared(function: F) -> F:
 
 
 _SHARED: set[Callable[..., Any]] = set()
-"""Functions that kernels may call unchanged."""
 
 
 def compile_all() -> None:
@@ -307,16 +288,14 @@ def compile_all() -> None:
 
 
 def interpret_all() -> None:
-    """Use plain Python again for the functions that `compile_all` has compiled."""
+    """Undo `compile_all`."""
     for call in COMPILABLE:
         if call.func in _PLAIN:
             call.__setstate__((_PLAIN[call.func], (), {}, {}))
 
 
 _MACHINE: dict[Callable[..., Any], Any] = {}
-"""Kernels by original function."""
 _PLAIN: dict[Any, Callable[..., Any]] = {}
-"""Original functions by kernel."""
 
 
 def plain(function: F) -> F:
@@ -329,16 +308,14 @@ class DependencyStamp:
     """Makes a numba cache locator depend on everything that a kernel uses."""
 
     def get_source_stamp(self) -> str:
-        """Stamp that must be unchanged for stored machine code to be used."""
         return self.stamp
 
     def get_disambiguator(self) -> str:
-        """Part of the file's name: a file with another stamp is not even opened."""
+        """A file with another stamp is not even opened, since the stamp is part of its name."""
         return self.stamp[:16]
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        """Locator for a kernel, or None if its folder is not writable."""
         locator = super().from_function(py_func, py_file)  # type: ignore[misc]
         if locator is not None:
             locator.stamp = stamp(py_func)
@@ -348,19 +325,21 @@ class DependencyStamp:
 
 
 class NamedFolder(DependencyStamp, caching.UserProvidedCacheLocator):  # type: ignore[misc]
-    """Folder named by NUMBA_CACHE_DIR."""
+    pass
 
 
 class SourceFolder(DependencyStamp, caching.InTreeCacheLocator):  # type: ignore[misc]
-    """Folder `__pycache__` beside the source."""
+    pass
 
 
 class UserFolder(DependencyStamp, caching.UserWideCacheLocator):  # type: ignore[misc]
-    """The user's cache folder."""
+    pass
 
 
 class CacheFolders(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    """Folders for machine code, in order of preference."""
+    """Folders for machine code, in order of preference: NUMBA_CACHE_DIR, `__pycache__` beside the
+    source, the user's cache folder.
+    """
 
     _locator_classes = (NamedFolder, SourceFolder, UserFolder)
 
@@ -368,15 +347,13 @@ class CacheFolders(caching.CompileResultCacheImpl):  # type: ignore[misc]
 class KernelCache(caching.FunctionCache):  # type: ignore[misc]
     """Machine code of a kernel on disk.
 
-    Before looking there, numba's own cache imports everything its compiler knows of Python and
-    numpy: 0.3 s and 36 MB. Stored machine code does not need it; to compile, the compiler imports
-    it anyway.
+    Before reading it, numba's own cache imports all compiler support for Python and numpy: 0.3 s
+    and 36 MB. Stored machine code does not need these modules; compiling imports them anyway.
     """
 
     _impl_class = CacheFolders
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Machine code for a signature, or None."""
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
 
@@ -423,7 +400,6 @@ def _source(function: Callable[..., Any]) -> str:
 
 
 def _type_name(hint: Any) -> str:
-    """Text that identifies a type, wherever it is defined."""
     if not hasattr(hint, "_fields"):
         return repr(hint)
     fields = get_type_hints(hint, include_extras=True)

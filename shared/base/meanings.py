@@ -1,4 +1,4 @@
-"""Meanings of the fields of a class, as its source has them, for help and documents."""
+"""Docstrings of the fields of a class, read from its source, for help and documents."""
 
 import ast
 import inspect
@@ -7,7 +7,7 @@ from itertools import pairwise
 
 
 def meanings(of: type) -> dict[str, str]:
-    """Docstring of each field of a class, in one line."""
+    """Docstring of each field, in one line."""
     found: dict[str, str] = {}
     for each in reversed(of.__mro__):
         with suppress(TypeError, OSError):  # not a class of Python's own, or without its source

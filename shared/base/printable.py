@@ -2,10 +2,10 @@
 
 
 def printable(text: str) -> str:
-    r"""Text in which characters that are not visible are replaced by escapes such as `\x1b`.
+    r"""Text in which invisible characters are replaced by escapes such as `\x1b`.
 
-    A terminal obeys some of them: it clears the screen, moves the cursor, or reverses the direction
-    of text.
+    A terminal interprets some of them: they clear the screen, move the cursor, or reverse the
+    direction of text.
     """
     if text.isprintable():
         return text

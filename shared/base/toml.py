@@ -2,7 +2,7 @@
 
 The standard library's parser stores every prefix of a dotted key: its memory grows with the square
 of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So
-the text is first checked for these two, in one pass. Nothing else parses TOML in this package;
+the text is first checked for both, in one pass. Nothing else parses TOML in this package;
 tests/shared/test_toml.py checks it.
 """
 
@@ -13,9 +13,7 @@ from typing import Any
 BYTES_MAX = 1_000_000
 """Largest size of a text [characters]."""
 PARTS_MAX = 8
-"""Largest number of parts of a key."""
 DEPTH_MAX = 32
-"""Largest number of open brackets."""
 
 _OPAQUE = re.compile(
     r'"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}'
@@ -27,14 +25,14 @@ _OPAQUE = re.compile(
 )
 """Strings and comments, in which dots and brackets have no meaning."""
 _DIVIDERS = re.compile(r"[=,\[\]{}\n]")
-"""Characters that end a key."""
 
 
 def loads(text: str) -> dict[str, Any]:
     """Values of a TOML text.
 
     Raises:
-        ValueError: it is invalid, too long, nested too deeply, or has a key of too many parts.
+        ValueError: the text is invalid, too long, nested too deeply, or has a key of too many
+            parts.
     """
     if len(text) > BYTES_MAX:
         raise ValueError(f"got {len(text)} characters, expected at most {BYTES_MAX}")

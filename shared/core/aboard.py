@@ -4,22 +4,16 @@ import msgspec
 
 
 class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Base of the events of one vehicle."""
-
     vehicle: int
-    """Number of the vehicle."""
 
 
 class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameter of an autopilot and its meaning for the flight."""
-
     name: str
     value: float | None
     """Value; None if the autopilot does not have the parameter."""
     meaning: str
-    """Meaning of the value, in words."""
     wanted: str = ""
-    """Safe values, and the one to set; empty if the value is safe."""
+    """Safe values and the one to set, in words; empty if the value is safe."""
 
     def __str__(self) -> str:
         value = "missing" if self.value is None else f"{self.value:g}"
@@ -28,8 +22,6 @@ class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
-    """Base of the events about parameters of an autopilot."""
-
     parameters: tuple[AutopilotParameter, ...]
 
     def __str__(self) -> str:
@@ -37,12 +29,8 @@ class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
-    """The client has heard the vehicle's autopilot for the first time."""
-
     name: str
-    """Name and version."""
     system: int
-    """Number of its MAVLink system."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
@@ -56,7 +44,6 @@ class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
     """The client has set parameters of the autopilot, and read them back."""
 
     changes: tuple[tuple[str, float, float], ...]
-    """Name, old value and new value of each."""
 
     def __str__(self) -> str:
         lines = [
@@ -67,20 +54,15 @@ class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotRefused(VehicleEvent, frozen=True, kw_only=True):
-    """The autopilot has refused a command."""
-
     asked: str
-    """Command, in words."""
     answer: str
-    """Answer of the autopilot, the name of a MAV_RESULT."""
+    """Name of the MAV_RESULT."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: its autopilot refuses to {self.asked}: {self.answer}"
 
 
 class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
-    """The autopilot has sent a status text."""
-
     text: str
     severity: int
     """MAVLink severity, from 0 (emergency) to 7."""
@@ -90,20 +72,14 @@ class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
 
 
 class TextsOmitted(VehicleEvent, frozen=True, kw_only=True):
-    """The autopilot has sent more status texts than are logged."""
-
     count: int
-    """Number of texts that were not logged."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: {self.count} more texts of its autopilot are not logged"
 
 
 class AutopilotWaits(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on the ground cannot be flown yet."""
-
     waits_for: str
-    """What is missing, in words."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} waits for {self.waits_for}"
@@ -113,11 +89,8 @@ class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
     """Datagrams arrive from another address than that of a silent autopilot, and are dropped."""
 
     came_from: str
-    """HOST:PORT of the sender."""
     expected: str
-    """HOST:PORT of the autopilot."""
     content: str
-    """Content of the newest datagram, in words."""
 
     def __str__(self) -> str:
         silent = f"vehicle {self.vehicle}: nothing comes from its autopilot at {self.expected}"
@@ -125,20 +98,16 @@ class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
 
 
 class AutopilotMoved(VehicleEvent, frozen=True, kw_only=True):
-    """The autopilot of a vehicle on the ground is heard from another address after a silence."""
+    """The autopilot of a vehicle on the ground has restarted at another address."""
 
     before: str
-    """Old HOST:PORT."""
     after: str
-    """New HOST:PORT."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: its autopilot is at {self.after}, it was at {self.before}"
 
 
 class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
-    """Positions arrive from the autopilot, but none of them can be used."""
-
     why: str
 
     def __str__(self) -> str:
@@ -146,21 +115,18 @@ class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ClockSilent(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's autopilot is heard, and does not answer questions for its clock any more."""
+    """A vehicle's autopilot sends messages, but no longer answers TIMESYNC."""
 
     silent_s: float
-    """Time since its newest answer [s]."""
 
     def __str__(self) -> str:
         return (
             f"vehicle {self.vehicle}: its autopilot has not answered TIMESYNC for "
-            f"{self.silent_s:.0f} s: its clock is followed as it ran until then"
+            f"{self.silent_s:.0f} s: its time is extrapolated from earlier answers"
         )
 
 
 class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
-    """The autopilot has changed its mode, or was armed or disarmed."""
-
     mode: str
     armed: bool
 
@@ -170,14 +136,10 @@ class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
 
 
 class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
-    """Somebody else commands the autopilot."""
-
     system: int
-    """Number of the sender's MAVLink system."""
     component: int
-    """Number of its component."""
     said: str
-    """Type of its newest message."""
+    """Type of the newest message of that sender."""
 
     def __str__(self) -> str:
         who = f"system {self.system}, component {self.component}"
@@ -188,24 +150,23 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle deviates from its commands by more than wind and model errors explain."""
 
     off_mps: float
-    """Distance of its velocity from the possible ones [m/s]."""
+    """Distance of the velocity from the range that the commands explain [m/s]."""
 
     def __str__(self) -> str:
-        off = f"flies {self.off_mps:.1f} m/s otherwise than it is told"
+        off = f"deviates by {self.off_mps:.1f} m/s from its commands"
         return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
 
 
 class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
-    """A vehicle is not armed because its autopilot would react unsafely to silence, by parameters
-    that are unsafe or could not be set.
+    """A vehicle is not armed because its autopilot would react unsafely to silence: parameters are
+    unsafe or could not be set.
     """
 
     sets: bool = False
-    """Whether they were to be set."""
+    """Whether the client was allowed to set them."""
 
     @property
     def brief(self) -> str:
-        """Names of the parameters in one line, and what to do."""
         unknown = ", ".join(each.name for each in self.parameters if each.value is None)
         unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
         does = "could not set" if self.sets else "sets"
@@ -216,10 +177,7 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle is not flown because its take-off has failed."""
-
     doing: str
-    """Stage of the take-off that was not reached."""
     why: str
 
     def __str__(self) -> str:
@@ -227,8 +185,6 @@ class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on the ground is not armed until an operator allows it."""
-
     why: str
 
     def __str__(self) -> str:
@@ -244,7 +200,7 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         at = ", ".join(f"{each:.2f}" for each in self.place)
-        said = "say where its origin lies there: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        said = "set its origin in that frame: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
         return (
             f"vehicle {self.vehicle} hovers at [{at}] of its autopilot's local frame "
             f"(north, east, up), and its origin is not known; {said}"
@@ -252,7 +208,6 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
 
 
 AboardFailure = ParametersUnsafe | NotTakenOff
-"""Events that make a vehicle unusable."""
 AboardEvent = (
     AutopilotFound
     | ParametersRead

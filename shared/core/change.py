@@ -3,9 +3,9 @@
     values by key → may these change? → checked like a scenario → `Endpoint.change` → `Changed`
 
 All values of a request take effect together, between two steps of the endpoint, or none does. A
-request is a JSON object, values by key; an empty one asks for the keys that may change. The answer
-is an `Answer`. `shell.control` has the socket for both, and `sim.flight` makes the same changes in
-virtual time.
+request is a JSON object, values by key; an empty object requests the list of keys that may change.
+The answer is an `Answer`. `shell.control` has the socket for both, and `sim.flight` makes the same
+changes in virtual time.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,6 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 
 REQUEST_BYTES_MAX = 4096
-"""Largest size of a request [B]."""
 ONCE = keys_of(InFlight.LEAP)
 """Keys of one-time decisions, which no later run of the process repeats."""
 KEY_SHOWN_MAX = 60
@@ -33,22 +32,18 @@ KEY_SHOWN_MAX = 60
 
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Answer to a request."""
-
     refused: str = ""
     """Why nothing was changed, in one line; empty if the request was carried out."""
     changed: tuple[Changed, ...] = ()
-    """Keys with new values."""
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
 
 
 class Running:
-    """Scenario being flown by an endpoint, which may be changed.
+    """The scenario that an endpoint flies, and its changes.
 
     Args:
-        endpoint: the endpoint.
-        scenario: scenario that the endpoint was made with.
+        scenario: scenario that the endpoint was created with.
         settings: values in it that were set in an earlier run.
     """
 
@@ -65,16 +60,14 @@ class Running:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with all changes so far."""
         return self._scenario
 
     @property
     def changeable(self) -> frozenset[str]:
-        """Keys that may change."""
         return self._endpoint.changeable
 
     def change(self, values: Mapping[str, Any], *, now_ns: int) -> tuple[Changed, ...]:
-        """Change the values of keys, and report it by events of the endpoint.
+        """Change the values of keys, and report the change by events of the endpoint.
 
         Args:
             values: plain values by key, as in a scenario's file.
@@ -84,7 +77,7 @@ class Running:
             Keys whose value has changed.
 
         Raises:
-            ConfigError: nothing was changed, which is reported by an event, too.
+            ConfigError: nothing was changed; an event reports the refusal, too.
         """
         before = reading.to_table(self._scenario)
         try:
@@ -112,11 +105,9 @@ class Running:
         return changed
 
     def tell(self, event: Event) -> None:
-        """Report an event through the endpoint."""
         self._endpoint.tell(event)
 
     def refuse(self, reason: str) -> None:
-        """Report through the endpoint that a change is refused."""
         self._endpoint.tell(ChangeRefused(reason=reason))
 
     def answer(self, request: bytes, *, now_ns: int) -> bytes:
@@ -146,7 +137,8 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of whole keys: arguments of a text become the text with them.
+        """Values of whole keys: an argument, such as `network.uplink.loss`, is replaced in its
+        text.
 
         Raises:
             ConfigError: a key may not change, or a text has no such argument.
@@ -163,8 +155,8 @@ class Running:
                 value(table, text)
             except (KeyError, TypeError):
                 shown = key[:KEY_SHOWN_MAX]
-                # A request may come from anybody who can open the socket: no control characters in
-                # the log.
+                # A request may come from any process that can open the socket: no control
+                # characters in the log.
                 shown = shown if shown.isprintable() else repr(shown)
                 raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
             what = f"expected one of {', '.join(may)}"
@@ -173,15 +165,11 @@ class Running:
 
 
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
-    """Scenario with some values replaced.
-
-    Args:
-        scenario: a valid scenario.
-        values: plain values by key.
+    """Scenario with some values replaced; `values` are plain values by key.
 
     Raises:
-        ConfigError: a key is unknown, or the scenario cannot be flown so. A network may become too
-            bad to fly over.
+        ConfigError: a key is unknown, or the new scenario cannot be flown. A network may become
+            too bad to fly over.
     """
     table = reading.to_table(scenario)
     set_keys(values, table)
@@ -195,5 +183,4 @@ _DECODER = msgspec.json.Decoder(dict[str, Any])
 
 
 def _text(value: Any) -> str:
-    """Value as JSON."""
     return msgspec.json.encode(value).decode()

@@ -20,14 +20,14 @@ Address = tuple[str, int]
 brackets, with a scope if needed, as in `fe80::1%eth0`."""
 
 NETWORK_BYTES = 8
-"""Length of the network part of an IPv6 address, which identifies a host [B]: who has one address
-of a 64-bit network has them all."""
+"""Length of the network part of an IPv6 address, which identifies a host [B]: whoever has one
+address of a 64-bit network has all of them."""
 
 EVENTS_MAX = 1024
 """Number of events kept until the driver reads them; older ones are dropped and counted."""
 
 VEHICLES_TOLD_MAX = 16
-"""Number of vehicles with figures of their own."""
+"""Number of vehicles with individual figures."""
 
 
 class Datagram(NamedTuple):
@@ -57,24 +57,18 @@ def host_of(address: Address) -> str:
 
 
 class Form(NamedTuple):
-    """Format of one kind of packets: first bytes and bounds of the length."""
+    """Format of one kind of packets: first bytes and bounds of the length [B]."""
 
     head: bytes
-    """First bytes."""
     least: int
-    """Smallest size [B]."""
     most: int
-    """Largest size [B]."""
 
 
 def by_name(counts: Mapping[Any, int]) -> dict[str, int]:
-    """Figures of a group: counts by name."""
     return {str(each): count for each, count in counts.items()}
 
 
 class Events(deque[Event]):
-    """Events waiting for the driver."""
-
     def __init__(self) -> None:
         super().__init__()
         self._omitted: Counter[str] = Counter()
@@ -91,7 +85,7 @@ class Events(deque[Event]):
         return self
 
     def take(self) -> Sequence[Event]:
-        """Remove and return all events, preceded by how many were dropped."""
+        """Remove and return all events, preceded by the number of dropped ones."""
         omitted = (Omitted(kind=kind, count=count) for kind, count in self._omitted.items())
         events = (*omitted, *self)
         self.clear()
@@ -103,9 +97,9 @@ class Endpoint(ABC):
     """Base of everything that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
 
     changeable: frozenset[str] = frozenset()
-    """Keys of its scenario that may change in flight, see `shared.core.change`."""
+    """Keys of the scenario that may change in flight, see `shared.core.change`."""
     keeps = False
-    """Whether it has state for the next run of the process, see `keep`."""
+    """Whether the endpoint has state for the next run of the process, see `keep`."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 
@@ -133,7 +127,7 @@ class Endpoint(ABC):
         """Send the last datagrams before the driver ends; nothing else is called after it."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
-        """Why a change is refused at present, in words; empty if it is not.
+        """Why a change is refused at present, in words; empty if it is accepted.
 
         Args:
             scenario: the changed scenario, checked.
@@ -147,7 +141,6 @@ class Endpoint(ABC):
         Args:
             scenario: the scenario with all changes so far, checked.
             keys: keys with a new value, all of them `changeable`.
-            now_ns: time now.
         """
         assert not keys  # there are no changeable keys by default
 
@@ -156,18 +149,12 @@ class Endpoint(ABC):
 
         Args:
             utc_ns: time since 1970 [ns].
-            error_ns: largest error of it [ns].
+            error_ns: largest error of `utc_ns` [ns].
             now_ns: the same time on the endpoint's own clock [ns].
         """
 
     def send(self, payload: bytes, peer: Address, socket: int = 0) -> None:
-        """Put a datagram into the outbox.
-
-        Args:
-            payload: UDP payload.
-            peer: address of the receiver.
-            socket: number of the endpoint's own socket.
-        """
+        """Put a datagram into the outbox; `socket` is the number of the endpoint's own socket."""
         self._out.append(Datagram(payload, peer, socket))
 
     def tell(self, event: Event) -> None:
@@ -186,8 +173,8 @@ class Endpoint(ABC):
         return {}
 
     def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002 - most keep nothing
-        """State for the next run of this process, if it has changed since the last call;
-        otherwise None.
+        """State for the next run of this process, if it has changed since the last call; otherwise
+        None.
         """
         return None
 

@@ -20,12 +20,9 @@ def address_text(host: str, port: int) -> str:
 
 
 class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has bound its socket and is about to start."""
-
     host: str
     port: int
     waiting_for: str
-    """Peers that it waits for."""
 
     def __str__(self) -> str:
         address = address_text(self.host, self.port)
@@ -33,8 +30,6 @@ class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The name of a peer cannot be resolved yet."""
-
     host: str
     reason: str
 
@@ -43,19 +38,14 @@ class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The name of a peer was resolved after earlier failures."""
-
     host: str
     address: str
-    """Numeric address of the peer."""
 
     def __str__(self) -> str:
         return f"found {self.host}: it is {self.address}"
 
 
 class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A page can be opened in a browser."""
-
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
     taken: str = ""
@@ -69,23 +59,17 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A page has refused browsers, or dropped what they sent."""
-
     why: str
     count: int
-    """Number of times so far."""
 
     def __str__(self) -> str:
         return f"refused, {self.count} so far: {self.why}"
 
 
 class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process serves its figures over HTTP as metrics."""
-
     host: str
     port: int
     local: bool = True
-    """Whether only this machine can read them."""
 
     def __str__(self) -> str:
         whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
@@ -93,17 +77,14 @@ class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The desired trajectory is faster than the vehicle can fly."""
-
     at_s: float
-    """First time in the flight at which it is too fast [s]."""
+    """First time in the flight at which the trajectory is too fast [s]."""
     speed_mps: float
-    """Desired speed along an axis at that time [m/s]."""
     most_mps: float
-    """Largest speed of the vehicle along this axis [m/s]."""
+    """Largest speed of the vehicle along the same axis [m/s]."""
 
     def __str__(self) -> str:
-        asked = f"the desired trajectory asks {self.speed_mps:.3g} m/s at {self.at_s:g} s"
+        asked = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
         most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
         return f"{asked}, and the vehicle flies at most {most}: it cannot follow"
 
@@ -117,10 +98,9 @@ class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has no keys: its packets can be read and forged by anybody."""
+    """A process has no keys: anybody can read and forge its packets."""
 
     local: bool
-    """Whether only this machine can reach it."""
 
     def __str__(self) -> str:
         who = "on this machine" if self.local else "on the network"
@@ -128,30 +108,22 @@ class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process was asked for its figures, or ends."""
-
     figures: dict[str, Any]
-    """Figures by name; a nested dictionary is a group."""
 
     def __str__(self) -> str:
         return "counted so far:"
 
 
 class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Events of a kind were left out because there were too many."""
-
     kind: str
-    """Name of their class; "lines" if the output was not read in time."""
+    """Name of the events' class; "lines" if the output was not read in time."""
     count: int
-    """Number of events left out."""
 
     def __str__(self) -> str:
         return f"… and {self.count:,} more {self.kind}".replace(",", " ")
 
 
 class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process could not write all of its part of the record; the flight goes on."""
-
     file: str
     reason: str
     """System's message, such as "No space left on device"."""
@@ -161,20 +133,14 @@ class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """An error in the code of a process, which goes on."""
-
     traceback: str
-    """Python's traceback."""
 
     def __str__(self) -> str:
-        return f"a mistake in its code, the flight goes on\n{self.traceback.rstrip()}"
+        return f"an error in its code, the flight goes on\n{self.traceback.rstrip()}"
 
 
 class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """netem has opened a flow for a new client."""
-
     flow: int
-    """Number of the flow, from 0."""
     host: str
     port: int
 
@@ -183,25 +149,24 @@ class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A packet has come back to netem, while the server has never answered."""
+    """A packet of netem has returned to netem, while the server has never answered."""
 
     times: int
-    """Number of successive new addresses that it came from."""
+    """Number of successive new addresses that the packet came from."""
 
     def __str__(self) -> str:
         return (
-            f"a packet has come back from {self.times} new addresses, and opens no more flows: the "
+            f"a packet has returned from {self.times} new addresses, and opens no more flows: the "
             "server has never answered, and its address may lead back to this netem"
         )
 
 
 class TooLong(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """netem has dropped a packet because of its length, the first of that kind."""
+    """The first packet that netem has dropped because of its length."""
 
     size: int
     """UDP payload [B]."""
     most: int
-    """Longest UDP payload that passes [B]."""
 
     def __str__(self) -> str:
         return (
@@ -211,8 +176,6 @@ class TooLong(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A packet of netem to the server could not be sent, or was refused on its way."""
-
     host: str
     port: int
     reason: str
@@ -223,30 +186,25 @@ class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """An autopilot has sent a status text."""
-
     text: str
     severity: int
     """MAVLink severity, from 0 (emergency) to 7."""
 
     def __str__(self) -> str:
-        return self.text or "nothing in words"
+        return self.text or "an empty text"
 
 
 class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """A server with keys has dropped datagrams that were forged, repeated or too old."""
 
     count: int
-    """Number of them so far."""
     host: str
-    """Host of the newest one's sender."""
     port: int
     reason: Drop
-    """Why the newest was dropped."""
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"
-        return f"{self.count} datagrams dropped so far that were no vehicle's, {newest}"
+        return f"{self.count} datagrams dropped so far as forged, repeated or too old, {newest}"
 
 
 class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -259,21 +217,15 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A key of the scenario has a new value."""
-
     key: str
     before: str
-    """Old value, as in a scenario's file."""
     after: str
-    """New value."""
 
     def __str__(self) -> str:
         return f"{self.key} is {self.after} from now on, it was {self.before}"
 
 
 class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A requested change in flight was refused, and nothing was changed."""
-
     reason: str
     """Reason, which names the key, the given and the expected value."""
 
@@ -282,21 +234,16 @@ class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class PeerEvent(VehicleEvent, frozen=True, kw_only=True):
-    """Base of the events of one vehicle and the other end of its link."""
-
     host: str
-    """Host of the vehicle where the server reports, of the server where the vehicle does."""
+    """Host of the vehicle in an event of the server, of the server in an event of the vehicle."""
     port: int
 
     @property
     def peer(self) -> str:
-        """HOST:PORT."""
         return address_text(self.host, self.port)
 
 
 class SessionOpened(PeerEvent, frozen=True, kw_only=True):
-    """The server has received the first observation of a session."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} flies, from {self.peer}"
 
@@ -312,7 +259,6 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
     """Server and vehicle fly different scenarios; each end reports it."""
 
     differences: tuple[Difference, ...]
-    """Keys of the scenario that differ."""
 
     def __str__(self) -> str:
         keys = "; ".join(
@@ -323,8 +269,6 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ServerFull(PeerEvent, frozen=True, kw_only=True):
-    """The server has refused a vehicle because it is full."""
-
     room: int
     """Largest number of vehicles."""
 
@@ -338,14 +282,12 @@ class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         return (
-            f"vehicle {self.vehicle}: its client has begun anew without its motion; until it is "
-            "heard, others keep away from all of that"
+            f"vehicle {self.vehicle}: its client has restarted without its motion; until its "
+            "first packet arrives, others keep clear of every place where it may be"
         )
 
 
 class NumberTaken(PeerEvent, frozen=True, kw_only=True):
-    """The server has refused a vehicle because its number is in use by another one."""
-
     holder: str
     """HOST:PORT of the vehicle that already uses this number."""
 
@@ -358,7 +300,6 @@ class NoSession(PeerEvent, frozen=True, kw_only=True):
     """The server opens no session for a vehicle, which keeps asking."""
 
     reason: Literal["full", "taken"]
-    """Whether the server is full, or another client uses the vehicle's number."""
 
     def __str__(self) -> str:
         why = {
@@ -369,25 +310,19 @@ class NoSession(PeerEvent, frozen=True, kw_only=True):
 
 
 class NoAnswer(PeerEvent, frozen=True, kw_only=True):
-    """A vehicle has given up without having heard the server."""
-
     waited_s: float
-    """Time since its first HELLO [s]."""
     secure: bool = False
-    """Whether it has a key, so that only answers with that key count."""
+    """Whether the vehicle has a key, so that only answers with that key count."""
 
     def __str__(self) -> str:
         if self.secure:
-            said = f"nobody who knows this key answers at {self.peer} in {self.waited_s:.0f} s"
+            said = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
             return f"vehicle {self.vehicle}: {said}"
         return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
 
 
 class Unanswered(PeerEvent, frozen=True, kw_only=True):
-    """No answer from the server yet; the vehicle keeps asking."""
-
     left_s: float
-    """Time until it gives up [s]."""
 
     def __str__(self) -> str:
         left = f"{self.left_s:.0f} s"
@@ -395,35 +330,29 @@ class Unanswered(PeerEvent, frozen=True, kw_only=True):
 
 
 class Welcomed(PeerEvent, frozen=True, kw_only=True):
-    """The server has opened a session for a vehicle that cannot be flown yet."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: session open with the server at {self.peer}"
 
 
 class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle that is not flown yet does not hear the server any more."""
+    """Packets of the server no longer arrive at a vehicle on the ground."""
 
     silent_s: float
-    """Time since the newest packet [s]."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: the server has been silent for {self.silent_s:.1f} s"
 
 
 class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle that is not flown yet hears the server again."""
+    """Packets of the server arrive again at a vehicle on the ground."""
 
     silent_s: float
-    """Time without a packet [s]."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: the server is heard again, after {self.silent_s:.1f} s"
 
 
 class Flying(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle's first session has opened, and the flight has begun."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: session open, flying"
 
@@ -463,7 +392,7 @@ DOES = {
 
 
 class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
-    """The server makes no plan for a vehicle that it hears, or sends none."""
+    """The server makes no plan for a vehicle with an open session, or sends none."""
 
     why: str
 
@@ -472,24 +401,20 @@ class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
 
 
 class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
-    """The server rejects the states that a vehicle reports."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} reports a state that it cannot have reached: not believed"
 
 
 class InZone(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on a mission was at rest within a zone when the server started."""
-
     zone: str
     """Zone, as written in the scenario."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is led out"
+        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is guided out"
 
 
 class LeftTube(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on a mission is further from its motion than allowed."""
+    """A vehicle on a mission is farther from its motion than allowed."""
 
     off_m: float
     """Distance outside its tube [m]."""
@@ -500,7 +425,6 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
 
 
 def metres(leap_m: tuple[float, ...]) -> str:
-    """Text of a displacement."""
     return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
 
 
@@ -508,9 +432,9 @@ class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle's measured state has leapt, and the operator has to choose a frame."""
 
     by_m: tuple[float, ...]
-    """Displacement of its position on each axis [m]; empty if only its velocity has leapt."""
+    """Displacement of the position on each axis [m]; empty if only the velocity has leapt."""
     land_after_s: float
-    """Time of hovering after which it lands without a choice [s]; 0: never."""
+    """Time of hovering after which the vehicle lands without a choice [s]; 0: never."""
 
     def __str__(self) -> str:
         leap = f"position has leapt by {metres(self.by_m)}" if self.by_m else "velocity has leapt"
@@ -523,36 +447,31 @@ class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
 
 
 class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
-    """The packets of a vehicle contradict what was known of its clock."""
+    """The packets of a vehicle contradict the bounds of its clock's offset."""
 
     what: str
-    """What was contradicted, and the consequence."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle}: {self.what}"
 
 
 class TimeUnknown(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The time of day is to narrow what is known of clocks, and this host does not know it."""
+    """`link.time_of_day` is "host", but the host does not know the error of its clock."""
 
     def __str__(self) -> str:
         return (
             'link.time_of_day is "host", and the kernel of this host does not say how wrong its '
-            "clock is: delays alone tell of clocks (chrony needs `rtcsync` in its configuration; "
-            "systemd-timesyncd states no error)"
+            "clock is: clocks are compared by delays alone (chrony needs `rtcsync` in its "
+            "configuration; systemd-timesyncd states no error)"
         )
 
 
 class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
-    """The fence limits the input of a vehicle."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is held back by its fence"
 
 
 class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
-    """The server plans for a vehicle again."""
-
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} gets plans again"
 
@@ -561,9 +480,7 @@ class NotFlown(VehicleEvent, frozen=True, kw_only=True):
     """A flight has ended without a plan, or never had one."""
 
     covered: int
-    """Number of steps with a planned input."""
     steps: int
-    """Number of all steps."""
     why: str
     """Why there was no plan, as far as the vehicle knows."""
 
@@ -573,10 +490,7 @@ class NotFlown(VehicleEvent, frozen=True, kw_only=True):
 
 
 class Recalled(VehicleEvent, frozen=True, kw_only=True):
-    """A client has restored the state saved by an earlier run."""
-
     goes_on: bool
-    """Whether the flight of that run continues."""
 
     def __str__(self) -> str:
         if self.goes_on:
@@ -585,41 +499,34 @@ class Recalled(VehicleEvent, frozen=True, kw_only=True):
 
 
 class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
-    """A client ignores the state saved by an earlier run."""
-
     reason: str
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: what an earlier run kept is not followed: {self.reason}"
+        return (
+            f"vehicle {self.vehicle}: the state saved by an earlier run is not used: {self.reason}"
+        )
 
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Values set in flight in an earlier run of the process are in force again."""
-
     path: str
     """Journal that contains them."""
     values: dict[str, Any]
 
     def __str__(self) -> str:
         each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
-        return f"in force again from {self.path}, as it was set in flight: {each}"
+        return f"set in flight and in force again, from {self.path}: {each}"
 
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """The state for the next run of a process cannot be written."""
-
     reason: str
 
     def __str__(self) -> str:
-        return f"what the next run of this process must know cannot be kept: {self.reason}"
+        return f"the state for the next run of this process cannot be saved: {self.reason}"
 
 
 class Finished(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle has begun the last step of its flight."""
-
     steps: int
     missed: int
-    """Number of missed steps."""
 
     def __str__(self) -> str:
         return (
@@ -628,7 +535,6 @@ class Finished(VehicleEvent, frozen=True, kw_only=True):
 
 
 Failure = SessionRefused | NoSession | NoAnswer | NotFlown | AboardFailure
-"""Events that end or prevent the flight of a vehicle."""
 
 Event = (
     Listening

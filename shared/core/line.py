@@ -1,6 +1,6 @@
 """Addresses as users write them: HOST:PORT of a UDP peer, and lines to a vehicle's own hardware.
 
-    udp:HOST:PORT       listen there, and answer whoever sends first
+    udp:HOST:PORT       listen there, and answer the first sender
     udpout:HOST:PORT    send to this address
     tcp:HOST:PORT       connect to it
     serial:PATH:BAUD    a serial port, as in serial:/dev/ttyACM0:57600
@@ -16,11 +16,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 
 HOST_PORT = "HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
-"""Form of an address, for messages."""
 LINE: Address = ("line", 0)
 """Peer at the other end of a TCP or serial line."""
 FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
-"""Forms of a line, for messages."""
 
 
 class Line(NamedTuple):
@@ -34,7 +32,6 @@ class Line(NamedTuple):
 
     @property
     def address(self) -> Address:
-        """Host and port of the line."""
         return self.host, self.number
 
     @property
@@ -62,7 +59,7 @@ def parse_line(key: str, text: str) -> Line:
     """Line from its text.
 
     Raises:
-        ConfigError: it is invalid; the message names `key`.
+        ConfigError: the text is invalid; the message names `key`.
     """
     kind, _, rest = text.partition(":")
     if kind == "serial":

@@ -1,12 +1,13 @@
 """Steady time for an endpoint whose host's clock jumps.
 
-An endpoint needs a clock that goes forward at the rate of real time. If the clock is set back or
-ahead, scheduled work would be late or early, and time stamps from before and after could not be
-compared. Through `Steady` the clock stands still for the jump and goes on from there:
+An endpoint needs a clock that advances at the rate of real time. If the clock is set back or ahead,
+scheduled work would be late or early, and time stamps from before and after could not be compared.
+`Steady` removes every jump, so that the endpoint's time stands still for the jump and goes on from
+there:
 
     steady = clock - (all jumps so far)
 
-If the host stalls, real time passes; that is no jump and is passed on unchanged.
+If the host stalls, real time passes; a stall is no jump and is passed on unchanged.
 """
 
 from collections.abc import Sequence
@@ -18,18 +19,15 @@ from skytether.shared.core.events import Event
 from skytether.shared.scenario.schema import Scenario
 
 JUMP_NS = 60 * SECOND_NS
-"""Largest advance of a clock between two readings, or past a wake that is due [ns]; more is a
+"""Largest advance of a clock between two readings, or past a wake that is due; a larger one is a
 jump."""
 
 
 class Steady(Endpoint):
-    """Wraps an endpoint, and gives it a steady time.
+    """Wraps an endpoint, and passes steady time to it.
 
-    An endpoint that waits for datagrams only may wait for any time: then only a clock that goes
-    back jumps.
-
-    Args:
-        inner: the endpoint.
+    An endpoint that waits for datagrams only may wait for any time: then only an advance backwards
+    counts as a jump.
     """
 
     def __init__(self, inner: Endpoint) -> None:
@@ -38,15 +36,14 @@ class Steady(Endpoint):
         self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
         self.keeps = inner.keeps
         self._seen_ns: int | None = None
-        """Latest reading of the clock."""
         self._jumps_ns = 0
 
     def _steady(self, now_ns: int) -> int:
-        """Steady time for the endpoint."""
         seen_ns = now_ns if self._seen_ns is None else self._seen_ns
         self._seen_ns = now_ns
         if not 0 <= now_ns - seen_ns <= JUMP_NS and self._is_jump(seen_ns, now_ns):
-            # All of it, so that steady time stands still for the jump and goes on from there.
+            # Subtract the whole jump, so that steady time stands still for it and goes on from
+            # there.
             self._jumps_ns += now_ns - seen_ns
         return now_ns - self._jumps_ns
 
@@ -59,63 +56,49 @@ class Steady(Endpoint):
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._inner.receive(datagram, now_ns=self._steady(now_ns))
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._inner.wake(now_ns=self._steady(now_ns))
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         due_ns = self._inner.next_wake_ns()
         return due_ns if due_ns is None else due_ns + self._jumps_ns
 
     def close(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._inner.close(now_ns=self._steady(now_ns))
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`."""
         return self._inner.objection(scenario, keys)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._inner.change(scenario, keys, now_ns=self._steady(now_ns))
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._inner.learn_time(utc_ns, error_ns, now_ns=self._steady(now_ns))
 
     def keep(self, *, now_ns: int) -> bytes | None:
-        """See `Endpoint`; saved times are relative to the time of writing."""
+        """Saved times are relative to the time of writing."""
         return self._inner.keep(now_ns=self._steady(now_ns))
 
     def kept(self) -> None:
-        """See `Endpoint`."""
         self._inner.kept()
 
     def tell(self, event: Event) -> None:
-        """See `Endpoint`."""
         self._inner.tell(event)
 
     def undelivered(self, socket: int, reason: str) -> None:
-        """See `Endpoint`."""
         self._inner.undelivered(socket, reason)
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return self._inner.figures()
 
     @property
     def finished(self) -> bool:
-        """See `Endpoint`."""
         return self._inner.finished
 
     def outbox(self) -> list[Datagram]:
-        """See `Endpoint`."""
         return self._inner.outbox()
 
     def events(self) -> Sequence[Event]:
-        """See `Endpoint`."""
         return self._inner.events()

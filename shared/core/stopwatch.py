@@ -1,31 +1,24 @@
-"""Stopwatch: cost of each part of the work, on a clock that the driver passes to a core."""
+"""Stopwatch: duration of each part of the work, on a clock passed in by the driver."""
 
 from collections import Counter
 from collections.abc import Callable
 
 
 class Stopwatch:
-    """Sums durations by name.
-
-    Args:
-        clock_ns: any clock [ns]; None measures nothing, as in virtual time.
-    """
+    """Sums durations by name. With `clock_ns` None nothing is measured, as in virtual time."""
 
     def __init__(self, clock_ns: Callable[[], int] | None = None) -> None:
         self.runs = clock_ns is not None
         self._clock_ns = clock_ns or (lambda: 0)
         self._since_ns = 0
         self.spent_ns: Counter[str] = Counter()
-        """Sum of the laps of each name so far [ns]."""
         self.total_ns = 0
-        """Sum of all laps so far [ns]."""
 
     def start(self) -> None:
-        """Begin a lap."""
         self._since_ns = self._clock_ns()
 
     def lap(self, name: str) -> int:
-        """End the lap, count it under this name, and begin the next; returns its duration [ns]."""
+        """End the lap, add it to this name, and begin the next; returns its duration [ns]."""
         if not self.runs:
             return 0
         now_ns = self._clock_ns()

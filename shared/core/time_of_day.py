@@ -5,23 +5,25 @@ from typing import NamedTuple
 from skytether.shared.base.units import SECOND_NS
 
 FRESH_NS = 10 * SECOND_NS
-"""Time for which it is valid after it was learned [ns]."""
+"""Validity of a learned time of day."""
 DRIFT = 1000
 """Time in which two clocks drift apart by one unit: 0.1 %, for two hosts whose clocks are slewed by
 500 ppm each."""
 
 
 class TimeOfDay(NamedTuple):
-    """Time of day at a time of an endpoint's own clock."""
+    """Offset from an endpoint's own clock to the time of day, and its error."""
 
     ahead_ns: int
     """Time since 1970 minus the time on the endpoint's own clock [ns]."""
     error_ns: int
     """Largest error of `ahead_ns` at the time `learned_ns` [ns]."""
     learned_ns: int
-    """Time on the endpoint's own clock when it was learned [ns]."""
+    """Time on the endpoint's own clock when the offset was learned [ns]."""
 
     def error_at(self, now_ns: int) -> int | None:
-        """Largest error at a time of the endpoint's own clock [ns]; None if it is too old."""
+        """Largest error at a time of the endpoint's own clock [ns]; None if
+        the offset is too old.
+        """
         age_ns = now_ns - self.learned_ns
         return self.error_ns + age_ns // DRIFT + 1 if 0 <= age_ns <= FRESH_NS else None

@@ -1,3 +1,3 @@
-"""Dynamics and rules for prediction at both ends: model, eq. (1)-(4), rule of flight, eq. (11),
-terms.
+"""Model and rules with which both ends predict: eq. (1)-(4), rule of flight,
+eq. (11), and terms.
 """

@@ -6,13 +6,13 @@ for the time r that of n + 1 steps ago, then that of n steps ago:
     x(k+1) = A x(k) + B u(k-n) + L (u(k-n-1) - u(k-n))          L = B - B(Δt - r)
 
 Planning does not have to consider a dead time (Artstein's reduction). The vehicle knows the inputs
-that it has issued and that act later, and predicts with them the state z in which the next one
+that it has issued and that act later. With them it predicts the state z in which the next input
 takes effect:
 
     z(k) = x at k Δt + θ             z(k+1) = A z(k) + B u(k), which is eq. (4)
 
-exactly, for any θ. So a vehicle reports and flies by z, and the server plans for z, along the
-desired trajectory at k Δt + θ. Each axis has a dead time of its own.
+exactly, for any θ. So a vehicle uses z in its feedback and its observations, and the server plans
+for z, along the desired trajectory at k Δt + θ. Each axis has a dead time of its own.
 """
 
 from collections import deque
@@ -26,10 +26,7 @@ from skytether.shared.law.model import Array, Axis, advance, discretise
 
 
 class DeadTime(NamedTuple):
-    """Dead time of one axis."""
-
     steps: int
-    """Number of whole steps n."""
     rest: Axis | None
     """Model over the remainder r, eq. (4) with r for Δt; None without a remainder."""
     late: tuple[float, float]
@@ -37,7 +34,7 @@ class DeadTime(NamedTuple):
 
 
 def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -> DeadTime:
-    """Dead time of an axis with these parameters; see `shared.law.model.discretise`."""
+    """Dead time of an axis; arguments as in `shared.law.model.discretise`."""
     steps, rest_ns = divmod(seconds_to_ns(dead_time_s), dt_ns)
     if not rest_ns:
         return DeadTime(steps, None, (0.0, 0.0))
@@ -48,11 +45,8 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
 
 
 class PendingInputs:
-    """Inputs that one vehicle has issued and that still act.
-
-    Args:
-        model: eq. (4) of each axis.
-        dead_times: dead time of each axis.
+    """Inputs that one vehicle has issued and that still act; the arguments
+    have one item per axis.
     """
 
     def __init__(self, model: Sequence[Axis], dead_times: Sequence[DeadTime]) -> None:
@@ -70,9 +64,9 @@ class PendingInputs:
         """Issue the input of a step, of each axis [m/s].
 
         Returns:
-            input acting at the end of this step on each axis [m/s], and the difference of the input
-            acting before, until the remainder r has passed [m/s]; the latter None without a
-            remainder on any axis.
+            input acting at the end of this step on each axis [m/s]; and the input acting at its
+                start, for the remainder r, minus the former [m/s], None without a remainder on
+                any axis.
         """
         for issued, u in zip(self._issued, command.tolist(), strict=True):
             issued.append(u)
@@ -85,9 +79,9 @@ class PendingInputs:
         """State z in which the next input takes effect [m, m/s]; shape (axes, 2).
 
         Args:
-            known: state at the end of the step whose input was issued last [m, m/s]; shape (axes,
-                2).
-            disturbance: what else acts on each axis like an input meanwhile [m/s].
+            known: state at the end of the step whose input was issued last [m, m/s]; shape
+                (axes, 2).
+            disturbance: disturbance of each axis meanwhile, as an input [m/s].
         """
         predicted = []
         axes = zip(self._axes, self._issued, known.tolist(), disturbance.tolist(), strict=True)

@@ -1,16 +1,16 @@
-"""Heartbeats: how long an end may be silent, which the other end decides.
+"""Heartbeats: how long one end may be silent, as requested by the other end.
 
-An end considers the other as gone after a time-out of its own, and measures the loss from the
-numbers of the packets that arrive. So each packet of a session has a number, and asks for a longest
-silence. Any packet is a heartbeat; if there is nothing else to send, one is sent after that
-silence.
+Each end considers the other as gone after a time-out of its own, and measures the loss from the
+numbers of the packets that arrive. So each packet of a session has a number, and carries the
+longest silence that its sender allows the receiver. Any packet counts as a heartbeat; if there is
+nothing else to send, one is sent after that silence.
 
 With a packet every T, and n of them within the time-out, a working link is mistaken for lost
 
     f = 3600/T pⁿ (1 - p) times an hour                      p: share lost, independent
 
-It asks for the longest T, a whole number of steps and within bounds, with f at most once in ten
-hours. A twentieth of the time-out is left out, for varying delays.
+An end requests the longest T, a whole number of steps and within bounds, with f at most once in ten
+hours. A twentieth of the time-out is a margin for varying delays.
 """
 
 from bisect import bisect_left
@@ -26,21 +26,19 @@ FEWEST, MOST = 3, 15
 TIMEOUT_SHARE = 0.95
 """Share of the time-out within which n heartbeats are counted."""
 WINDOW = 128
-"""Number of newest packets for which it is known whether they arrived."""
+"""Number of newest packets whose arrival is recorded."""
 ASSUMED, WEIGHT = 0.3, 4
-"""Share lost that is assumed initially, and its weight in packets, at all times."""
+"""Share lost that is assumed initially, and the weight of this assumption in packets."""
 NUMBERS = 128
-"""Modulus of the packet numbers on the wire."""
 BEFORE = -(2**64)
-"""Time or step before all others."""
 SILENCE_MAX = 2**16 - 1
-"""Longest silence that can be asked for [half steps]."""
+"""Longest silence that can be requested [half steps]."""
 SESSION_NS = 30 * SECOND_NS
-"""Silence after which the server forgets a vehicle [ns]."""
-# With three, the observations behind the plans became so old that at 30 % loss 5 of 30 flights of
-# `target` braked before a newer plan came; with two, none.
+"""Silence after which the server forgets a vehicle."""
+# Three were worse: the observations behind the plans became so old that at 30 % loss 5 of 30
+# flights of `target` braked before a newer plan came; with two, none.
 PATIENCE = 2
-"""Number of the vehicle's time-outs for which the server waits for it."""
+"""Time for which the server waits for a vehicle, in time-outs of the vehicle."""
 
 
 def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
@@ -79,13 +77,13 @@ def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
 
 
 class Hearing:
-    """Reception statistics of one end: which packets of the other arrived, and the silence to ask
-    for.
+    """Reception statistics of one end: the packets that arrived, and the silence to allow the other
+    end.
 
     Args:
         timeout_ns: time without a packet after which the other end counts as gone [ns].
         step_ns: length of a step, the resolution of heartbeats [ns].
-        fixed_ns: silence to ask for whatever the loss [ns]; None to follow the loss.
+        fixed_ns: silence to allow whatever the loss [ns]; None to follow the loss.
     """
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
@@ -93,7 +91,8 @@ class Hearing:
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._received = 0
-        """Bits of the newest WINDOW packets, set for those that arrived; the newest is lowest."""
+        """Bits of the newest WINDOW packets, set for those that arrived; the newest is the lowest
+        bit."""
         self.newest = -1
         """Largest number of a packet that arrived; -1 before the first."""
         self._newest_at = BEFORE
@@ -102,13 +101,12 @@ class Hearing:
         """Cached `silence`; 0 if it has to be computed again."""
 
     def begin(self) -> None:
-        """Reset for another session."""
         self._received, self.newest, self._newest_at, self._silence = 0, -1, BEFORE, 0
 
     def hear(self, number: int, at: int) -> None:
         """Note a packet, in any order and possibly repeated.
 
-        In a burst of NUMBERS losses or more, NUMBERS of them are not noticed.
+        A burst of NUMBERS losses or more is counted NUMBERS too short.
 
         Args:
             number: its number, modulo NUMBERS.
@@ -120,7 +118,7 @@ class Hearing:
             self.newest += ahead
             self._newest_at = at
         else:
-            # A late packet was not lost, though it seemed so.
+            # A late packet was counted as lost until now.
             self._received |= 1 << (self.newest - number) % NUMBERS
         if self._fixed_ns is None:
             self._silence = 0
@@ -136,7 +134,7 @@ class Hearing:
 
     @property
     def silence_ns(self) -> int:
-        """Longest silence to ask of the other end [ns].
+        """Longest silence to allow the other end [ns].
 
         If it follows the loss it is half a step shorter than T, since steps are not woken to the
         nanosecond.
@@ -148,7 +146,7 @@ class Hearing:
 
     @property
     def silence(self) -> int:
-        """Longest silence to ask of the other end [half steps]."""
+        """Longest silence to allow the other end [half steps]."""
         if self._silence == 0:
             self._silence = min(max(self.silence_ns // self._half_step_ns, 1), SILENCE_MAX)
         return self._silence

@@ -5,7 +5,6 @@ use these functions, which are also compiled into the server's kernel.
 """
 
 ACCELERATION_MPS2 = 50.0
-"""Acceleration that no vehicle exceeds [m/s²]."""
 NOISE_M, NOISE_MPS = 1.0, 2.0
 """Largest change of position [m] and of velocity [m/s] by noise."""
 
@@ -22,36 +21,28 @@ def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
 
 
 def displacement(p: float, v: float, after_p: float, after_v: float, time: float) -> float:
-    """Distance of a position from where the velocities have taken the vehicle [m].
+    """Distance of a position from the one that the mean velocity predicts [m].
 
     Args:
         p, v: position [m] and velocity [m/s] on one axis before.
         after_p, after_v: position [m] and velocity [m/s] after.
         time: time between the two [s].
     """
-    # By the mean of both velocities, so that only what acceleration cannot explain is left.
+    # The mean velocity leaves only the effect of acceleration within the interval.
     return after_p - p - 0.5 * (v + after_v) * time
 
 
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
-    """Whether no vehicle can have moved from one position to the other.
+    """Whether no vehicle can have moved from one position to the other; arguments as in
+    `displacement`.
 
-    Args:
-        p, v: position [m] and velocity [m/s] on one axis before.
-        after_p, after_v: position [m] and velocity [m/s] after.
-        time: time between the two [s].
-        noise: change of position that noise may cause [m].
+    `noise` is the change of position that noise may cause [m].
     """
     return abs(displacement(p, v, after_p, after_v, time)) > most_m(time, noise)
 
 
 def most_m(time: float, noise: float) -> float:
-    """Largest `displacement` that acceleration and noise explain [m].
-
-    Args:
-        time: time between the two positions [s].
-        noise: change that noise may cause [m].
-    """
+    """Largest `displacement` that acceleration and noise explain [m]; `time` in s, `noise` in m."""
     return noise + 0.5 * ACCELERATION_MPS2 * time * time

@@ -24,7 +24,7 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 """Flag of each vehicle; shape (n,)."""
 ALTITUDE = 2
-"""Axis of the altitude, if there is one."""
+"""Index of the vertical axis, if there is one."""
 
 
 class Axis(NamedTuple):
@@ -41,21 +41,18 @@ class Axis(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Coefficients of the discretised model, eq. (4), on every axis; each of shape (axes,)."""
+    """Coefficients of the discretised model, eq. (4), on every axis as in `Axis`; each of shape
+    (axes,).
+    """
 
     a01: Array
-    """Change of position in a step for each m/s of velocity [s]."""
     a11: Array
-    """Factor of the velocity in a step."""
     b0: Array
-    """Change of position in a step for each m/s of input [s]."""
     b1: Array
-    """Change of velocity in a step for each m/s of input."""
 
     def axes(self) -> list[Axis]:
-        """The model of each axis in plain floats."""
-        # numpy takes twice as long for sums of two or three numbers, which is all that the
-        # vehicle's loops have.
+        # numpy takes twice as long for sums of two or three numbers, and the vehicle's loops have
+        # no longer ones.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 

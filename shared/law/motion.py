@@ -12,15 +12,13 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 SPACING = 10
-"""Steps from one knot to the next."""
 INTERVALS = 12
-"""Number of planned intervals."""
 JOIN_MAX = 3
 """Largest number of intervals that a new motion copies from the motion in force."""
 SAMPLES = 4
 """Number of straight pieces that approximate an interval of a motion."""
 MARGIN_M = 0.03
-"""Least margin of a plan, see `Clearances` [m]."""
+"""Smallest margin of a plan, see `Clearances`."""
 
 
 Knots = Annotated[Array, 2]
@@ -33,7 +31,6 @@ class Motion(NamedTuple):
     first: int
     """Step of the first knot, a multiple of SPACING."""
     position: Knots
-    """Position of each knot [m]; shape (knots, axes)."""
     velocity: Knots
     """Velocity of each knot, 0 at the last [m/s]; shape (knots, axes)."""
 
@@ -45,7 +42,7 @@ class Motion(NamedTuple):
     def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
         """Positions [m] and velocities [m/s] at steps, which may be fractional.
 
-        Before the first knot the vehicle rests there.
+        Before the first knot the vehicle is at rest there.
 
         Args:
             steps: shape (n,).
@@ -85,12 +82,10 @@ class Clearances(NamedTuple):
 
     @property
     def planned_apart_m(self) -> float:
-        """Distance of planned motions and goals from each other [m]."""
         return self.apart_m + self.margin_m
 
     @property
     def planned_clear_m(self) -> float:
-        """Distance of planned motions and goals from zones [m]."""
         return self.tube_m + self.margin_m
 
 
@@ -100,6 +95,5 @@ def bend_m(acceleration_mps2: float, dt_s: float) -> float:
 
 
 def resting(step: int, position: Array) -> Motion:
-    """Motion at rest at a position [m; shape (axes,)] from a step on."""
     at = np.array([position], dtype=np.float64)
     return Motion(step // SPACING * SPACING, at, np.zeros_like(at))

@@ -14,7 +14,6 @@ class Outlines(NamedTuple):
     edges: Annotated[Array, 3]
     """Start and end of each edge, x and y [m]; shape (zones, edges, 4)."""
     counts: Annotated[Array, 1]
-    """Number of edges of each zone; shape (zones,)."""
     boxes: Annotated[Array, 2]
     """Least and largest x, y, and height [m]; shape (zones, 6)."""
     fences: Annotated[Array, 1]
@@ -32,10 +31,10 @@ def is_near(
     high_m: float,
     clearance_m: float,
 ) -> bool:
-    """Whether a straight line comes nearer than a clearance to what a zone forbids, or touches it.
+    """Whether a straight line comes nearer than a clearance to the forbidden side of a zone, or
+    touches it.
 
     Args:
-        outlines: zones.
         zone: index of the zone.
         x0, y0, x1, y1: both ends of the line [m].
         low_m, high_m: its least and largest height.
@@ -83,7 +82,7 @@ def _off2(x: float, y: float, along_x: float, along_y: float) -> float:
 def _crosses(
     x: float, y: float, line_x: float, line_y: float, along_x: float, along_y: float
 ) -> bool:
-    """Whether an edge, whose start is relative to that of a line, crosses that line."""
+    """Whether an edge crosses a line; the edge starts at (x, y) from the start of the line."""
     begins = line_x * y - line_y * x
     ends = line_x * (y + along_y) - line_y * (x + along_x)
     line_begins = along_y * x - along_x * y
@@ -92,8 +91,8 @@ def _crosses(
 
 
 def _is_left(x: float, y: float, x0: float, y0: float, x1: float, y1: float) -> bool:
-    """Whether an edge passes to the right of a point: a point is inside if an odd number of edges
-    does.
+    """Whether an edge passes to the right of a point. A point is inside a polygon if an odd number
+    of its edges do.
 
     Args:
         x, y: the point [m].

@@ -1,4 +1,4 @@
-"""Rule of flight: what a vehicle flies at a step with the horizon in force, eq. (11).
+"""Rule of flight: the input that a vehicle flies at a step with the horizon in force, eq. (11).
 
     u*(k) = u(min(k, k_h + n - 1) | k_h)                    k_h: the step the horizon was made for
                                                             n: number of its inputs
@@ -18,8 +18,8 @@ comes to rest, and the vehicle stays there in any wind.
 
 This is the only implementation of the rule: `step` and `reference_at` combine its parts for one
 spatial axis, `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
-compiles the same functions into its kernels, and so knows what was flown. Only `speed` concerns all
-axes.
+compiles the same functions into its kernels, and so knows which input was flown. Only `speed`
+concerns all axes.
 """
 
 from collections.abc import Sequence
@@ -38,15 +38,13 @@ class AxisHorizon(NamedTuple):
     length: int
     """Number of inputs that may be flown."""
     indexed: bool
-    """Whether each stage has an input of its own, not always the first."""
+    """Whether each stage has its own input; otherwise the first is flown at every stage."""
     speed: float
     """Magnitude of the last input over all axes [m/s]."""
     brake: float
     """Decrease of speed per step when braking [m/s]; 0 repeats the last input for ever."""
     bound: float
-    """Bound u_max of the input [m/s]."""
     feeds_back: bool
-    """Whether there is feedback aboard."""
     gain_p: float
     """K on position [1/s]."""
     gain_v: float
@@ -71,8 +69,8 @@ def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
 def late_max(horizon: int) -> int:
     """Number of steps after its committed ones at which a horizon may still come into force.
 
-    By then the vehicle has flown other inputs than its plan begins with. The next plan makes up for
-    a few; many would make the server's estimate and its plans oscillate.
+    By then the vehicle has flown other inputs than its plan begins with. The next plan corrects a
+    few; many would make the server's estimate and its plans oscillate.
     """
     # A longer allowance let the estimate oscillate until the vehicle flew away
     # (tests/server/test_slow.py).
@@ -100,12 +98,8 @@ def bounded(u: float, bound: float) -> float:
 
 
 def braked(speed: float, steps: int, brake: float) -> float:
-    """Speed that is left after so many steps of braking [m/s].
-
-    Args:
-        speed: speed before [m/s].
-        steps: number of them.
-        brake: speed that braking takes away in a step [m/s].
+    """Speed that is left after so many steps of braking [m/s]; `brake` is the decrease per step
+    [m/s].
     """
     return max(0.0, speed - steps * brake)
 
@@ -127,12 +121,8 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
 
 
 def reference_input(without_feedback: float, disturbance: float, share: float) -> float:
-    """Input that drives the reference state x̄ [m/s].
-
-    Args:
-        without_feedback: input without feedback [m/s].
-        disturbance: ŵ [m/s].
-        share: `remaining`; at 0, x̄ comes to rest.
+    """Input that drives the reference state x̄ [m/s]: with the disturbance ŵ, or 0 once braking has
+    ended (`share` is 0).
     """
     # With ŵ, x̄ would drift on for ever after the vehicle has braked.
     return without_feedback + disturbance if share > 0.0 else 0.0
@@ -176,9 +166,8 @@ def next_reference(
     """Reference state x̄ at the next stage, position [m] and velocity [m/s].
 
     Args:
-        horizon: the horizon.
         without_feedback, share: see `planned_input`.
-        ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
+        ref_p, ref_v: x̄ at this stage, position [m] and velocity [m/s].
     """
     return advance(
         horizon.model, ref_p, ref_v, reference_input(without_feedback, horizon.disturbance, share)
@@ -191,7 +180,6 @@ def reference_at(
     """Reference state x̄ at the stage `last`, position [m] and velocity [m/s].
 
     Args:
-        horizon: the horizon.
         first: stage of the given x̄, 0 or later.
         last: stage of the result.
         ref_p, ref_v: x̄ at `first`, position [m] and velocity [m/s].
@@ -208,14 +196,13 @@ def step(
     """Fly one axis for a step with the horizon in force.
 
     Args:
-        horizon: the horizon.
         stage: k - k_h; may be before the first or after the last input.
         ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
         p, v: state at the stage, position [m] and velocity [m/s].
 
     Returns:
-        the input that is flown, u*(k) [m/s]; the same without feedback [m/s]; and, with feedback,
-        x̄ at the next stage, position [m] and velocity [m/s].
+        the input that is flown, u*(k) [m/s]; the same without feedback [m/s]; and, with
+            feedback, x̄ at the next stage, position [m] and velocity [m/s].
 
     Source: eq. (11).
     """
@@ -236,7 +223,6 @@ LENGTH, INDEXED, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = 
 
 
 def horizon_of(table: Table, inputs: Table, axis: int) -> AxisHorizon:
-    """Horizon on one axis, from a table with one row per axis."""
     return AxisHorizon(
         model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
         inputs=inputs[axis],

@@ -15,9 +15,9 @@ The vehicle flies, at each stage i,
 ū is the input under which the velocity of eq. (4) follows the spline, K and λ the vehicle's
 regulator (`shared.scenario.gain`), u(i-1) the input flown until now, and ŵ the disturbance
 estimated by the vehicle's own filter. x is the state in which the input takes effect
-(`shared.law.dead_time`), so the spline is of the desired trajectory that much later. No input is
-flown for longer than `link.age_max_s` after the observation behind it: from there on ū is held, or
-braked as in `shared.law.rule`, and x̄ follows eq. (4) with that until it rests.
+(`shared.law.dead_time`), so the spline is the desired trajectory later by the dead time. No input
+is flown for longer than `link.age_max_s` after the observation behind it: from then on ū is held,
+or braked as in `shared.law.rule`, and x̄ follows eq. (4) with this ū until it rests.
 
 The client flies by these functions, and the server compiles them.
 """
@@ -37,24 +37,20 @@ Knots = Sequence[float] | NDArray[np.floating[Any]]
 
 
 class AxisSpline(NamedTuple):
-    """Spline on one axis, and how it is flown."""
-
     model: Axis
     knots: Knots
     spacing: int
     """Steps from one knot to the next."""
     dt_s: float
-    """Length of a step [s]."""
     length: int
     """Number of stages at which it may be flown."""
     last: float
-    """Input ū at the last of them [m/s]."""
+    """Input ū at the last of these stages [m/s]."""
     speed: float
     """Magnitude of that input over all axes [m/s]."""
     brake: float
     """Decrease of speed per step when braking [m/s]; 0 continues along the spline for ever."""
     bound: float
-    """Bound u_max of the input [m/s]."""
     gain_p: float
     """K on position [1/s]."""
     gain_v: float
@@ -113,7 +109,6 @@ def guided_to(
     """State x̄ at the stage `last`, position [m] and velocity [m/s].
 
     Args:
-        guide: the spline.
         first: stage of the given x̄; only used after the last stage that may be flown.
         last: stage of the result.
         ref_p, ref_v: x̄ at `first`, position [m] and velocity [m/s].
@@ -133,10 +128,9 @@ def guided_to(
 def regulated(
     guide: AxisSpline, stage: int, ref_p: float, ref_v: float, p: float, v: float, w: float
 ) -> tuple[float, float]:
-    """Input demanded by the regulator on one axis, which `follow` smooths.
+    """Input demanded by the regulator on one axis, before `follow` smooths it.
 
     Args:
-        guide: the spline.
         stage: steps since its first knot.
         ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
         p, v: state at the stage, position [m] and velocity [m/s].
@@ -180,7 +174,6 @@ SPACING, DT_S, LENGTH, LAST, SPEED, BRAKE, BOUND, GAIN_P, GAIN_V, LAG = range(
 
 
 def spline_of(table: Table, knots: Table, axis: int) -> AxisSpline:
-    """Spline on one axis, from a table with one row per axis."""
     return AxisSpline(
         model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
         knots=knots[axis],
@@ -237,8 +230,8 @@ def foresee_spline(
 ) -> None:
     """State of each axis one step later, flown along the spline from a state at the stage.
 
-    The share λ of the previous input is left out: it lasts for a few steps only. Wind is assumed to
-    be compensated.
+    The share λ of the previous input is left out, since its effect lasts for a few steps only. Wind
+    is assumed to be compensated.
 
     Args:
         table, knots, stage, state: see `fly_spline`.

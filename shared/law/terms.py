@@ -1,8 +1,8 @@
-"""Terms of a flight: what server and client must agree on before it.
+"""Terms of a flight: the values on which server and client must agree before it.
 
 Everything that both ends use for prediction is a term, and both build it from the terms alone, so
-that nothing left out here can be used. Keys of a scenario that are not terms belong to one end,
-which may set them freely; `shared/scenario/schema.py` says of each whose it is.
+that no other value can be used. Keys of a scenario that are not terms belong to one end, which may
+set them freely; `shared/scenario/schema.py` names the owner of each.
 """
 
 from typing import NamedTuple
@@ -15,18 +15,13 @@ from skytether.shared.law.model import Model, discretise
 
 
 class Difference(msgspec.Struct, frozen=True):
-    """A term on which two ends disagree."""
-
     key: str
-    """Key of the scenario."""
     here: str
-    """Value at the end that reports it."""
     there: str
-    """Value at the other end."""
 
 
 FLOWN_AS = ("committed", "predictive", "trajectory", "none")
-"""Ways in which a vehicle flies the server's messages, by the names of our schemes."""
+"""Ways in which a vehicle flies the server's messages, by the names of the built-in schemes."""
 INDEXED = ("committed", "predictive")
 """Ways in which the vehicle reads a horizon at the present stage, not always at its first."""
 COMMITTING = ("committed",)
@@ -39,11 +34,9 @@ class Terms(NamedTuple):
     """Values on which both ends must agree before a flight: plain numbers and texts."""
 
     dt_ns: int
-    """Length of a step [ns]."""
     horizon: int
     """Number of steps planned ahead, H."""
     axes: int
-    """Number of spatial axes, 2 or 3."""
     tau_s: tuple[float, ...]
     """Time constant of the model, eq. (2)-(3), of each axis [s]."""
     gain: tuple[float, ...]
@@ -55,68 +48,57 @@ class Terms(NamedTuple):
     scheme: str
     """How the vehicle flies the messages of the server, one of FLOWN_AS."""
     feedback: bool
-    """Whether horizons contain feedback."""
     exhausted: str
     """Behaviour after a horizon's last input: "hold" or "brake"."""
     brake_mps2: float
     """Deceleration with which braking takes the desired velocity to zero [m/s²]."""
     age_max_s: float
-    """Largest age of the observation behind an input [s]."""
     join_s: float
     """Time after its first knot up to which a trajectory is accepted [s]; 0: at any time."""
     land_after_s: float
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     shape: str
-    """Shape of the desired trajectory."""
     radius_m: float
     """Half the width of circle, figure-eight and square [m]."""
     period_s: float
-    """Time for one round of them [s]."""
+    """Time for one round of these shapes [s]."""
     altitude_m: float
-    """Height of these shapes in 3-D [m]."""
+    """Altitude of these shapes in 3-D [m]."""
     points: str
     """Digest of the waypoints."""
     speed_mps: float
-    """Speed between waypoints [m/s]."""
     loop: bool
-    """Whether the waypoints are flown in a loop."""
     table: str
     """Digest of the content of the trajectory's CSV file."""
 
     @property
     def dt_s(self) -> float:
-        """Length of a step [s]."""
         return self.dt_ns / SECOND_NS
 
     @property
     def model(self) -> Model:
-        """Model of the vehicle, the same at both ends."""
         return discretise(self.tau_s, self.dt_s, self.gain)
 
     @property
     def dead_times(self) -> list[DeadTime]:
-        """Dead time of the model of each axis."""
         axes = zip(self.tau_s, self.dead_time_s, self.gain, strict=True)
         return [dead_time(tau_s, late_s, self.dt_ns, gain) for tau_s, late_s, gain in axes]
 
     @property
     def indexed(self) -> bool:
-        """Whether the vehicle reads a horizon at the present stage, not always at its first."""
         return self.scheme in INDEXED
 
     @property
     def commits(self) -> bool:
-        """Whether horizons begin with committed inputs."""
         return self.scheme in COMMITTING
 
     @property
     def splines(self) -> bool:
-        """Whether splines of the desired trajectory are sent instead of inputs."""
         return self.scheme in ALONG_SPLINES
 
     @property
     def planned(self) -> int:
-        """Number of a horizon's inputs after the committed ones: H, or 1 without a plan."""
+        """Number of a horizon's inputs after the committed ones: H, or 1 for a trajectory."""
         return 1 if self.splines else self.horizon
 
     @property
@@ -126,17 +108,14 @@ class Terms(NamedTuple):
 
     @property
     def age_max(self) -> int:
-        """Largest age of the observation behind an input [steps]."""
         return seconds_to_ns(self.age_max_s) // self.dt_ns
 
     @property
     def join(self) -> int:
-        """Steps after its first knot up to which a trajectory is accepted; 0: at any time."""
         return seconds_to_ns(self.join_s) // self.dt_ns
 
     @property
     def land_after(self) -> int:
-        """Steps of hovering with a silent server after which the vehicle lands; 0: never."""
         return seconds_to_ns(self.land_after_s) // self.dt_ns
 
     @property

@@ -28,7 +28,6 @@ def keys(section: type[Section], prefix: str = "") -> Iterator[tuple[str, Key]]:
 
 
 KEYS: Mapping[str, Key] = MappingProxyType(dict(keys(Scenario)))
-"""Metadata of every key of a scenario, by dotted name."""
 
 TERMS: Mapping[str, str] = MappingProxyType(
     {
@@ -46,7 +45,6 @@ def keys_of(*groups: InFlight) -> frozenset[str]:
 
 
 def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
-    """Terms on which two ends differ, named by their keys."""
     return tuple(
         Difference(TERMS[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(Terms._fields, here, there, strict=True)
@@ -55,7 +53,6 @@ def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
 
 
 def _text(field: str, value: object) -> str:
-    """Value of a term as it is written in a scenario."""
     if field == "dt_ns" and isinstance(value, int):
         return f"{value / SECOND_NS:g}"
     if isinstance(value, tuple):

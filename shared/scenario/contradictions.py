@@ -23,13 +23,12 @@ from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
 Contradiction = tuple[str, object, str]
-"""Key, its value, and what was expected."""
+"""Key, its value, and the expected value in words."""
 
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
-"""Largest number of steps of a trajectory that are checked against the fence."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
@@ -40,10 +39,9 @@ def contradictions(
     """Contradictions of a scenario whose values are each valid.
 
     Args:
-        scenario: the scenario.
-        known: a scenario that was checked before; if the desired trajectory is the same, it is not
-            checked again.
-        any_network: whether its network may be too slow, or lose too much, to fly over.
+        known: a scenario that was checked before; if the desired trajectory is the same, it is
+            not checked again.
+        any_network: whether the network may be too slow, or lose too many packets, to fly over.
     """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
@@ -102,7 +100,6 @@ def contradictions(
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
-    """Contradictions of the desired trajectory, zones and goals."""
     wrong = list(_no_zones(scenario)) or list(_no_goals(scenario))
     same = known and (scenario.reference, scenario.model.axes) == (
         known.reference,
@@ -116,7 +113,6 @@ def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradictio
 
 
 def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `control.scheme`: unknown, or unfit for feedback or mission."""
     control = scenario.control
     try:
         properties = control.properties
@@ -131,7 +127,7 @@ def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a mission, whose vehicles keep apart whichever packets are lost."""
+    """Contradictions of a mission, whose vehicles have to keep apart whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not scenario.is_mission:
         if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
@@ -157,7 +153,7 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
         expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
         yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
-        expected = "'land' on a mission: all others reckon with a vehicle that lands straight down"
+        expected = "'land' on a mission: all other vehicles expect a vertical landing"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected
     # A vehicle that receives nothing flies its motion to the end before it brakes.
     longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
@@ -167,7 +163,6 @@ def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _is_one(trigger: str, name: str) -> bool:
-    """Whether a trigger is a single policy with this name."""
     try:
         return TRIGGERS.one(trigger).name == name
     except GrammarError:
@@ -175,7 +170,6 @@ def _is_one(trigger: str, name: str) -> bool:
 
 
 def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `mission.zones`."""
     least_m = scenario.mission.tube_m
     try:
         for zone in scenario.zones.zones:
@@ -188,8 +182,8 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too near to another
-    goal.
+    """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too
+    near to another goal.
     """
     mission = scenario.mission
     if not (mission.goals and scenario.is_mission):
@@ -204,7 +198,7 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
-    # Last goals of other vehicles; with `allocate` they are only known in the server.
+    # Last goals of other vehicles; with `allocate` only the server knows them.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     beside = " to the side" if scenario.lands else ""
@@ -225,16 +219,15 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _away_m(scenario: Scenario, off: Array) -> float:
-    """Distance of two goals, heights scaled by `Scenario.rest_scale` [m]."""
     return math.hypot(*off[:2], *(scenario.rest_scale * off[2:]))
 
 
 def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a mission's goals: too near to each other, or to zones."""
+    """Contradictions of the goals of a mission's shape: too near to each other, or to zones."""
     mission, goals = scenario.mission, scenario.unallocated_reference()
     assert isinstance(goals, Mission)
     if mission.allocate and not goals.in_step:
-        expected = "false, or a goal of each vehicle at each time that one of them has one"
+        expected = "false, or goals of all vehicles at the same times"
         yield "mission.allocate", "true", expected
         return
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
@@ -265,7 +258,6 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of horizon and network: plans arrive too late, or end too early."""
     yield from _too_slow(scenario)
     yield from _too_short(scenario)
 
@@ -298,9 +290,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradiction of a horizon that is short compared with the time the vehicle needs to
-    brake.
-    """
+    """Contradiction of a horizon that is too short for the vehicle to brake."""
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
@@ -317,7 +307,6 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `network.uplink` and `network.downlink`."""
     for way in ("uplink", "downlink"):
         try:
             getattr(scenario, way)
@@ -329,7 +318,6 @@ def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
-    """Contradictions of `control.trigger`."""
     try:
         make_trigger(control, 1)
     except GrammarError:
@@ -358,7 +346,6 @@ def _no_policies(
 
 
 def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `reference`, for a built-in shape."""
     ref, axes = scenario.reference, scenario.model.axes
     least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
     if len(ref.points_m) < least:
@@ -388,7 +375,6 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a fence that leaves no space inside its margins."""
     fence = scenario.fence
     low, high, radius = inner_bounds(scenario)
     drawn = max(margins(scenario))
@@ -405,7 +391,6 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _outside(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of desired trajectories that cross the fence, or are too fast."""
     steps = min(scenario.steps, FENCED_STEPS_MAX)
     reference, times_s = (
         scenario.unallocated_reference(),

@@ -32,7 +32,6 @@ TEXTS: Mapping[str, PluginTable] = MappingProxyType(
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of a nested table."""
     for key, value in table.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}.")
@@ -41,11 +40,7 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
-    """Set values in a nested table.
-
-    Args:
-        changes: values by dotted key.
-        table: the table, which is changed.
+    """Set values by dotted key in a nested table, in place.
 
     Raises:
         ConfigError: a key is unknown, or a text has no such argument.
@@ -67,7 +62,7 @@ def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
 
 
 def text_key(key: str) -> str:
-    """Key of the text in which a key addresses an argument; any other key unchanged."""
+    """Key of the text whose argument `key` addresses; any other key unchanged."""
     return next((each for each in TEXTS if key.startswith(f"{each}.")), key)
 
 

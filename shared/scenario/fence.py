@@ -12,11 +12,11 @@ from skytether.shared.scenario.schema import FenceConfig, Scenario
 SLOW_STEPS = 2
 """Steps by which the fence's time constant T exceeds the vehicle's."""
 ERROR_S = 0.06
-"""Margin for all model errors together, as a time at the vehicle's largest speed [s]."""
+"""Margin for all model errors together, as a time at the vehicle's largest speed."""
 WEAK = 1.25
 """Factor on the wind's margin, for a vehicle whose gain is 20 % below the model's."""
 LATER_S = 0.1
-"""Largest excess of the vehicle's dead time over the model's [s]."""
+"""Largest excess of the vehicle's dead time over the model's."""
 
 
 def is_home_inside(fence: FenceConfig) -> bool:

@@ -26,11 +26,7 @@ ROUNDS = 10_000
 
 
 def feedback_gain(scenario: Scenario) -> Array:
-    """Gain K of the feedback around a horizon; 0 without `control.feedback`.
-
-    Returns:
-        gain on position [1/s] and velocity; shape (axes, 2).
-    """
+    """Gain K of the feedback around a horizon, on position [1/s] and velocity; shape (axes, 2)."""
     model, control = scenario.terms().model, scenario.control
     if not control.feedback:
         return np.zeros_like(model.B)
@@ -38,14 +34,9 @@ def feedback_gain(scenario: Scenario) -> Array:
 
 
 def stationary_gain(model: Model, control: ControlConfig) -> Array:
-    """Gain K of the feedback around a horizon.
+    """Gain K of the feedback around a horizon, on position [1/s] and velocity; shape (axes, 2).
 
-    Args:
-        model: eq. (4).
-        control: weights; S is added to R.
-
-    Returns:
-        gain on position [1/s] and velocity; shape (axes, 2).
+    S of the weights is added to R.
     """
     weight = control.input_weight + control.change_weight
     gain = _settled(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)
@@ -53,10 +44,8 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
 
 
 def regulator(scenario: Scenario) -> Array:
-    """Gain of the regulator along a trajectory.
-
-    Returns:
-        K on position [1/s] and velocity, then λ; shape (axes, 3).
+    """Gain of the regulator along a trajectory: K on position [1/s] and velocity, then λ; shape
+    (axes, 3).
     """
     model, control = scenario.terms().model, scenario.control
     Q, R, S = control.state_weight, control.input_weight, control.change_weight
@@ -73,12 +62,10 @@ def _settled(
     input_weight: float,
     change_weight: float,
 ) -> Array:
-    """Gain on position, velocity and previous input, from A and B of eq. (4), Q, R and S.
+    """Gain on position, velocity and previous input, from A and B of eq. (4), Q, R and S; shape
+    (axes, 3).
 
     Cached, because all vehicles of a scenario use it.
-
-    Returns:
-        shape (axes, 3).
     """
     B = np.pad(np.frombuffer(b).reshape(-1, 2), ((0, 0), (0, 1)), constant_values=1.0)
     A = np.pad(np.frombuffer(a).reshape(-1, 2, 2), ((0, 0), (0, 1), (0, 1)))

@@ -46,17 +46,14 @@ class GrammarError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A name with arguments."""
-
     name: str
     values: tuple[Value, ...] = ()
     """Arguments as written; after `PluginTable` has bound the call, one for each parameter."""
     keys: tuple[str, ...] = ()
     """Name of each argument, empty for a positional one; no names after binding."""
     text: str = field(default="", compare=False)
-    """The call as written."""
     begin: int = field(default=0, compare=False)
-    """Index of its first character in the text."""
+    """Index of the call's first character in the text."""
 
     def __str__(self) -> str:
         arguments = ", ".join(
@@ -67,8 +64,6 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Combination:
-    """Two expressions joined by & or |."""
-
     operator: Literal["&", "|"]
     left: "Expression"
     right: "Expression"
@@ -78,11 +73,7 @@ Expression = Call | Combination
 
 
 def parse(text: str, form: str) -> Expression:
-    """Parse calls combined with & and |.
-
-    Args:
-        text: the text.
-        form: expected form of the text, for messages.
+    """Parse calls combined with & and |; `form` is the expected form of the text, for messages.
 
     Raises:
         GrammarError: the text is invalid.
@@ -144,7 +135,6 @@ def calls(text: str, form: str) -> list[Call]:
 
 
 def _tokens(text: str, form: str) -> list[Call | str]:
-    """Calls, operators and parentheses of a text."""
     tokens: list[Call | str] = []
     at = 0
     while at < len(text):

@@ -23,13 +23,12 @@ from skytether.shared.scenario.reference import (
 )
 
 SWAP_AT_S = 2.0
-"""Time at which vehicles that swap places depart [s]."""
+"""Time at which vehicles that swap places depart."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
 VEHICLES_MAX = 65_535
-"""Largest number of a vehicle."""
 CROWDED = 32
-"""Number of stays in neighbouring cells at one time above which two of them are surely too near."""
+"""Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
 
 class Mission:
@@ -61,12 +60,10 @@ class Mission:
 
     @property
     def vehicles(self) -> tuple[int, ...]:
-        """Numbers of the vehicles that have goals."""
         return tuple(self._goals)
 
     @property
     def places(self) -> Array:
-        """All goals of all vehicles [m]; shape (n, axes)."""
         return np.concatenate([points_m for _, points_m in self._goals.values()])
 
     @property
@@ -77,23 +74,19 @@ class Mission:
 
     @property
     def lasts_s(self) -> float:
-        """Time of the last goal [s]."""
         return max(float(times_s[-1]) for times_s, _ in self._goals.values())
 
     def of(self, vehicle: int) -> "Mission":
-        """The reference of another vehicle."""
         return Mission(self._goals, self._axes, vehicle, is_show=self.is_show)
 
     def goals(self, vehicle: int) -> Array:
-        """Goals of a vehicle [m]; shape (n, axes)."""
         return self._goals[vehicle][1]
 
     def __call__(self, t: NDArray[Any]) -> Array:
-        """Goals at times [s]; see `Reference`."""
         if self._path:
             return self._path(t)
         t = np.asarray(t, dtype=np.float64)
-        if not t.ndim:  # of one vehicle at each step: no search in arrays
+        if not t.ndim:  # called for one vehicle at each step: no search in arrays
             state = np.zeros((self._axes, 2))
             state[:, 0] = self._points_m[max(bisect_right(self._times, float(t)) - 1, 0)]
             return state
@@ -127,7 +120,7 @@ class Mission:
         It minimises the sum of the squared distances to the next goals, so that paths cross less.
         The mission must be `in_step`.
         """
-        from scipy.optimize import linear_sum_assignment  # a client does without scipy
+        from scipy.optimize import linear_sum_assignment  # clients have no scipy
 
         times_s = next(iter(self._goals.values()))[0]
         wanted = np.stack([points_m for _, points_m in self._goals.values()], axis=1)
@@ -143,17 +136,13 @@ class _Stays(NamedTuple):
     """Stays of all vehicles: a goal, from its time until that of the vehicle's next goal."""
 
     vehicles: NDArray[np.int64]
-    """Number of each stay's vehicle; shape (n,)."""
     begin_s: Array
-    """Time at which each stay begins [s]; shape (n,)."""
     end_s: Array
-    """Time at which each stay ends [s]; shape (n,)."""
     places_m: Array
     """Goal of each stay, heights scaled [m]; shape (n, axes)."""
 
     @classmethod
     def of(cls, goals: Mapping[int, tuple[Array, Array]], height: float) -> "_Stays":
-        """Stays at the vehicles' goals, sorted by the time at which they begin."""
         counts = [len(times_s) for times_s, _ in goals.values()]
         begin_s = np.concatenate([times_s for times_s, _ in goals.values()])
         ends_s = [np.append(times_s[1:], np.inf) for times_s, _ in goals.values()]
@@ -164,7 +153,6 @@ class _Stays(NamedTuple):
         return cls(vehicles[order], begin_s[order], np.concatenate(ends_s)[order], places_m[order])
 
     def distance_m(self, one: int, other: int) -> float:
-        """Distance of two stays [m]."""
         return float(np.linalg.norm(self.places_m[one] - self.places_m[other]))
 
     def nearest(self, apart_m: float) -> tuple[int, int] | None:
@@ -302,8 +290,8 @@ class Guided:
         self._references, self.goals = references, goals
 
     def of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: its replaced goal, if any; its start at time 0 is never
-        replaced.
+        """Reference of a vehicle: its replaced goal, if any; its start at time
+        0 is never replaced.
         """
         original = self._references(vehicle)
 
@@ -339,7 +327,7 @@ def parse_goals(text: str, axes: int) -> dict[int, Array]:
 
 
 def format_goals(goals: Mapping[int, Array]) -> str:
-    """Text from which `parse_goals` makes these goals."""
+    """Inverse of `parse_goals`."""
     return " & ".join(
         f"goal({vehicle}, {', '.join(f'{at:.6g}' for at in place)})"
         for vehicle, place in goals.items()

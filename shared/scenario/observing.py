@@ -2,7 +2,7 @@
 
 They are combined with & and | like policies of a trigger (`shared.scenario.grammar`), and
 `client.reporting` evaluates them aboard, once per step. Two observations are sent in any case: the
-first of a session, and one after the longest silence that the server asks for.
+first of a session, and one after the longest silence that the server allows.
 """
 
 from collections.abc import Callable
@@ -15,18 +15,17 @@ from skytether.shared.scenario.registry import PERIOD_MAX, REPORTS
 
 
 class Unreported(NamedTuple):
-    """Input of a policy, at one step: what the server cannot know without a new observation."""
+    """Input of a policy, at one step: the deviation of the server's prediction from the vehicle."""
 
     off_m: float
-    """Distance between the vehicle and where the server expects it [m], see
+    """Distance of the vehicle from the state that the server predicts [m], see
     `client.reporting.BelievedState`."""
     is_news: bool
     """Whether, since the last observation, another horizon has come into force, the mode has
-    changed, or the horizon in force was received again, so that the server may not know of it."""
+    changed, or the horizon in force was received again, so that its acknowledgement may have been
+    lost."""
     steps: int
-    """Number of steps since the last observation."""
     dt_s: float
-    """Length of a step [s]."""
 
 
 Report = Callable[[Unreported], bool]
@@ -60,12 +59,11 @@ def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)])
 
 
 def is_always(text: str) -> bool:
-    """Whether a text of `vehicle.report` is just `always`."""
     return REPORTS.parse(text) == Call("always")
 
 
 def make_report(text: str) -> Report:
-    """Make the report rule from a text that has been checked."""
+    """Report rule from a text that has been checked."""
 
     def make(expression: Expression) -> Report:
         if isinstance(expression, Combination):

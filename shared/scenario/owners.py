@@ -17,7 +17,7 @@ class Owner(Enum):
     """Owner of a key: which end uses its value, and whether the ends may have different values."""
 
     BOTH = "both ends"
-    """Both ends predict with it: a term of the flight, which must be equal."""
+    """A term of the flight: both ends predict with it, so it must be equal."""
     EACH = "each end"
     """Each end uses its own value."""
     SERVER = "server"
@@ -28,31 +28,23 @@ class Owner(Enum):
 
 
 class InFlight(Enum):
-    """Group of keys that may change in flight, together."""
+    """Group of keys that change together in flight."""
 
     TRIGGER = auto()
-    """Rule for sending horizons."""
     POINT = auto()
     """Position and velocity of a live point."""
     ARMED = auto()
-    """Whether plans may be flown."""
     ORIGIN = auto()
-    """Origin of the scenario, for a vehicle in the air that has lost it."""
+    """Origin of the scenario's frame, for a vehicle in the air without one."""
     LEAP = auto()
     """Operator's choice after a leap of the position."""
     WIND = auto()
-    """Wind and gusts."""
     IMPAIRMENT = auto()
-    """Delay and loss of packets."""
     ZONES = auto()
-    """Zones of a mission."""
     GOALS = auto()
-    """Goals of a mission."""
 
 
 class Key(msgspec.Struct, frozen=True):
-    """Metadata of a key."""
-
     owner: Owner
     in_flight: InFlight | None = None
     """Group with which the key may change in flight; None if it may not change."""

@@ -16,7 +16,6 @@ from skytether.shared.scenario.schema import Scenario
 STEPS_MAX = 100_000
 """Largest number of steps that are checked before a flight."""
 TINY = 1e-9
-"""Relative tolerance for rounding."""
 
 
 class TooFast(NamedTuple):
@@ -31,8 +30,8 @@ class TooFast(NamedTuple):
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight: no live point, target or
-    mission.
+    """Whether the desired trajectory is known before the flight: no live
+    point, target or mission.
     """
     return scenario.reference.shape not in ("live", "target") and not scenario.is_mission
 
@@ -40,20 +39,14 @@ def is_known(scenario: Scenario) -> bool:
 def excess(scenario: Scenario, velocity: Array) -> Array:
     """Ratio of the desired speed to the vehicle's largest, on each axis; shape (n, axes).
 
-    Args:
-        scenario: has u_max and the gain.
-        velocity: desired velocity [m/s]; shape (n, axes).
+    `velocity` is the desired velocity [m/s]; shape (n, axes).
     """
     ratio: Array = np.abs(velocity) / (scenario.u_max * scenario.model_gain)
     return ratio
 
 
 def is_too_fast(scenario: Scenario, velocity: Array) -> Flags:
-    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,).
-
-    Args:
-        scenario, velocity: see `excess`.
-    """
+    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,)."""
     over: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
     return over
 
@@ -66,7 +59,9 @@ def first_too_fast(scenario: Scenario) -> TooFast | None:
         return None
     times_s = np.arange(min(scenario.steps, STEPS_MAX) + 1) * scenario.control.dt
     if not REFERENCES[REFERENCES.one(scenario.reference.shape).name].is_ours:
-        times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # as `sampled` checked it
+        times_s = SAMPLED_S[
+            scenario.duration >= SAMPLED_S
+        ]  # the times at which `sampled` checked the shape
     velocity = scenario.make_reference()(times_s)[..., 1]
     over = is_too_fast(scenario, velocity)
     if not over.any():

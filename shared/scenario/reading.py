@@ -1,7 +1,7 @@
 """Reading a scenario from a TOML file, with the scenarios it extends and the files it names.
 
-A scenario with `extends = "other"` (name of a built-in scenario, or a file beside it) holds only
-what differs from the other. Every value is checked here, and every file that a scenario names is
+A scenario with `extends = "other"` (name of a built-in scenario, or a file beside it) contains only
+the differences from the other. Every value is checked here, and every file that a scenario names is
 read here, so that endpoints open no files. `skytether scenarios` lists the built-in scenarios.
 """
 
@@ -27,7 +27,6 @@ from skytether.shared.scenario.registry import IMPAIRMENTS, ZONES, File, Files, 
 from skytether.shared.scenario.schema import TABLES, Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
-"""Folder of the built-in scenarios."""
 EXTENDS_MAX = 20
 """Largest length of a chain of `extends`."""
 GIVEN_MAX = 200
@@ -41,7 +40,6 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX = 16_000_000
-"""Largest size of `reference.file` [B]."""
 COMPARED = "compare"
 """Name of the file with the scenarios of `skytether compare`."""
 
@@ -97,9 +95,9 @@ def check(
     Args:
         raw: the table.
         source: file or command line of the values, for messages.
-        known: a scenario that was checked before; if the desired trajectory is the same, its files
-            are not read again.
-        any_network: whether its network may be too slow, or lose too much, to fly over.
+        known: a scenario that was checked before; if the desired trajectory is the same, its
+            files are not read again.
+        any_network: whether the network may be too slow, or lose too many packets, to fly over.
 
     Raises:
         ConfigError: the first error.
@@ -133,13 +131,11 @@ def _without_contradictions(
 
 
 def _refuse_first(wrong: Iterator[Contradiction], source: str) -> None:
-    """Raise the first contradiction, if any, as a ConfigError."""
     for key, given, expected in wrong:
         raise ConfigError(f"{_where(source)}{key}: got {_short(str(given))}, expected {expected}")
 
 
 def _where(source: str) -> str:
-    """Prefix of a message: the source, if there is one."""
     return f"{source}: " if source else ""
 
 
@@ -151,7 +147,6 @@ def to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def to_toml(scenario: Scenario) -> bytes:
-    """Content of a file from which `load` makes the scenario again."""
     return msgspec.toml.encode(to_table(scenario))
 
 
@@ -202,10 +197,8 @@ def _relative_to(folder: Path, raw: dict[str, Any]) -> None:
 
 
 def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scenario:
-    """Scenario with the contents of the files that it names.
-
-    Raises:
-        ConfigError: a file cannot be read.
+    """Scenario with the contents of the files that it names; raises ConfigError if one cannot be
+    read.
     """
     now, before = (dict(flat(to_table(each))) if each else {} for each in (scenario, known))
     contents: dict[str, File] = {}
@@ -252,7 +245,9 @@ def _content(where: str, name: str, most: int) -> bytes:
 
 
 def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Raw table in which keys of single arguments are applied to the default texts."""
+    """Raw table in which arguments given as keys, such as `network.uplink.loss`, replace those in
+    the default texts.
+    """
     default = to_table(Scenario())
     for key in TEXTS:
         section, name = key.split(".")
@@ -264,7 +259,6 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: str) -> str:
-    """Text of a key with some arguments changed."""
     try:
         for path, value in flat(arguments, f"{key}."):
             text = with_argument(key, text, path, value)
@@ -274,7 +268,6 @@ def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: s
 
 
 def _path(file: str) -> Path:
-    """Path of a scenario file, from a path or the name of a built-in file."""
     if not file.endswith(".toml"):
         return SCENARIOS / f"{file}.toml"
     try:
@@ -284,7 +277,6 @@ def _path(file: str) -> Path:
 
 
 def _toml(path: Path, file: str) -> dict[str, Any]:
-    """Raw table of a file, named `file` in messages."""
     try:
         return toml.loads(files.read(path, toml.BYTES_MAX).decode())
     except OSError as error:
@@ -296,7 +288,9 @@ def _toml(path: Path, file: str) -> dict[str, Any]:
 def _overlay(
     below: dict[str, Any], above: dict[str, Any], source: str, prefix: str = ""
 ) -> dict[str, Any]:
-    """Merge two raw tables, `above` taking precedence; keys of single arguments change the text."""
+    """Merge two raw tables, `above` taking precedence; an argument given as a
+    key changes the text.
+    """
     merged = dict(below)
     for name, value in above.items():
         key, old = f"{prefix}{name}", merged.get(name)
@@ -318,7 +312,7 @@ _PLAIN = {
     "array": "a list",
     "object": "a table",
 }
-"""Words of msgspec's messages, and the words that ours use instead."""
+"""Words of msgspec's messages, and their replacements."""
 
 _ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
 
@@ -362,7 +356,6 @@ def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
 
 
 def _represented(given: object) -> str:
-    """`repr` of a value, cut to GIVEN_MAX characters."""
     try:
         return _short(repr(given))
     except ValueError:  # Python formats no number of more than 4300 digits
@@ -370,7 +363,6 @@ def _represented(given: object) -> str:
 
 
 def _short(given: str) -> str:
-    """Text cut to GIVEN_MAX characters."""
     return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
 
 

@@ -20,18 +20,17 @@ FAR_M = 1e6
 FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory made from points [m/s]."""
 GRID_S = 0.05
-"""Time between the random velocities of a target [s]; they are interpolated linearly."""
+"""Time between the random velocities of a target; they are interpolated linearly."""
 TURN_S = 3600.0
-"""Time after which a target's path is run backwards, then forwards again [s]. This bounds the
-memory for the random walk."""
+"""Time after which a target's path is run backwards, then forwards again, to bound the memory for
+the random walk."""
 GRID_BLOCK = 1024
-"""Number of random velocities that are drawn at a time."""
 COLUMNS_MAX = 64
 """Largest number of columns of a table, which bounds time and memory per line."""
 
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
-"""Times at which a plug-in's trajectory is checked before a flight [s]: densely for two minutes,
-then more and more rarely up to a day. No round numbers, as a trajectory may be special at those."""
+"""Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
+increasingly sparse up to a day. No round numbers, since a trajectory may be special at those."""
 
 Reference = Callable[[NDArray[Any]], Array]
 
@@ -42,9 +41,8 @@ def _planar(
     axes: int,
     altitude_m: float,
 ) -> Reference:
-    """Planar curve from functions of time to (position, velocity) for x and y.
-
-    With three axes it is flown at constant altitude.
+    """Planar curve from functions of time to (position, velocity) for x and y; altitude is
+    constant.
     """
 
     def sample(t: Array) -> Array:
@@ -135,7 +133,6 @@ def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0)
 
 
 def hover(point_m: Array) -> Reference:
-    """Constant position [m; shape (axes,)]."""
     point = np.asarray(point_m, dtype=np.float64)
 
     def sample(t: Array) -> Array:
@@ -158,17 +155,17 @@ def target(
 ) -> Reference:
     """Random walk from the origin, by white acceleration or by random turns.
 
-    Velocity and position are reflected at their bounds. Before time 0 the target rests at the
-    origin. After TURN_S it runs its path backwards.
+    Velocity and position are reflected at their bounds. Before time 0 the target is at rest at the
+    origin. After TURN_S its path is run backwards.
 
     Args:
         rng: generator used by this walk only; later times draw more numbers from it.
-        axes: number of axes.
         agility: strength of the white acceleration [m/s per √s].
         speed_mps: largest velocity along an axis [m/s].
         radius_m: largest coordinate [m].
-        turn_every_s: mean time between two turns [s]; the velocity then changes at turns only, by
-            as much as it would have since the last one. 0: it changes all the time.
+        turn_every_s: mean time between two turns [s]; the velocity then changes at turns only,
+            by as much as the white acceleration would have changed it since the last turn. 0:
+            no turns.
     """
     walk = _Walk(rng, axes, turn_every_s)
 
@@ -192,7 +189,7 @@ def target(
 
 
 class _Walk:
-    """Velocity and position of a target on a time grid of GRID_S, drawn as needed."""
+    """Velocity and position of a target on a time grid of GRID_S, drawn on demand."""
 
     def __init__(self, rng: np.random.Generator, axes: int, turn_every_s: float) -> None:
         self._rng = rng
@@ -203,8 +200,8 @@ class _Walk:
         self._positions = np.zeros((1, axes))
 
     def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
-        """Velocities [m/s] and positions [m] at grid points 0 … last at least; each (points,
-        axes).
+        """Velocities [m/s] and positions [m] at grid points 0 … last at least;
+        each (points, axes).
         """
         while len(self._free) <= last:
             kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
@@ -221,11 +218,10 @@ class _Walk:
 
 
 def reflected(free: Any, bound: float) -> tuple[Any, Any]:
-    """Coordinate reflected at walls, and its direction: 1, or -1 if reversed.
+    """Coordinate reflected at walls at ±bound, and its direction: 1, or -1 if reversed.
 
     Args:
         free: coordinate without walls; number or array.
-        bound: the walls are at ±bound.
     """
     crossed = np.floor((free + bound) / (2.0 * bound))
     way = 1.0 - 2.0 * (crossed % 2.0)
@@ -262,11 +258,7 @@ def from_csv(content: bytes, axes: int) -> Reference:
 
 
 def check_times(times_s: Array, lines: Indices) -> None:
-    """Refuse times in a table that do not start at 0, or do not rise.
-
-    Raises:
-        ValueError: with the first such line.
-    """
+    """Refuse times in a table that do not start at 0, or do not rise, by a ValueError."""
     if times_s[0] != 0.0:
         raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
     for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:
@@ -280,7 +272,7 @@ def read_table(content: bytes, names: list[str]) -> tuple[Array, Indices]:
     Raises:
         ValueError: the table is invalid; says what and in which line.
     """
-    import csv  # only needed for files
+    import csv  # needed for files only
 
     try:
         text = io.StringIO(content.decode("utf-8-sig"), newline="")
@@ -306,7 +298,6 @@ def read_table(content: bytes, names: list[str]) -> tuple[Array, Indices]:
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:
-    """Finite numbers of one line of a table."""
     with suppress(TypeError, ValueError):
         numbers = [float(word) for word in words]  # type: ignore[arg-type]
         if all(map(isfinite, numbers)):

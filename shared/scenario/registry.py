@@ -50,7 +50,7 @@ UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
         "": {"%": (1.0, 100.0)},
     }
 )
-"""Units that may stand behind a number, by the end of the parameter's name: multiplier, divisor."""
+"""Units that may follow a number, by the end of the parameter's name: multiplier, divisor."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
@@ -64,14 +64,11 @@ class File(NamedTuple):
 
 
 Files = tuple[File, ...]
-"""Files that a scenario names, with their contents."""
 
 
 def content(files: Files, name: str) -> bytes:
-    """Content of a file that a scenario names.
-
-    Raises:
-        ConfigError: the file was not read with the scenario.
+    """Content of a file that a scenario names; raises ConfigError if it was not read with the
+    scenario.
     """
     for file in files:
         if file.name == name:
@@ -89,10 +86,9 @@ class Parameter:
     default: Value | None = None
     """Default value; None if the argument is required."""
     is_rest: bool = False
-    """Whether it takes all remaining arguments, as *args."""
+    """Whether the parameter takes all remaining arguments, like *args."""
 
     def takes(self, value: Any) -> bool:
-        """Whether a value is valid for this parameter."""
         try:
             msgspec.convert(value, self.type)
         except msgspec.ValidationError:
@@ -100,7 +96,7 @@ class Parameter:
         return isinstance(value, str) or math.isfinite(value)
 
     def without_unit(self, value: Value | None) -> Value | None:
-        """A number in the parameter's own unit, of one such as 50ms, 10% or 1mbit."""
+        """A number in the parameter's own unit, from a word such as 50ms, 10% or 1mbit."""
         found = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
         units = next(units for end, units in UNITS.items() if self.name.endswith(end))
         if found is None or found[2].lower() not in units:
@@ -110,7 +106,6 @@ class Parameter:
 
     @property
     def file(self) -> bool:
-        """Whether the parameter is a file name."""
         return _bounds(self.type)[0] is str
 
     def __str__(self) -> str:
@@ -125,14 +120,12 @@ class Parameter:
 
 
 def _bounds(hint: Any) -> tuple[Any, dict[str, Any]]:
-    """Type without bounds, and the bounds by their names in msgspec.Meta."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     pairs = [(key, getattr(mark, key)) for mark in marks for key in (*LOW, *HIGH, *FURTHER)]
     return kind, {key: bound for key, bound in pairs if bound is not None}
 
 
 def _further(bounds: dict[str, Any]) -> list[str]:
-    """Bounds other than those of an interval, in words."""
     return [f"({FURTHER[key]} {bounds[key]})" for key in FURTHER if key in bounds]
 
 
@@ -144,20 +137,21 @@ class Entry:
     """Function or class; called with the program's arguments, then those of the scenario."""
     parameters: tuple[Parameter, ...]
     about: str
-    """First paragraph of its docstring."""
+    """First paragraph of the docstring of `make`."""
     needs: str = ""
-    """Figure that a scheme must compute for it (`schemes.SchemeProperties.computes`), or empty."""
+    """Figure that a scheme must compute for this entry (`schemes.SchemeProperties.computes`), or
+    empty."""
     version: str = ""
-    """Digest of a plug-in's file, or name and version of its package; empty for built-in ones."""
+    """Digest of a plug-in's file, or name and version of its package; empty for built-in
+    entries."""
 
     @property
     def source(self) -> str:
-        """Name of its module; for a plug-in that is a file, the path."""
+        """Name of the module of `make`; for a plug-in that is a file, the path."""
         return self.make.__module__
 
     @property
     def is_ours(self) -> bool:
-        """Whether it comes with Skytether."""
         return self.source.startswith("skytether.")
 
     def bound(self, call: Call) -> tuple[Value, ...] | None:
@@ -334,7 +328,6 @@ class PluginTable(dict[str, Entry]):
         return replace(call, values=values, keys=())
 
     def _args(self, call: Call) -> list[tuple[Value, bool]]:
-        """Arguments of a bound call, and whether each is a file name."""
         parameters = self[call.name].parameters
         last = len(parameters) - 1
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
@@ -448,7 +441,6 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
 
 
 PERIOD_MAX = 1_000_000
-"""Largest number of steps from one packet to the next."""
 
 TRIGGERS = PluginTable(
     "policy", "policies such as 'state_gap & budget(5, 2) | silence(1)'", given=1, class_=2

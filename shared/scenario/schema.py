@@ -1,9 +1,9 @@
 """Keys of a scenario: everything about a flight, typed and frozen.
 
 A key is defined here alone: name, owner (`owners.py`), type with bounds, default, and a description
-with its unit in brackets. The description appears in `--help` and in docs/keys.md, which
-`make keys` writes. A `Term` is used by both ends: it has a field in `shared/law/terms.py: Terms`,
-which `Scenario.terms` fills in.
+with its unit in brackets. The description appears in `--help` and in docs/keys.md, which `make
+keys` writes. A `Term` is used by both ends: it has a field in `shared/law/terms.py: Terms`, which
+`Scenario.terms` fills in.
 
 `reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are each
 valid, but not together.
@@ -55,34 +55,22 @@ from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
-# Bounds of numbers lie far beyond any vehicle, and low enough that no time overflows 63 bits of
+# Bounds of numbers are far beyond any vehicle, and low enough that no time overflows 63 bits of
 # nanoseconds and no product of several values overflows a float.
 Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
-"""Positive property of a vehicle, from 0.001 to 1000 of its unit."""
 Factors = Factor | tuple[Factor, ...]
-"""Property of a vehicle: one number for all axes, or one each."""
+"""One number for all axes, or one each."""
 DeadTime = Annotated[float, Meta(ge=0, le=2)]
-"""Dead time of the model [s]."""
 TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
-"""True dead time of a vehicle [s]."""
 Strength = Annotated[float, Meta(ge=0, le=1e3)]
-"""Property that may be 0, up to 1000 of its unit."""
 Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
-"""Signed speed along an axis [m/s]."""
 Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
-"""Coordinate [m]."""
 Amount = Annotated[float, Meta(ge=0, le=1e9)]
-"""Weight, cost or tolerance of any unit."""
 Duration = Annotated[float, Meta(ge=0, le=3600)]
-"""Time from 0 to an hour [s]."""
 Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
-"""Time from a millisecond to an hour [s]."""
 MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
-"""Mean of a random time [s]."""
 Text = Annotated[str, Meta(max_length=TEXT_MAX)]
-"""Text of entries in a table of `registry.py`."""
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
-"""Text of the impairments in one direction."""
 
 
 SHAPE_CHARS = 15
@@ -94,19 +82,20 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class ModelConfig(Section, frozen=True):
-    """Model of the UAV, known to both ends, eq. (1)-(6)."""
+    """Model of the UAV, known to both ends, eq. (1)-(6). A list has one number for all axes, or one
+    each.
+    """
 
     axes: Term[Literal[2, 3]] = 2
-    """Number of axes: 2 to fly in the plane, 3 in space."""
+    """Number of axes: 2 in the plane, 3 in space."""
     tau_s: Term[tuple[Factor, ...]] = (0.84,)
-    """Time constant of the velocity loop [s]: one for all axes, or one each."""
+    """Time constant of the velocity loop [s]."""
     u_max: Term[tuple[Factor, ...]] = (1.6,)
-    """Largest desired velocity [m/s]: one for all axes, or one each."""
+    """Largest desired velocity [m/s]."""
     gain: Term[Factors] = 1.0
-    """Gain of the velocity loop, steady velocity over desired velocity: one for all axes, or one
-    each."""
+    """Gain of the velocity loop: steady velocity over desired velocity."""
     dead_time_s: Term[DeadTime | tuple[DeadTime, ...]] = 0.0
-    """Dead time before an input takes effect [s]: one for all axes, or one each."""
+    """Dead time before an input takes effect [s]."""
 
 
 class ControlConfig(Section, frozen=True):
@@ -117,48 +106,41 @@ class ControlConfig(Section, frozen=True):
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
     scheme: Term[Text] = "trajectory"
-    """Delay compensation, see `skytether schemes`. With `trajectory` the vehicle follows the sent
-    trajectory by a regulator aboard, made from the weights in the vehicle's own scenario."""
+    """Delay compensation, see `skytether schemes`."""
     feedback: Term[bool] = True
-    """Whether a horizon carries its initial state and a feedback gain, with which the vehicle
-    corrects deviations from the predicted states. A vehicle that can only play back inputs needs
-    false, and an `input_weight` of 3, as in the scenario `playback`."""
+    """Whether the vehicle corrects deviations from a horizon's states. If it can only play back
+    inputs: false, and `input_weight` 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
-    """Longest time from making a horizon to flying it [s]; auto: as measured in flight."""
+    """Longest time from making a horizon to flying it [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
-    """Time constant of the disturbance observer, which estimates steady wind and a wrong gain [s];
-    longer if observations are old. 0, and always with the scheme "none": no observer."""
+    """Time constant of the estimate of steady wind and a wrong gain [s]; longer if observations are
+    old. 0, or scheme "none": no estimate."""
     trigger: OfTrigger[Text] = "expected_gap | heartbeat"
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
-    argument of one is also a key: `control.trigger.expected_gap = 0.1`."""
+    argument is also a key: `control.trigger.expected_gap = 0.1`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
-    """Largest data rate of the server to all its vehicles together, IP and UDP headers included
-    [B/s]. Of the horizons that the trigger asks for, those that are expected to gain most per byte
-    are sent first. auto: the largest rate without queueing, as measured; 0: no limit."""
+    """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
+    the largest gain per byte are sent first. auto: the largest measured rate without queueing; 0:
+    no limit."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
-    """Solver of eq. (9): a Riccati active set, exact and fast, or OSQP, the reference."""
+    """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
-    """Largest distance of a spline from the trajectory it approximates, unless 16 knots are too few
-    [m]; with the scheme "trajectory"."""
+    """Largest distance of a sent spline from the trajectory, if 16 knots suffice [m]."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
-    """Weight Q of eq. (5) on the position [1/m²] and the velocity [s²/m²] of every axis."""
+    """Weight Q of eq. (5) on position [1/m²] and velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
     """Weight P of eq. (5) and (16) on the final position [1/m²] and velocity [s²/m²]."""
     input_weight: OfServer[Annotated[float, Meta(ge=1e-9, le=1e9)]] = 1.0
     """Weight R of eq. (5) on the input [s²/m²]."""
     change_weight: OfServer[Amount] = 0.0
-    """Weight S of eq. (9) on the change from the previous horizon, and with the scheme "trajectory"
-    on the change of the input from step to step [s²/m²]."""
+    """Weight S of eq. (9) on the change from the previous horizon; with the scheme "trajectory", on
+    the change of the input from step to step [s²/m²]."""
     input_reference: OfServer[bool] = True
-    """Whether R weighs u - v_ref instead of u, so that R does not ask for standing still."""
+    """Whether R weighs u - v_ref instead of u, so that it does not slow the vehicle down."""
 
     @property
     def properties(self) -> SchemeProperties:
-        """Properties of the scheme.
-
-        Raises:
-            GrammarError: there is no such scheme.
-        """
+        """Properties of the scheme; raises GrammarError if there is no such scheme."""
         return schemes.properties(self.scheme)
 
 
@@ -172,152 +154,139 @@ class ReferenceConfig(Section, frozen=True):
     """Desired trajectory."""
 
     shape: Term[Text] = "circle"
-    """Shape of the desired trajectory, see `skytether references`; target: a random walk that only
-    the server knows; live: a point that is moved in flight."""
+    """Shape of the desired trajectory, see `skytether references`."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
-    """Time for which the server knows the desired trajectory ahead [s]. It extrapolates after that,
-    and always extrapolates a live point."""
+    """Time for which the server knows the desired trajectory ahead [s]; after that, and for a live
+    point, it extrapolates."""
     agility: OfServer[Strength] = 0.3
-    """Strength of the white acceleration that moves a target [m/s per √s]."""
+    """Strength of the white acceleration of a target [m/s per √s]."""
     turn_every_s: OfServer[Duration] = 0.0
-    """Mean time between turns of a target [s]. Its velocity changes at turns only, by as much as
-    `agility` would have changed it since the last turn; 0: it changes all the time."""
+    """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
-    """Half the width of circle, figure-eight, square, swap and sphere, and of the area of a target
-    [m]."""
+    """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
     """Time for one round of circle, figure-eight or square [s]."""
     altitude_m: Term[Position] = 0.0
-    """Altitude of circle, figure-eight, square and swap in space, and of a sphere's centre [m]."""
+    """Altitude of the shape in space [m]."""
     points_m: Annotated[
         tuple[tuple[Position, ...], ...], Key(Owner.BOTH, InFlight.POINT, term="points")
     ] = ()
-    """Waypoints [m], at least two; the one point to hover at; the first position of a live
-    point."""
+    """Waypoints, the point to hover at, or the start of a live point [m]."""
     velocity_mps: Annotated[tuple[Speed, ...], Key(Owner.SERVER, InFlight.POINT)] = ()
     """Velocity of a live point [m/s]; default: estimated from its moves."""
     speed_mps: Term[Factor] = 1.0
-    """Speed between waypoints, and the largest of a target along an axis [m/s]."""
+    """Speed between waypoints; largest speed of a target along an axis [m/s]."""
     loop: Term[bool] = False
-    """Whether the vehicle returns from the last waypoint to the first and goes round again."""
+    """Whether the waypoints are repeated."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """CSV file with the columns t, x, y (and z), for a mission also vehicle; its path is relative
-    to the scenario's folder."""
+    """CSV file with the columns t, x, y (and z), for a mission also vehicle; relative to the
+    scenario's folder."""
 
 
 class VehicleConfig(Section, frozen=True):
-    """The UAV: its simulation, what it reports, and its failsafe."""
+    """The UAV: its simulation, its observations, and its failsafe."""
 
     kind: OfVehicle[Text] = "simulated"
-    """Vehicle that flies, see `skytether vehicles`."""
+    """Vehicle, see `skytether vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Connection to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD."""
     memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
-    """Folder in which the client saves what it needs to continue after a restart; auto: the state
-    folder of its service or user, for a vehicle with an autopilot; none: nothing is saved."""
+    """Folder for the state that a restarted client needs; none: not saved; auto: for a vehicle with
+    an autopilot, the state folder of its service or user."""
     report: OfVehicle[Text] = "deviation(0.05) | silence(1)"
     """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
     """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""
     brake_mps2: Term[Factor] = 2.0
-    """Deceleration of the desired velocity when `brake` stops the vehicle [m/s²]."""
+    """Deceleration when braking [m/s²]."""
     slew_mps2: OfVehicle[Factor] = 50.0
-    """Fastest change of the desired velocity on an axis [m/s²]; no limit where `exhausted` is
-    `hold`."""
+    """Fastest change of the desired velocity on an axis [m/s²]; no limit with `exhausted =
+    "hold"`."""
     land_after_s: Term[Duration] = 10.0
-    """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
+    """Time of hovering with a silent server before landing [s]; 0: never lands."""
     on_loss: OfVehicle[Literal["land", "return"]] = "land"
-    """Action after hovering for `land_after_s` with a silent server: land in place, or return:
-    the autopilot flies home and lands there."""
+    """Action after `land_after_s`: land in place, or return home by the autopilot and land
+    there."""
     after_leap: Annotated[
         Literal["ask", "old", "new", "stay"], Key(Owner.VEHICLE, InFlight.LEAP)
     ] = "ask"
-    """Choice after a leap of the position, made in flight only: old (subtract the leap; the fence
-    stays), new (accept the leap; the fence moves with it), or stay (hover on). Without a choice the
-    vehicle lands after `land_after_s`; see docs/failsafe.md."""
+    """Choice after a leap of the position, made in flight only: subtract the leap (old), accept it,
+    so that the fence moves with it (new), or hover on (stay); see docs/failsafe.md."""
     tau_s: OfVehicle[tuple[Factor, ...]] = ()
-    """True time constant [s]: one for all axes, or one each; default: the model's."""
+    """True time constant [s]; default: the model's."""
     gain: OfVehicle[Factors] = ()
-    """True gain of the velocity loop: one for all axes, or one each; default: the model's."""
+    """True gain of the velocity loop; default: the model's."""
     dead_time_s: OfVehicle[TrueDeadTime | tuple[TrueDeadTime, ...]] = ()
-    """True dead time before an input takes effect [s]: one for all axes, or one each; default: the
-    model's."""
+    """True dead time before an input takes effect [s]; default: the model's."""
     start_m: OfVehicle[tuple[Position, ...]] = ()
     """Position at the start, at rest [m]; default: that of the reference."""
     wind: OfWind[Strength] = 0.0
     """Strength of random wind, a white acceleration [m/s per √s]."""
     steady_wind_mps: OfWind[tuple[Speed, ...]] = ()
-    """Steady-state velocity that constant wind adds, for each axis [m/s]; default: none. For a
-    quadrotor, the velocity of the wind itself."""
+    """Velocity that constant wind adds on each axis [m/s]; for a quadrotor, the velocity of the
+    wind itself."""
     turbulence_mps: OfWind[Strength] = 0.0
-    """Wind speed 6 m above ground, for the Dryden turbulence of a quadrotor [m/s]; 0: no
-    turbulence."""
+    """Wind speed 6 m above ground, for the Dryden turbulence of a quadrotor [m/s]."""
     gust_mps2: OfWind[Strength] = 0.0
-    """Acceleration by a gust [m/s²]; 0: no gusts."""
+    """Acceleration by a gust [m/s²]."""
     gust_every_s: OfWind[MeanTime] = 10.0
-    """Mean time from the end of one gust to the next [s]."""
+    """Mean time between gusts [s]."""
     gust_s: OfWind[MeanTime] = 1.0
     """Mean length of a gust [s]."""
     frame: OfVehicle[Literal["auto", "crazyflie", "1.5kg", "sih"]] = "auto"
-    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, and with an autopilot the frame of
-    its own simulator."""
+    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, or that of the autopilot's
+    simulator."""
     battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
-    """Charge of a quadrotor's battery at the start, from 0 to 1; endless: always full."""
+    """Charge of a quadrotor's battery at the start; endless: always full."""
 
 
 class FenceConfig(Section, frozen=True):
-    """Fence that the vehicle does not leave, whatever inputs it receives.
-
-    The vehicle uses the fence in its own scenario. A server whose scenario has a fence refuses
-    desired trajectories that cross it.
+    """Fence that the vehicle does not leave, whatever inputs it receives. The vehicle uses its own
+    scenario's fence; a server with a fence refuses desired trajectories that cross it.
     """
 
     low_m: OfEach[tuple[Position, ...]] = ()
-    """Lowest position on each axis [m]; default: no bound. With three axes the third is
-    altitude."""
+    """Lowest position on each axis [m]; default: no bound."""
     high_m: OfEach[tuple[Position, ...]] = ()
     """Highest position on each axis [m]; default: no bound."""
     radius_m: OfEach[Strength] = 0.0
-    """Largest distance from where it started [m]; 0: no bound."""
+    """Largest distance from the start [m]; 0: no bound."""
     speed_mps: OfEach[Strength] = 0.0
-    """Largest desired speed, over all axes [m/s]; 0: no bound but `model.u_max`."""
+    """Largest desired speed over all axes [m/s]; 0: only `model.u_max`."""
     wind_mps: OfEach[Annotated[float, Meta(ge=0, le=100)]] = 1.0
-    """Largest velocity that wind or an error of the gain may add without carrying the vehicle over
-    the fence [m/s]: the larger, the wider the margin inside the fence."""
+    """Largest velocity added by wind or a wrong gain for which the fence holds [m/s]; widens the
+    margin."""
 
     @property
     def is_there(self) -> bool:
-        """Whether the fence has any bound."""
         return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
 
 
 class MissionConfig(Section, frozen=True):
-    """Mission: several vehicles with goals, which keep apart whichever packets are lost.
-
-    See docs/together.md.
+    """Mission: several vehicles with goals, which keep apart whichever packets are lost; see
+    docs/together.md.
     """
 
     separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance between two vehicles, one above the other, for downwash [m]: at least
-    `separation_m`, or 0 for the same value."""
+    """Smallest distance between two vehicles, one above the other [m]; 0: `separation_m`."""
     tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
     speed_mps: OfServer[Strength] = 0.0
-    """Largest speed of a motion, over all axes [m/s]; 0: no bound but `model.u_max`."""
+    """Largest speed of a motion over all axes [m/s]; 0: only `model.u_max`."""
     acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
     """Largest acceleration of a motion on an axis [m/s²]."""
     allocate: OfServer[bool] = False
-    """Whether the goals of each time are assigned to the nearest vehicles; every vehicle then needs
-    a goal at each time."""
+    """Whether goals are assigned to the nearest vehicles; each vehicle then needs a goal at each
+    time."""
     goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.GOALS)] = ""
-    """Goals that replace those of the mission, also in flight: goal(vehicle, x, y), with three axes
-    goal(vehicle, x, y, z), combined with &."""
+    """Goals that replace those of the mission: goal(vehicle, x, y), or goal(vehicle, x, y, z),
+    combined with &."""
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
-    """Zones to keep out of or to stay within, combined with &: box(x0, x1, y0, y1), cylinder(x, y,
-    radius), polygon(x, y, …), fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
+    """Zones combined with &: box(x0, x1, y0, y1), cylinder(x, y, radius), polygon(x, y, …),
+    fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
 
     @property
     def height_scale(self) -> float:
@@ -329,74 +298,65 @@ class SensorConfig(Section, frozen=True):
     """Sensors of the vehicle, and the filter of their measurements."""
 
     filter: OfVehicle[Literal["kalman", "none"]] = "kalman"
-    """Filter of the measurements: a Kalman filter, or none. With perfect measurements at every step
-    both give the same state."""
+    """Filter of the measurements: Kalman filter or none."""
     position_noise_m: OfVehicle[Strength] = 0.0
-    """Standard deviation of the noise of a position [m]."""
+    """Standard deviation of a measured position [m]."""
     velocity_noise_mps: OfVehicle[Strength] = 0.0
-    """Standard deviation of the noise of a velocity [m/s]."""
+    """Standard deviation of a measured velocity [m/s]."""
     position_bias_m: OfVehicle[tuple[Position, ...]] = ()
-    """Constant error of the positions, for each axis [m]; default: none."""
+    """Constant error of positions, on each axis [m]."""
     velocity_bias_mps: OfVehicle[tuple[Speed, ...]] = ()
-    """Constant error of the velocities, for each axis [m/s]; default: none."""
+    """Constant error of velocities, on each axis [m/s]."""
     position_every_s: OfVehicle[Duration] = 0.0
     """Time between two measured positions [s]; 0: one at every step."""
     velocity_every_s: OfVehicle[Duration | Literal["never"]] = 0.0
-    """Time between two measured velocities [s]; 0: one at every step; never: only positions are
-    measured."""
+    """Time between two measured velocities [s]; 0: one at every step."""
     delay_s: OfVehicle[Annotated[float, Meta(ge=0, le=2)]] = 0.0
     """Delay of the measurements [s]."""
     process_noise: OfVehicle[Factor] = 0.1
-    """Strength of the white acceleration that the filter assumes, for wind and model errors
-    [m/s per √s]."""
+    """Strength of the white acceleration that the filter assumes [m/s per √s]."""
 
 
 class MavlinkConfig(Section, frozen=True):
-    """Autopilot that speaks MAVLink, of a vehicle of the kind `mavlink`."""
+    """Autopilot of a vehicle of the kind `mavlink`."""
 
     system: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 245
     """MAVLink system number of the client; ArduPilot's ground-station failsafe must listen to
     it."""
     component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
-    """MAVLink component number of the client; 191 is an onboard computer."""
+    """MAVLink component number of the client; 191: onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
-    """MAVLink system number of the autopilot; 0: the first that sends a heartbeat."""
+    """MAVLink system number of the autopilot; 0: that of the first heartbeat."""
     positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
-    """Rate of positions that the client requests from the autopilot [Hz]."""
+    """Rate of positions requested from the autopilot [Hz]."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
-    """Time without a position from the autopilot after which the vehicle brakes [s]."""
+    """Time without a position after which the vehicle brakes [s]."""
     battery_min: OfVehicle[Annotated[float, Meta(ge=0, le=1)]] = 0.2
-    """Charge of the battery below which the vehicle lands, from 0 to 1."""
+    """Charge of the battery below which the vehicle lands."""
     battery_min_v: OfVehicle[Annotated[float, Meta(ge=0, le=100)]] = 0.0
     """Voltage of the battery below which the vehicle lands [V]; 0: no limit."""
     takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
-    """Take-off altitude [m]; auto: that of the start of the desired trajectory, or 3 m with two
-    axes."""
+    """Take-off altitude [m]; auto: that of the trajectory's start, or 3 m in the plane."""
     origin: Annotated[
         Literal["takeoff", "autopilot"] | tuple[Position, ...],
         Key(Owner.VEHICLE, InFlight.ORIGIN),
     ] = "takeoff"
-    """Origin of the scenario: `takeoff`, the point where the vehicle is armed; `autopilot`, the
-    autopilot's local origin; or a point in the autopilot's local frame: north, east (and up) [m].
-    On a mission the point of arming is the vehicle's first goal, on the ground. With `takeoff`, a
-    client that starts while the vehicle is in the air reads the origin from `vehicle.memory`; if
-    that has none, the vehicle hovers until this key is set."""
+    """Origin of the scenario: the point of arming (on a mission, below the first goal), the
+    autopilot's local origin, or a point in its local frame: north, east (and up) [m]. A client that
+    restarts in the air without a saved origin hovers until this key is set."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
-    """Reaction if somebody else commands the autopilot, or if the vehicle does not follow its
-    commands: brake, and land if that goes on; or yield, as to a pilot, until it is over."""
+    """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
+    land; or yield, as to a pilot."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
-    """Longest wait for the autopilot's first message, and for each step of arming and take-off
-    [s]."""
+    """Longest wait for the first heartbeat, and for each step of take-off [s]."""
 
 
 class NetworkConfig(Section, frozen=True):
-    """Impairments of the network, both ways."""
-
     uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
-    """Impairments from server to vehicle, combined with &, see `skytether impairments`; "": none.
-    An argument of one is also a key: `network.uplink.loss = 0.3`."""
+    """Impairments from server to vehicle, combined with &, see `skytether impairments`. An argument
+    is also a key: `network.uplink.loss = 0.3`."""
     downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
-    """Impairments from vehicle to server, in the same way."""
+    """Impairments from vehicle to server."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
     """Largest UDP payload that passes [B]; 1472 fills an Ethernet frame."""
 
@@ -405,31 +365,29 @@ class LinkConfig(Section, frozen=True):
     """Time limits of a session."""
 
     heartbeat_s: OfEach[Interval | Literal["auto"]] = "auto"
-    """Longest time between two packets that this end asks of the other [s]; auto: from its
-    `timeout_s` and the measured loss rate towards it."""
+    """Longest silence allowed to the other end [s]; auto: from this end's `timeout_s` and the
+    measured loss."""
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
-    """Largest age of the observation behind an input [s]; after that the vehicle brakes and hovers,
-    or holds its last input with `vehicle.exhausted = "hold"`."""
+    """Largest age of the observation behind an input [s]; after that the vehicle acts as at the end
+    of a horizon (`vehicle.exhausted`)."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Time after a trajectory's first knot during which the vehicle accepts it [s]; 0: always. With
-    a limit the server knows for certain which trajectory is flown."""
+    a limit the server knows which trajectory is flown."""
     asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
-    unknown. It bounds the error of the vehicle's clock; the server checks whether it holds."""
+    unknown. It bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission. host: the host's clock, with the error bound of its
-    kernel, as set by chrony. If both ends have it, the server knows the vehicle's clock from it."""
+    """Source of the time of day on a mission, which compares clocks if both ends have one; host:
+    the host's clock, with an error bound from its kernel (chrony)."""
     timeout_s: OfEach[Interval] = 1.5
-    """Time of silence after which the vehicle takes the server as lost, brakes and sends HELLO
-    again [s]. After this time, or twice this time with heartbeats "auto", the server gives the
-    vehicle's number to another client that asks for it."""
+    """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
+    vehicle's number after the same time, or twice this time with heartbeats "auto"."""
     connect_s: OfVehicle[Interval] = 120.0
-    """Longest wait of the vehicle for its first session [s]; a server that starts for the first
-    time compiles for up to a minute."""
+    """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
+    minute."""
 
     @property
     def fixed_ns(self) -> int | None:
-        """`heartbeat_s` [ns]; None with "auto"."""
         return None if self.heartbeat_s == "auto" else seconds_to_ns(self.heartbeat_s)
 
     @property
@@ -446,31 +404,29 @@ class LinkConfig(Section, frozen=True):
 
 
 class SimulationConfig(Section, frozen=True):
-    """Computing time and clocks in virtual time."""
-
     compute_s: OfVirtualTime[Duration] = 0.001
     """Computing time of the server for a step [s]."""
     clock_offset_s: OfVirtualTime[Annotated[float, Meta(ge=-1e9, le=1e9)]] = 0.0
     """Offset of the vehicle's clock from the server's at the start [s]."""
     clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
-    """Drift of the vehicle's clock, positive if it runs faster than the server's [ppm]."""
+    """Drift of the vehicle's clock, positive if faster than the server's [ppm]."""
     time_error_s: OfVirtualTime[Duration] = 0.0
-    """Error of the time of day at each end of a mission [s]: positive at odd vehicles, negative at
-    the server and at even ones; 0: no end has a time of day."""
+    """Error of the time of day on a mission [s]: positive at odd vehicles, negative at the server
+    and even ones; 0: no time of day."""
 
 
 class Scenario(Section, frozen=True):
     """Scenario: all keys of a flight."""
 
     title: OfEach[str] = ""
-    """Title of the scenario, in one line."""
+    """Title in one line."""
     duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
     """Length of the flight [s]."""
     settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
-    """Time at the start that RMSE leaves out [s]; if it is not shorter than the flight, half of the
-    flight."""
+    """Time at the start that RMSE leaves out [s]; half of the flight if it is shorter than
+    this time."""
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
-    """Seed of all random numbers: delays, losses, wind."""
+    """Seed of all random numbers."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True
     """Whether plans may be flown; disarmed, the vehicle brakes and stays."""
     model: ModelConfig = ModelConfig()
@@ -502,11 +458,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def uplink(self) -> air.Path:
-        """Impairments from server to vehicle.
-
-        Raises:
-            GrammarError: the text is invalid.
-        """
+        """Impairments from server to vehicle; raises GrammarError if the text is invalid."""
         return air.path(self.network.uplink, self.files)
 
     @property
@@ -516,17 +468,14 @@ class Scenario(Section, frozen=True):
 
     @property
     def dt_ns(self) -> int:
-        """Length of a step [ns]."""
         return seconds_to_ns(self.control.dt)
 
     @property
     def steps(self) -> int:
-        """Number of steps in the whole flight."""
         return max(1, round(self.duration / self.control.dt))
 
     @property
     def settled_s(self) -> float:
-        """Time at which RMSE begins [s]."""
         return self.settle if self.settle < self.duration else self.duration / 2.0
 
     @property
@@ -546,17 +495,14 @@ class Scenario(Section, frozen=True):
 
     @property
     def model_gain(self) -> Array:
-        """The model's gains; shape (axes,)."""
         return self._per_axis(self.model.gain)
 
     @property
     def true_gain(self) -> Array:
-        """The vehicle's gains; shape (axes,)."""
         return self._per_axis(self.model.gain if self.vehicle.gain == () else self.vehicle.gain)
 
     @property
     def true_dead_time_s(self) -> Array:
-        """The vehicle's dead times [s]; shape (axes,)."""
         own = self.vehicle.dead_time_s
         return self._per_axis(self.model.dead_time_s if own == () else own)
 
@@ -564,7 +510,6 @@ class Scenario(Section, frozen=True):
         return np.array(np.broadcast_to(values, self.model.axes), dtype=np.float64)
 
     def terms(self) -> Terms:
-        """Terms that both ends must agree on before a flight."""
         control, vehicle, reference = self.control, self.vehicle, self.reference
         return Terms(
             dt_ns=self.dt_ns,
@@ -620,7 +565,6 @@ class Scenario(Section, frozen=True):
 
     @property
     def clearances(self) -> Clearances:
-        """Distances between motions of a mission, and from zones."""
         mission = self.mission
         most_mps2 = float(np.sqrt(self.model.axes)) * mission.acceleration_mps2
         return Clearances(
@@ -641,8 +585,8 @@ class Scenario(Section, frozen=True):
 
     @property
     def zones(self) -> Zones:
-        """Zones of a mission; without an upper end if vehicles may land, which keeps them from
-        landing in one.
+        """Zones of a mission. If vehicles may land, zones have no upper end, so that no vehicle
+        lands in one.
 
         Raises:
             GrammarError: the text is invalid.
@@ -670,17 +614,14 @@ class Scenario(Section, frozen=True):
 
 
 class WithFiles(Scenario, frozen=True):
-    """Scenario with the files that it names, made by `reading.py`."""
+    """Scenario with the contents of the files that it names, made by `reading.py`."""
 
     contents: Files = ()
-    """Files that the scenario names."""
 
     @property
     def files(self) -> Files:
-        """See `Scenario`."""
         return self.contents
 
 
 def _digest(content: bytes) -> str:
-    """Digest of some content as 16 hex digits; "none" if it is empty."""
     return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"

@@ -14,7 +14,7 @@ scheme = SCHEMES
 """Decorator of a scheme."""
 
 HELD = "held"
-"""Need of a trigger that reads the inputs that the vehicle flies if nothing is sent."""
+"""Need of a trigger that uses the inputs that the vehicle flies if nothing is sent."""
 FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
 """Figures of a plan that a scheme may compute; also names of columns in the record."""
 
@@ -23,7 +23,7 @@ class SchemeProperties(NamedTuple):
     """Properties of a scheme that other modules depend on."""
 
     flown_as: str = "predictive"
-    """Built-in scheme as which the vehicle flies its messages, one of
+    """Name of the built-in scheme by which the vehicle flies this scheme's messages, one of
     `shared.law.terms.FLOWN_AS`."""
     figures: tuple[str, ...] = ()
     """Figures of a plan that the scheme computes, from FIGURES."""
@@ -36,17 +36,14 @@ class SchemeProperties(NamedTuple):
 
     @property
     def indexed(self) -> bool:
-        """See `Terms.indexed`."""
         return self.flown_as in INDEXED
 
     @property
     def commits(self) -> bool:
-        """See `Terms.commits`."""
         return self.flown_as in COMMITTING
 
     @property
     def splines(self) -> bool:
-        """See `Terms.splines`."""
         return self.flown_as in ALONG_SPLINES
 
     @property

@@ -23,7 +23,6 @@ reference = REFERENCES
 
 
 def _points(scenario: Scenario) -> Array:
-    """Waypoints of the scenario [m]; shape (n, axes)."""
     return np.array(scenario.reference.points_m, dtype=np.float64)
 
 

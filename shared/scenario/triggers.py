@@ -40,7 +40,6 @@ class SituationArrays(NamedTuple):
     """
 
     model: Model
-    """Model of the vehicles."""
     dt_s: float
     """Length of a step [s]."""
     planned: int
@@ -207,7 +206,6 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
 
 @lru_cache(maxsize=256)
 def _each(n: int, number: float) -> Array:
-    """Read-only array with the same number n times; shape (n,)."""
     column = np.full(n, number)
     column.flags.writeable = False
     return column
@@ -215,14 +213,12 @@ def _each(n: int, number: float) -> Array:
 
 @lru_cache(maxsize=256)
 def _all_of(n: int) -> Flags:
-    """Read-only array of n flags, all True; shape (n,)."""
     flags = np.ones(n, dtype=np.bool_)
     flags.flags.writeable = False
     return flags
 
 
 def _timed(event: Flags, figures: Figures) -> Verdict:
-    """Verdict of a policy that compares no figure."""
     return Verdict(event, figures["state_gap"], _each(len(event), 0.0), Compared.NOTHING)
 
 
@@ -234,14 +230,13 @@ class _Stateless(Trigger):
 
     Args:
         function: returns a verdict, or flags of shape (n,).
-        values: its numbers, passed after the `Situation`.
+        values: the policy's numbers, passed after the `Situation`.
     """
 
     def __init__(self, function: Callable[..., Verdict | Flags], values: Sequence[Value]) -> None:
         self._function, self._values = function, values
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         verdict = self._function(situation, *self._values)
         if isinstance(verdict, Verdict):
             return verdict
@@ -275,11 +270,9 @@ class Periodic(Trigger):
         self._sent_step = np.zeros(capacity, dtype=np.int64)
 
     def forget(self, row: int) -> None:
-        """See `Trigger`."""
         self._sent_step[row] = 0
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         rows, figures = situation.rows, situation.figures
         due = figures["step"] - self._sent_step[rows] >= self._period
         # A horizon that is due at a fresh step stays due until it is sent.
@@ -289,7 +282,6 @@ class Periodic(Trigger):
         return _timed(due | fresh, figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """See `Trigger`."""
         self._sent_step[rows] = figures["step"]
 
 
@@ -316,11 +308,9 @@ class StateGap(Trigger):
         self._event_gap = np.zeros(capacity)
 
     def forget(self, row: int) -> None:
-        """See `Trigger`."""
         self._event_step[row], self._event_gap[row] = 0, 0.0
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         rows, figures = situation.rows, situation.figures
         step, gap, fresh = figures["step"], figures["state_gap"], figures["fresh"]
         if fresh.any():  # V(k_0) = 0
@@ -331,7 +321,6 @@ class StateGap(Trigger):
         return Verdict(fresh | (gap > threshold), gap, threshold, Compared.STATE_GAP)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """See `Trigger`."""
         self._event_step[rows], self._event_gap[rows] = figures["step"], figures["state_gap"]
 
 
@@ -356,7 +345,6 @@ class ExpectedGap(Trigger):
         self._most = c
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         return above(situation, Compared.EXPECTED_GAP, self._most)
 
 
@@ -412,30 +400,24 @@ class Budget(Trigger):
         self._step = np.zeros(capacity, dtype=np.int64)
 
     def forget(self, row: int) -> None:
-        """See `Trigger`."""
         self._tokens[row], self._step[row] = self._burst, 0
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         filled = self._filled(situation.rows, situation.figures)
         return _timed(filled >= 1.0, situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """See `Trigger`."""
-        # Not below 0: a packet without a token, sent by another policy, leaves no debt.
+        # Not below 0: a packet that another policy sends without a token leaves no debt.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 
     def _filled(self, rows: Indices, figures: Figures) -> Array:
-        """Tokens b at these steps; shape (n,)."""
         gained = self._gain * (figures["step"] - self._step[rows])
         # Computed from the number of steps passed, so that missed ticks fill the bucket too.
         return np.minimum(self._tokens[rows] + gained, self._burst)
 
 
 class Combined(Trigger):
-    """Two triggers joined by & (`np.logical_and`) or | (`np.logical_or`)."""
-
     def __init__(
         self, combine: Callable[[Flags, Flags], Flags], left: Trigger, right: Trigger
     ) -> None:
@@ -444,12 +426,10 @@ class Combined(Trigger):
         self._left, self._right = left, right
 
     def forget(self, row: int) -> None:
-        """See `Trigger`."""
         self._left.forget(row)
         self._right.forget(row)
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         left, right = self._left.test(situation), self._right.test(situation)
         # The record has one figure: that of the leftmost policy which compares one.
         shown = left if left.compares or not right.compares else right
@@ -457,7 +437,6 @@ class Combined(Trigger):
         return Verdict(event, shown.figure, shown.threshold, shown.compared)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """See `Trigger`."""
         self._left.sent(rows, figures)
         self._right.sent(rows, figures)
 
@@ -480,14 +459,12 @@ class Guarded(Trigger):
         self._has_failed = False
 
     def forget(self, row: int) -> None:
-        """See `Trigger`."""
         try:
             self._inner.forget(row)
         except Exception as error:
             self._fail(error)
 
     def test(self, situation: Situation) -> Verdict:
-        """See `Trigger`."""
         rows, figures, estimate, planned, arrays = situation
         # Read-only views: an error in a policy must not change what is sent.
         views = map(_read_only, (rows, figures, estimate, planned))
@@ -504,7 +481,6 @@ class Guarded(Trigger):
             return _timed(_all_of(len(rows)), figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        """See `Trigger`."""
         try:
             self._inner.sent(rows.copy(), figures.copy())
         except Exception as error:
@@ -528,7 +504,7 @@ def _column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
     """Values of n vehicles as an array of a type; shape (n,).
 
     Raises:
-        ValueError: they have another shape, or cannot be cast to the type.
+        ValueError: the values have another shape, or cannot be cast to the type.
     """
     column = np.asarray(values)
     if column.shape != (n,) or not np.can_cast(column.dtype, kind):
@@ -544,7 +520,7 @@ def make_trigger(
     """Make the trigger of a scenario.
 
     Args:
-        control: `trigger`, and the numbers that policies need.
+        control: `trigger`, and the keys that policies use.
         capacity: largest number of vehicles.
         tell: called with the traceback of each plug-in's first error in flight.
     """

@@ -23,16 +23,13 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import ZONES, File, Files
 
 ROUND = 24
-"""Number of corners of the polygon around a cylinder."""
 CORNERS_MAX = 1000
-"""Largest number of corners of all zones together."""
 EARTH_M = 6_378_137.0
-"""Radius of the earth at the equator, WGS 84 [m]."""
+"""Equatorial radius of the earth, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 """Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
 latter is less because degrees are projected onto a plane."""
 NORTH_MAX = 85.0
-"""Largest latitude [degrees]."""
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 """The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
 Frame = Callable[[Any], Array]
@@ -41,16 +38,12 @@ _NOWHERE: Array = np.zeros((0, 2))
 
 
 class Zone(NamedTuple):
-    """A polygon between two heights."""
-
     name: str
     """Text of the zone in the scenario, or file and name of a feature."""
     corners: Array
     """Corners in order along the border [m]; shape (n, 2)."""
     low_m: float = -math.inf
-    """Lowest altitude [m]."""
     high_m: float = math.inf
-    """Highest altitude [m]."""
     is_fence: bool = False
     """True if vehicles stay within the zone, False if they keep out of it."""
 
@@ -77,7 +70,6 @@ class Zones:
         self._starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(np.int64)
         nothing = np.zeros((0, 2))
         self._begin = np.concatenate([nothing, *(zone.corners for zone in zones)])
-        """First corner of each edge [m]; shape (edges, 2)."""
         ends = [np.roll(zone.corners, -1, axis=0) for zone in zones]
         self._along = np.concatenate([nothing, *ends]) - self._begin
         self._square = np.maximum((self._along**2).sum(axis=1), 1e-18)
@@ -92,7 +84,7 @@ class Zones:
         return bool(self.zones)
 
     def to_the_sky(self) -> "Zones":
-        """Zones in which those to keep out of have no upper limit."""
+        """Copy in which zones to keep out of have no upper limit."""
         high = [math.inf if not zone.is_fence else zone.high_m for zone in self.zones]
         raised = zip(self.zones, high, strict=True)
         return Zones([zone._replace(high_m=high_m) for zone, high_m in raised])
@@ -113,8 +105,8 @@ class Zones:
         return self._with_height(signed, points[:, 2:])
 
     def in_the_way(self, points: Array, room_m: float) -> str:
-        """Name of the first zone nearer than `room_m` to a path through points; empty if none
-        is.
+        """Name of the first zone nearer than `room_m` to a path through points; empty if there is
+        none.
         """
         places = [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
         pieces = list(zip(places, [*places[1:], places[-1]], strict=True))
@@ -223,7 +215,6 @@ def parse(text: str, axes: int, files: Files = ()) -> Zones:
     """Parse a text of zones; an empty text has none.
 
     Args:
-        text: zones joined by &.
         axes: number of axes of the flight.
         files: files that the text names, with their contents.
 
@@ -318,7 +309,7 @@ def geojson(file: File) -> list[Zone]:
     for zone in _features(file.name.rpartition("/")[2], collection):
         zones.append(zone)
         corners += len(zone.corners)
-        if corners > CORNERS_MAX:  # checking a ring takes quadratic time in its corners
+        if corners > CORNERS_MAX:  # checking a ring takes quadratic time
             raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
     if not zones:
         raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
@@ -330,12 +321,12 @@ def _features(file: str, collection: Any) -> Iterator[Zone]:
 
     Coordinates are degrees as in RFC 7946, and the collection's member `origin` has longitude and
     latitude of the scenario's origin. Instead, a member `"units": "m"` makes coordinates metres.
-    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and
-    `radius_m` for a Point.
+    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and `radius_m`
+    for a Point.
 
     Raises:
         ValueError: the collection is invalid, or too large.
-        GrammarError: a feature is invalid; says which and what was expected.
+        GrammarError: a feature is invalid; the message names it and the expected form.
     """
     whole = isinstance(collection, dict) and collection.get("type") == "FeatureCollection"
     if not (whole and isinstance(collection.get("features"), list)):
@@ -386,7 +377,8 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
 
     Raises:
         ValueError: a value is invalid.
-        KeyError, TypeError, AttributeError, IndexError: it has not the structure of a feature.
+        KeyError, TypeError, AttributeError, IndexError: the feature does not have the structure
+            of GeoJSON.
     """
     properties, geometry = feature.get("properties") or {}, feature["geometry"]
     kind = None if geometry is None else geometry["type"]
@@ -444,7 +436,6 @@ def _ring(places: Array) -> Array:
 
 
 def _crosses_itself(corners: Array) -> bool:
-    """Whether two edges of a polygon cross."""
     begin, end = corners, np.roll(corners, -1, axis=0)
     along = end - begin
 
@@ -458,10 +449,8 @@ def _crosses_itself(corners: Array) -> bool:
 
 
 def _number(given: Any, key: str = "origin") -> float:
-    """Value of a member as a number.
-
-    Raises:
-        ValueError: it is a text, a truth value, NaN or something else.
+    """Value of a member as a number; raises ValueError for a text, a truth value, NaN or anything
+    else.
     """
     if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
         raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
@@ -469,10 +458,8 @@ def _number(given: Any, key: str = "origin") -> float:
 
 
 def _places(points: Any) -> Array:
-    """Coordinates as in the file; shape (n, 2).
-
-    Raises:
-        ValueError: they are no coordinates, or have heights.
+    """Coordinates as in the file; shape (n, 2). Raises ValueError if they are invalid or have
+    heights.
     """
     if not (isinstance(points, list) and points):
         raise ValueError("coordinates, got none")

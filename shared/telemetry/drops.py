@@ -1,7 +1,6 @@
-"""Packets dropped in a flight by each process, by reason, from the figures that it counted.
+"""Number of packets dropped in a flight, by process and reason, from the figures of the processes.
 
-`docs/operating.md` says what each reason means. Figures may come from a file, so their types are
-checked.
+`docs/operating.md` explains the reasons. Figures may come from a file, so their types are checked.
 """
 
 from collections import Counter
@@ -22,27 +21,25 @@ class DirectionCounts(msgspec.Struct, frozen=True):
 
 
 class VehicleCounts(msgspec.Struct, frozen=True):
-    """What a client counted of one vehicle."""
-
     dropped: dict[str, int] = {}
 
 
 class ProcessCounts(msgspec.Struct, frozen=True):
-    """What a process counted, of all that `Endpoint.figures` and the process itself have."""
+    """Counts of dropped packets among the figures of a process."""
 
     dropped: dict[str, int] = {}
     by_vehicle: dict[str, VehicleCounts] = {}
     others_dropped: dict[str, int] = {}
-    """A client's, of the vehicles that `by_vehicle` leaves out."""
+    """A client's counts of the vehicles that `by_vehicle` leaves out."""
     uplink: DirectionCounts = DirectionCounts()
     downlink: DirectionCounts = DirectionCounts()
     refused: int | dict[str, int] = 0
-    """netem's packets without a flow; a server counts HELLOs here, which it answers."""
+    """netem's packets without a flow; in a server's figures, refused HELLOs, which are no drops."""
     kernel_drops: int = 0
 
 
 def counted(figures: Mapping[str, Any]) -> ProcessCounts:
-    """What the figures of a process say about dropped packets.
+    """Counts of dropped packets among the figures of a process.
 
     Raises:
         ValueError: a count is of another type.
@@ -56,8 +53,8 @@ def drops(
     """Number of packets that each process dropped, by reason; only reasons that occurred.
 
     Args:
-        figures: of each process, by its name; those of a server's workers are added up.
-        vehicle: number of the vehicle, of all that a client flies; None: all of them.
+        figures: figures of each process, by its name; those of a server's workers are added up.
+        vehicle: number of the vehicle to count in a client; None: all of its vehicles.
     """
     totals: dict[str, Counter[str]] = {}
     for name, each in figures.items():

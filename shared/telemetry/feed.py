@@ -17,9 +17,7 @@ from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows as Table
 
 LENGTH_BYTES = 4
-"""Size of a frame's length [B]."""
 FRAME_BYTES_MAX = 4 * 1024 * 1024
-"""Largest size of a frame [B]."""
 ROW_BYTES_MAX = 4096
 """Largest size of a row [B]; a plan of 270 inputs has about 1200."""
 
@@ -34,7 +32,6 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""
     name: str
-    """Name of the scenario."""
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
@@ -46,8 +43,6 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Rows of a part of the record."""
-
     part: str
     """Name of the part: client, server, plan or netem."""
     time_ns: int
@@ -57,10 +52,7 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """An event."""
-
     time_ns: int
-    """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event
 
 
@@ -68,7 +60,6 @@ class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Figures so far, about once a second."""
 
     time_ns: int
-    """Time of the figures [ns; CLOCK_MONOTONIC]."""
     figures: dict[str, Any]
     """Figures by name, see `Endpoint.figures`."""
 
@@ -78,20 +69,14 @@ Frame = Opened | Rows | Said | Figures
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Frame)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors of the decoder for invalid frames."""
 
 
 def pack(frame: Frame) -> bytes:
-    """Frame as msgpack."""
     return _ENCODER.encode(frame)
 
 
 def unpack(body: bytes | bytearray) -> Frame:
-    """Frame from the bytes of `pack`.
-
-    Raises:
-        FeedError: they are not a frame.
-    """
+    """Frame from the bytes of `pack`; raises FeedError if they are not a frame."""
     try:
         return _DECODER.decode(body)
     except _UNDECODABLE as error:
@@ -99,23 +84,16 @@ def unpack(body: bytes | bytearray) -> Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """Frame as bytes, with its length first."""
     body = pack(frame)
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
 class Reader:
-    """Splits a byte stream into frames."""
-
     def __init__(self) -> None:
         self._bytes = bytearray()
 
     def read(self, piece: bytes) -> list[Frame]:
-        """Frames that are complete now.
-
-        Raises:
-            FeedError: the bytes are not frames.
-        """
+        """Frames that are complete now; raises FeedError if the bytes are not frames."""
         self._bytes += piece
         frames: list[Frame] = []
         begin = 0
@@ -138,11 +116,7 @@ def described(columns: Mapping[str, np.dtype[np.void]]) -> dict[str, str]:
 
 
 def columns_of(described: str) -> np.dtype[np.void]:
-    """Columns of a part from their description.
-
-    Raises:
-        FeedError: it is invalid.
-    """
+    """Columns of a part from their description; raises FeedError if it is invalid."""
     try:
         columns = record.columns_of(msgspec.json.decode(described))
     except (ValueError, RecursionError) as error:
@@ -153,11 +127,7 @@ def columns_of(described: str) -> np.dtype[np.void]:
 
 
 def table(rows: bytes, columns: np.dtype[np.void]) -> Table:
-    """Rows as a structured array.
-
-    Raises:
-        FeedError: the last row is incomplete.
-    """
+    """Rows as a structured array; raises FeedError if the last row is incomplete."""
     if len(rows) % columns.itemsize:
         raise FeedError(f"got {len(rows)} B, expected rows of {columns.itemsize} B")
     return np.frombuffer(rows, columns)

@@ -5,15 +5,10 @@ from collections.abc import Iterable, Sequence
 from skytether.shared.base.units import MILLISECOND_NS
 
 BINS = 500
-"""Number of bins of a histogram."""
 
 
 class Histogram:
-    """Counts of durations in bins of equal width; the last bin takes all longer ones.
-
-    Args:
-        bin_ns: width of a bin [ns].
-    """
+    """Counts of durations in bins of equal width; the last bin takes all longer ones."""
 
     def __init__(self, bin_ns: int) -> None:
         self.bin_ns = bin_ns
@@ -21,7 +16,6 @@ class Histogram:
         self.largest_ns = 0
 
     def add(self, value_ns: int) -> None:
-        """Count one duration [ns]."""
         # Called once per packet or step: comparisons cost half of min() and max().
         index = value_ns // self.bin_ns
         self.counts[index if index < BINS else -1] += 1
@@ -29,7 +23,6 @@ class Histogram:
             self.largest_ns = value_ns
 
     def add_all(self, values_ns: Iterable[int]) -> None:
-        """Count several durations [ns]."""
         counts, bin_ns, largest_ns = self.counts, self.bin_ns, self.largest_ns
         for value_ns in values_ns:
             index = value_ns // bin_ns
@@ -48,12 +41,9 @@ class Histogram:
         return self.largest_ns / MILLISECOND_NS
 
     def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
-        """Number of durations below each edge [ms], keyed as in `20`, and of all, `inf`.
+        """Number of durations below each ascending edge [ms], keyed as in `20`, and of all, `inf`.
 
         A bin that contains an edge is counted above it.
-
-        Args:
-            edges_ms: ascending edges [ms].
         """
         counts_below, seen, index = {}, 0, 0
         for edge_ms in edges_ms:

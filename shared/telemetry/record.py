@@ -1,9 +1,9 @@
 """Records of a flight by each process: rows of a numpy structured type.
 
-Each process writes its own part: the client what it flew, the server its estimates and decisions,
-netem the fate of every packet. A part is a line of JSON that names the columns, followed by the
-rows as in memory. It may end anywhere, for example when a process is killed: half a row is left
-out.
+Each process writes its own part: the client the inputs that it flew, the server its estimates and
+decisions, netem the fate of every packet. A part is a line of JSON that names the columns, followed
+by the rows as in memory. A part may end anywhere, for example when its process is killed: an
+incomplete last row is left out.
 """
 
 import hashlib
@@ -77,14 +77,14 @@ REASON_TEXTS = {
     Reason.GOOD: "the link has been good for a second",
     Reason.UNARMED: "it is not armed",
     Reason.HORIZON: "a horizon has come",
-    Reason.OLD: "no newer horizon has come",
+    Reason.OLD: "no newer horizon has arrived",
     Reason.ENDED: "its plan has ended",
     Reason.LOST: "the server is silent",
     Reason.CLOSED: "the server has closed the session",
     Reason.RESTARTED: "the server has restarted",
-    Reason.LATE: "horizons come too late",
+    Reason.LATE: "horizons arrive too late",
     Reason.MALFORMED: "the server sends malformed messages",
-    Reason.RESYNC: "the server plans for impossible times",
+    Reason.RESYNC: "the server sends horizons from the future",
     Reason.STALLED: "its own computer woke it too late",
     Reason.BRAKED: "it has braked",
     Reason.ALONE: "the server has been silent for long",
@@ -92,15 +92,15 @@ REASON_TEXTS = {
     Reason.LEAPT: "its state has jumped further than a vehicle can move",
     Reason.TAKEN: "a pilot, or its autopilot, has taken over",
     Reason.DISARMED: "its motors are disarmed",
-    Reason.RETURNED: "its autopilot obeys again",
+    Reason.RETURNED: "its autopilot follows commands again",
     Reason.BATTERY: "its battery is low",
     Reason.ASTRAY: "its autopilot does not know where it is",
     Reason.MUTE: "its autopilot is silent",
     Reason.HOMEWARD: "the server has been silent for long",
     Reason.RIVAL: "somebody else commands its autopilot",
-    Reason.STRAYED: "it does not do what it is told",
-    Reason.WAITED: "what it waits for has not come for long",
-    Reason.RESUMED: "its process has restarted, and it goes on along its motion",
+    Reason.STRAYED: "it does not follow its commands",
+    Reason.WAITED: "it has waited too long",
+    Reason.RESUMED: "its process has restarted, and it continues its motion",
     Reason.UNUSABLE: "the positions of its autopilot cannot be used",
 }
 
@@ -111,21 +111,17 @@ def client_columns(axes: int) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            (
-                "state",
-                "<f8",
-                (axes, 2),
-            ),  # true position [m] and velocity [m/s]; the estimate where nobody knows
-            ("measured", "<f8", (axes, 2)),  # had of it since the step before, NaN for nothing
-            ("estimate", "<f8", (axes, 2)),  # what is reported and flown by, see docs/vehicles.md
-            ("input", "<f8", (axes,)),  # desired velocity that is flown from here on [m/s]
-            ("covered", "?"),  # whether that is an input of a horizon, neither hovering nor braking
-            ("in_force", "<i8"),  # step that its horizon was made for, -1 for none
-            ("age_ns", "<i8"),  # since the observation behind that horizon, -1 for none
-            ("stale", "<i8"),  # horizons older than the one held, so far
-            ("missed", "<i8"),  # steps slept through, so far
-            ("mode", "<u1"),  # what it does from here on, a `shared.wire.protocol.Mode`
-            ("reason", "<u1"),  # and why, a `Reason`
+            ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
+            ("measured", "<f8", (axes, 2)),  # since the step before [m, m/s]; NaN if not measured
+            ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
+            ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
+            ("covered", "?"),  # whether it comes from a horizon: not while hovering or braking
+            ("in_force", "<i8"),  # step that the horizon in force was made for; -1 for none
+            ("age_ns", "<i8"),  # age of the observation behind that horizon; -1 for none
+            ("stale", "<i8"),  # number of horizons older than the one in force, so far
+            ("missed", "<i8"),  # number of missed steps so far
+            ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
+            ("reason", "<u1"),  # reason for the mode, a `Reason`
         ]
     )
 
@@ -133,34 +129,30 @@ def client_columns(axes: int) -> np.dtype[np.void]:
 def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
-    It has those figures for triggers that the scheme computes; `server.common.scheme.PlanFigures`
-    describes them.
-
-    Args:
-        axes: number of spatial axes.
-        scheme: as in `control.scheme`.
+    The columns include the figures for triggers that `control.scheme` computes, see
+    `server.common.scheme.PlanFigures`.
     """
     return np.dtype(
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            ("reference", "<f8", (axes, 2)),  # x_d(k), as the server knew it then
+            ("reference", "<f8", (axes, 2)),  # x_d(k), as known to the server at that tick
             ("estimate", "<f8", (axes, 2)),  # x̂(k)
             ("ahead", "<i8"),  # d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
-            ("observed_step", "<i8"),  # of the observation behind x̂
-            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without
-            # a plan, or without a trigger that asks for expected_gap
+            ("observed_step", "<i8"),  # step of the observation behind x̂
+            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without a
+            # plan, or without a trigger that needs expected_gap
             *((figure, "<f8") for figure in properties(scheme).figures),
-            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, else NaN
-            ("threshold", "<f8"),  # what is compared, in its unit; 0 where nothing is
-            ("compared", "<u1"),  # figure that it is compared with, a `Compared`
+            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit; else NaN
+            ("threshold", "<f8"),  # of the compared figure; 0 if nothing is compared
+            ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),
             ("solved", "?"),
-            ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 where not measured
-            ("stale", "<i8"),  # observations older than the newest, so far
-            ("missed", "<i8"),  # ticks slept through, so far
+            ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 if not measured
+            ("stale", "<i8"),  # number of observations older than the newest, so far
+            ("missed", "<i8"),  # number of missed ticks so far
         ]
     )
 
@@ -168,7 +160,7 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
 def compared(rows: Rows) -> Array:
     """Figure that the trigger compared in each row of the server's part; shape (n,).
 
-    If nothing was compared it is V(k) of eq. (16), or NaN without one.
+    If nothing was compared it is V(k) of eq. (16), or NaN without a figure V(k).
     """
     names = rows.dtype.names or ()
     figures = np.full(len(rows), np.nan)
@@ -184,36 +176,32 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     """Columns of the server's plans: one row for each horizon that it sends.
 
     With the scheme "trajectory" the state is the first knot, and the inputs follow the spline.
-
-    Args:
-        axes: number of spatial axes.
-        planned: number of planned inputs per axis, H.
+    `planned` is H, the number of planned inputs per axis.
     """
     return np.dtype(
         [
             ("vehicle", "<u2"),
-            ("step", "<i8"),  # k, at which it was made
+            ("step", "<i8"),  # k, the step of the plan
             ("begins", "<i8"),  # step of the first of the inputs, k + d
-            ("state", "<f8", (axes, 2)),  # x̂(k+d), where they lead on from [m, m/s]
+            ("state", "<f8", (axes, 2)),  # x̂(k+d), the state from which the inputs start [m, m/s]
             ("inputs", "<f4", (axes, planned)),  # desired velocities, one a step [m/s]
-            ("disturbance", "<f8", (axes,)),  # input that is reckoned with besides [m/s]
+            ("disturbance", "<f8", (axes,)),  # ŵ, disturbance assumed in the prediction [m/s]
         ]
     )
 
 
 PIECE_ROWS = 1024
-"""Largest number of rows that a recorder passes to a sink in one piece."""
 
 UPLINK, DOWNLINK = 0, 1
 
 PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
     [
         ("direction", "<u1"),  # UPLINK or DOWNLINK
-        ("flow", "<u4"),  # which client
-        ("number", "<u4"),  # of the packet in its flow and direction
+        ("flow", "<u4"),  # number of the client
+        ("number", "<u4"),  # number of the packet in its flow and direction
         ("bytes", "<u2"),  # UDP payload
         ("arrived_ns", "<i8"),  # [netem's clock]
-        ("delay_ns", "<i8"),  # as drawn, also when lost
+        ("delay_ns", "<i8"),  # as drawn, also for a lost packet
         ("lost", "?"),
         ("overtaken", "?"),  # by a later packet of the same flow
     ]
@@ -233,15 +221,14 @@ class Sink(Protocol):
     """Destination of a part of the record, such as a binary file."""
 
     def write(self, piece: bytes, /) -> object:
-        """Write the header, or whole rows."""
+        pass
 
 
 class Recorder:
     """Writes rows to sinks.
 
     Args:
-        columns: columns of the rows.
-        sink: first gets the header; None for a recorder whose sinks are added by `follow`.
+        sink: receives the header first; None for a recorder whose sinks are added by `follow`.
     """
 
     def __init__(self, columns: np.dtype[np.void], sink: Sink | None = None) -> None:
@@ -255,18 +242,20 @@ class Recorder:
             self._sinks.append(sink)
 
     def follow(self, sink: Sink) -> None:
-        """Add a sink that gets the rows from now on, without header."""
+        """Add a sink that receives the rows from now on, without header."""
         self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
-        """Append `count` rows. Each value is one for all rows, or an array of them."""
+        """Append `count` rows. A value is a scalar for all rows, or an array
+        with one item per row.
+        """
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
         self._write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
-        """Append one row, faster: a value for every column in order, arrays number by number."""
+        """Append one row, faster: a value for every column in order, arrays flattened."""
         row = self._row.pack(*values)
         for sink in self._sinks:
             sink.write(row)
@@ -283,7 +272,6 @@ class Recorder:
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:
-    """Layout of a row in memory."""
     formats = {"u1": "B", "u2": "H", "u4": "I", "i8": "q", "f4": "f", "f8": "d", "b1": "?"}
     row = "<"
     for name in columns.names or ():
@@ -312,10 +300,10 @@ def columns_of(descr: Any) -> np.dtype[np.void]:
 
 
 def parse(part: bytes) -> Rows:
-    """Rows of a part; half a row at its end (of a killed writer) is left out.
+    """Rows of a part; an incomplete last row (of a killed writer) is left out.
 
     Raises:
-        ValueError: it is not a part of a record.
+        ValueError: the bytes are not a part of a record.
     """
     header, _, body = part.partition(b"\n")
     try:
@@ -326,18 +314,11 @@ def parse(part: bytes) -> Rows:
 
 
 def read(path: Path) -> Rows:
-    """Rows of a part in a file.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is not a part of a record.
-    """
+    """Rows of a part in a file; errors as in `parse`, and OSError."""
     return parse(path.read_bytes())
 
 
 class FlightEvent(NamedTuple):
-    """An event of a flight."""
-
     time_ns: int
     """Time in the flight [ns]: of the world, or over real UDP since the first event."""
     host: str
@@ -359,7 +340,7 @@ class Record:
     server: Rows
     netem: Rows
     failure: Failure | None = None
-    """Event that ended the flight of a vehicle; the first vehicle with one."""
+    """Event that ended the flight of a vehicle; the first one if there are several."""
     figures: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, those at
     the end of the batch."""

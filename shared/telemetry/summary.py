@@ -1,4 +1,4 @@
-"""Summary of a flight, computed from its record; its names are used everywhere."""
+"""Summary of a flight, computed from its record."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,8 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
-"""Share of the bound from which on an input counts as at it: inputs are rounded on the wire."""
+"""Share of the bound above which an input counts as at the bound: inputs are rounded on the
+wire."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,19 +53,19 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets with a horizon that the server sent; the other uplink packets are
     heartbeats and the handshake's."""
     uplink_packets: int | None
-    """Number of packets that entered the network from the server, lost ones included."""
+    """Number of packets that entered the network from the server, including lost ones."""
     uplink_bytes: int | None
     """UDP payload of all uplink packets [B]."""
     downlink_packets: int | None
     downlink_bytes: int | None
     uplink_packets_per_s: float | None = None
-    """Rate of packets from the server, heartbeats and lost ones included [1/s]."""
+    """Rate of packets from the server, including heartbeats and lost ones [1/s]."""
     uplink_bytes_per_s: float | None = None
-    """Their data rate, with HEADER_BYTES per packet [B/s]."""
+    """Data rate of these packets, with HEADER_BYTES per packet [B/s]."""
     downlink_packets_per_s: float | None = None
     """Rate of packets from the vehicle [1/s]."""
     downlink_bytes_per_s: float | None = None
-    """Their data rate, with HEADER_BYTES per packet [B/s]."""
+    """Data rate of these packets, with HEADER_BYTES per packet [B/s]."""
     packets_per_s: float | None = None
     """Rate of packets both ways [1/s]."""
     bytes_per_s: float | None = None
@@ -76,15 +77,17 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     stale: int
     """Number of messages discarded at either end because a newer one had arrived."""
     drops: dict[str, dict[str, int]] | None = None
-    """Number of packets that server, netem and client dropped, by reason (docs/operating.md); those
-    of server and netem are of all vehicles. None where the processes' figures are not known."""
+    """Number of packets that server, netem and client dropped, by reason (docs/operating.md);
+    server and netem count the packets of all vehicles. None without the figures of the
+    processes."""
     age_ms_p50: float | None
     """Age of the observation behind the input being flown [ms], over all steps."""
     age_ms_p99: float | None
     aoi_s_mean: float | None
-    """Mean age of information, that of this observation [s], over the steps from `settle` on."""
+    """Mean age of information: the age of the observation behind the input [s], over the steps from
+    `settle` on."""
     aoi_s_peak: float | None
-    """Mean of its peaks [s]: the age at each step before it decreases."""
+    """Mean of the peaks of this age [s]: its value at each step before it decreases."""
     plan_age_s_mean: float | None
     """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
     of information that only the server has, such as the position of a target."""
@@ -95,15 +98,15 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the steps from `settle` on at which the input is at its bound on some axis."""
     too_fast: float | None = None
     """Share of the steps at which the desired trajectory is faster than u_max times the gain on
-    some axis, so that nothing can follow it; None if only the server knows the trajectory."""
+    some axis, so that no vehicle can follow it; None if only the server knows the trajectory."""
     solve_ms_p50: float | None
     """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
     deadline_misses: int
     """Number of steps missed by server or client."""
     estimate_error_m: float | None = None
-    """Root mean square of the error of the position that the vehicle flew by, from `settle` on [m];
-    None if it knew the true position."""
+    """Root mean square of the error of the position used by feedback, from `settle` on [m]; None if
+    that position is exact."""
     secure: bool = False
     """Whether the link was authenticated and encrypted."""
 
@@ -121,7 +124,6 @@ def summarise(
     """Summary of one vehicle's flight.
 
     Args:
-        scenario: the scenario.
         name: name of the scenario.
         client: rows of the vehicle in the client's part.
         server: rows of the server, of any vehicles.
@@ -199,11 +201,10 @@ def summarise(
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
-    The position of a live point and the goal of a vehicle on a mission are only in the server's
-    record: at a step without a row the previous one holds. NaN if unknown.
+    Only the server's record has the position of a live point and the goal of a vehicle on a
+    mission: at a step without a row the previous one holds. NaN if unknown.
 
     Args:
-        scenario: the scenario.
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
@@ -222,7 +223,6 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
 
 
 def _too_fast(scenario: Scenario, client: Rows) -> float | None:
-    """Share of the steps at which the desired trajectory is too fast to be followed."""
     if not (is_known(scenario) and len(client)):
         return None
     velocity = scenario.make_reference()(client["step"] * scenario.control.dt)[..., 1]
@@ -236,7 +236,7 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 
 
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
-    """Error of the position that was flown by [m]; shape (steps, axes).
+    """Error of the position used by feedback [m]; shape (steps, axes).
 
     With a dead time it is compared with the true position a dead time later; NaN after the flight.
     """
@@ -254,7 +254,6 @@ def _estimate_error(scenario: Scenario, client: Rows) -> Array:
 
 
 def _rms(vectors: Array) -> float:
-    """Root mean square of the lengths of vectors; shape (n, axes)."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
@@ -296,9 +295,9 @@ def _quantile(values: Array, share: float) -> float | None:
 def least_separation(
     each: Sequence[Rows], began_s: Sequence[float], dt_s: float, height_scale: float = 1.0
 ) -> float | None:
-    """Smallest distance between two vehicles while both are on a mission [m]; None without any.
+    """Smallest distance between two vehicles while both are on a mission [m]; see `separations`.
 
-    See `separations`.
+    None if no two vehicles were on a mission at the same time.
     """
     _, least_m = separations(each, began_s, dt_s, height_scale)
     return float(np.nanmin(least_m)) if np.isfinite(least_m).any() else None
@@ -318,8 +317,8 @@ def separations(
         height_scale: factor of distances along the third axis, see `MissionConfig`.
 
     Returns:
-        times on that clock [s; shape (n,)], empty for fewer than two vehicles, and distances [m],
-        NaN while fewer than two fly.
+        times on that clock [s; shape (n,)], empty for fewer than two vehicles, and distances
+            [m], NaN while fewer than two fly.
     """
     tracks = [
         track(rows, began, dt_s, height_scale)
@@ -336,14 +335,9 @@ Track = tuple[Array, Array]
 def track(
     rows: Rows, began_s: float, dt_s: float, height_scale: float = 1.0, *, whole: bool = False
 ) -> Track:
-    """Positions of a vehicle over time, see `separations`.
+    """Positions of a vehicle over time; arguments as in `separations`.
 
-    Args:
-        rows: rows of the client's part of it.
-        began_s: time at which its step 0 began [s].
-        dt_s: length of a step [s].
-        height_scale: see `separations`.
-        whole: whether to begin with the first row, not at the first step on the mission.
+    `whole` begins with the first row instead of the first step on the mission.
     """
     flown = rows if whole else rows[np.argmax(rows["mode"] == Mode.TRACK) :]
     at = flown["state"][:, :, 0].copy()
@@ -354,9 +348,7 @@ def track(
 def nearest(tracks: Sequence[Track], dt_s: float) -> tuple[Array, Array]:
     """Smallest distance between any two vehicles, over time; see `separations`.
 
-    Args:
-        tracks: one per vehicle.
-        dt_s: time from one distance to the next [s].
+    `dt_s` is the time from one distance to the next [s].
     """
     if len(tracks) < 2:
         return np.zeros(0), np.zeros(0)

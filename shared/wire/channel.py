@@ -32,11 +32,11 @@ OVERHEAD_BYTES = HEADER.size + 16
 WINDOW = 2048
 """Number of newest counters that are tracked; a packet with an older one is not opened."""
 FRESH_NS, FRESH_PACKETS = 300 * SECOND_NS, 2**22
-"""Age [ns] and number of packets of a channel from which on a new one is wanted."""
+"""Age and number of packets of a channel after which a new one is needed."""
 LIFE_NS, PACKETS_MAX = 600 * SECOND_NS, 2**32
-"""Age [ns] and number of packets from which on nothing is opened any more."""
+"""Age and number of packets after which nothing is opened any more."""
 OVERLAP_NS = 10 * SECOND_NS
-"""Time for which a replaced channel is still opened [ns]."""
+"""Time for which a replaced channel is still opened."""
 
 _PREFIX = struct.Struct("<BBHI")
 _COUNTER = struct.Struct("<Q")
@@ -45,21 +45,15 @@ _MASK = 2**WINDOW - 1
 
 
 def kind(packet: bytes) -> int:
-    """Type of a sealed packet, of a channel or of a handshake.
-
-    Raises:
-        ProtocolError: it is not a sealed packet.
-    """
+    """Type of a sealed packet; raises ProtocolError if the packet is not sealed."""
     if len(packet) < 2 or packet[0] != VERSION:
         raise ProtocolError(Drop.NOT_SEALED)
     return packet[1]
 
 
 def address(packet: bytes) -> tuple[int, int]:
-    """Numbers of the vehicle and of the channel in a packet of type DATA.
-
-    Raises:
-        ProtocolError: it is too short.
+    """Numbers of the vehicle and of the channel in a packet of type DATA; ProtocolError if too
+    short.
     """
     if len(packet) < OVERHEAD_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -68,11 +62,8 @@ def address(packet: bytes) -> tuple[int, int]:
 
 
 class OpenedPacket(NamedTuple):
-    """Content of a packet."""
-
     payload: bytes
     newest: bool
-    """Whether no later packet has arrived before it."""
 
 
 class ReplayWindow:
@@ -92,7 +83,6 @@ class ReplayWindow:
         return back < 0 or (back < WINDOW and not self._seen >> back & 1)
 
     def add(self, counter: int) -> None:
-        """Note a new counter."""
         back = self.newest - counter
         if back >= 0:
             self._seen |= 1 << back
@@ -106,8 +96,6 @@ class Channel:
     """One end of a channel: seals what it sends and opens what it receives.
 
     Args:
-        vehicle: number of the vehicle.
-        number: number of the channel.
         seal: key for packets that this end sends.
         open_: key for packets that it receives.
         born_ns: time of the handshake.
@@ -128,7 +116,6 @@ class Channel:
         self, vehicle: int, number: int, *, seal: bytes, open_: bytes, born_ns: int
     ) -> None:
         self.number = number
-        """Number of the channel."""
         self._prefix = _PREFIX.pack(VERSION, DATA, vehicle, number)
         self._seal = ChaCha20Poly1305(seal).encrypt
         self._open = ChaCha20Poly1305(open_).decrypt
@@ -138,7 +125,6 @@ class Channel:
         self._opens_until_ns = born_ns + LIFE_NS
 
     def seal(self, payload: bytes) -> bytes:
-        """Packet that carries a message."""
         header = self._prefix + _COUNTER.pack(self._sent)
         sealed = self._seal(_NONCE.pack(self._sent), payload, header)
         self._sent += 1
@@ -148,7 +134,7 @@ class Channel:
         """Message in a packet.
 
         Raises:
-            ProtocolError: it is not from the peer, is a repeat, or comes too late.
+            ProtocolError: the packet is not from the peer, is a repeat, or comes too late.
         """
         if len(packet) < OVERHEAD_BYTES:
             raise ProtocolError(Drop.LENGTH)
@@ -171,12 +157,12 @@ class Channel:
         return OpenedPacket(payload, newest)
 
     def retire(self, *, now_ns: int) -> None:
-        """Open packets that are still on their way to this end, and then nothing more."""
+        """From now on open only packets that are still on their way, for OVERLAP_NS."""
         # The smaller of both: retiring never prolongs the life of a channel.
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 
     def wants_successor(self, now_ns: int) -> bool:
-        """Whether this channel needs a successor, because of its age or number of packets."""
+        """Whether a new channel is needed, because of age or number of packets."""
         # Both directions count, since one handshake renews the keys of both.
         packets = max(self._sent, self._window.newest + 1)
         return now_ns >= self._fresh_until_ns or packets >= FRESH_PACKETS

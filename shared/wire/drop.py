@@ -58,7 +58,7 @@ class Drop(StrEnum):
     """The observation from which the horizon was planned is impossible."""
     TOO_OLD = "too old"
     TOO_EARLY = "too early"
-    """The motion of a mission begins at a step that is still ahead aboard."""
+    """A mission's motion begins at a step that is in the future of the vehicle."""
     TOO_LATE = "too late"
     NOT_TAKEN = "not taken"
 

@@ -25,12 +25,10 @@ from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
 from skytether.shared.wire.protocol import kind_of
 
 INITIATION, CHALLENGE, RESPONSE = 1, 2, 3
-"""Types of the packets."""
 
 HEADER = struct.Struct("<BBHB")
 """Version, type, vehicle and number of the key."""
 CHANNEL = struct.Struct("<I")
-"""Number of a channel."""
 COOKIE_BYTES = 16
 MAC_BYTES = 16
 INITIATION_BYTES = 512
@@ -41,41 +39,30 @@ NO_COOKIE = bytes(COOKIE_BYTES)
 """Cookie of a client that has not received one."""
 
 _GREETINGS = (1, 2)
-"""Types of the messages HELLO and WELCOME."""
 _PROLOGUE = b"skytether 1"
 _COOKIE_END = HEADER.size + COOKIE_BYTES
 _PADDED_BYTES = INITIATION_BYTES - _COOKIE_END - MESSAGE_BYTES - MAC_BYTES
-"""Size of a HELLO and its padding [B]."""
 HELLO_BYTES_MAX = _PADDED_BYTES - 1
-"""Largest size of a HELLO [B]."""
 WELCOME_BYTES_MAX = INITIATION_BYTES - RESPONSE_BYTES_MIN
-"""Largest size of a WELCOME [B]."""
 
 
 class Initiation(NamedTuple):
-    """Parts of an INITIATION."""
-
     cookie: bytes
     message: bytes
-    """First message of the handshake."""
 
 
 class Response(NamedTuple):
-    """Parts of a RESPONSE."""
-
     channel: int
-    """Number of the channel."""
     message: bytes
-    """Second message of the handshake."""
 
 
 def check_place(message: bytes, *, in_handshake: bool) -> None:
     """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
 
-    Others may repeat a packet of the handshake, so nothing else is accepted there.
+    An attacker may repeat a packet of the handshake, so nothing else is accepted there.
 
     Raises:
-        ProtocolError: even the holder of the key must not send it there.
+        ProtocolError: the message is in the wrong place, even if its sender has the key.
     """
     kind = kind_of(message)
     if kind is None or (kind in _GREETINGS) != in_handshake:
@@ -83,7 +70,7 @@ def check_place(message: bytes, *, in_handshake: bool) -> None:
 
 
 def prologue(key: VehicleKey) -> bytes:
-    """Prologue of a handshake, the same at both ends: this protocol, the vehicle and its key."""
+    """Prologue of a handshake, the same at both ends: protocol, vehicle and number of the key."""
     return _PROLOGUE + _header(key, INITIATION)
 
 
@@ -94,13 +81,11 @@ def pad(hello: bytes) -> bytes:
 
 
 def unpad(padded: bytes) -> bytes:
-    """HELLO without its padding."""
     # The byte 0x80 ends the message, so that a HELLO may end with zeros itself.
     return padded.rstrip(b"\0")[:-1]
 
 
 def write_initiation(key: VehicleKey, cookie: bytes, message: bytes) -> bytes:
-    """INITIATION from its parts."""
     packet = _sealed(key, _header(key, INITIATION) + cookie + message)
     assert len(packet) == INITIATION_BYTES
     return packet
@@ -119,10 +104,8 @@ def write_response(key: VehicleKey, channel: int, message: bytes, public: bytes)
 
 
 def address(packet: bytes) -> tuple[int, int]:
-    """Numbers of the vehicle and of its key in an INITIATION.
-
-    Raises:
-        ProtocolError: it has another length.
+    """Numbers of the vehicle and of its key in an INITIATION; ProtocolError if
+    its length is wrong.
     """
     if len(packet) != INITIATION_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -131,22 +114,14 @@ def address(packet: bytes) -> tuple[int, int]:
 
 
 def read_initiation(key: VehicleKey, packet: bytes) -> Initiation:
-    """Parts of an INITIATION.
-
-    Raises:
-        ProtocolError: its sender does not have the key.
-    """
+    """Parts of an INITIATION; ProtocolError if its sender does not have the key."""
     if not is_authentic(key, packet):
         raise ProtocolError(Drop.FORGED)
     return Initiation(packet[HEADER.size : _COOKIE_END], packet[_COOKIE_END:-MAC_BYTES])
 
 
 def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
-    """Cookie in a CHALLENGE.
-
-    Raises:
-        ProtocolError: it does not answer this ephemeral key.
-    """
+    """Cookie in a CHALLENGE; ProtocolError if it does not answer this ephemeral key."""
     if len(packet) != CHALLENGE_BYTES:
         raise ProtocolError(Drop.LENGTH)
     if not is_authentic(key, packet, public):
@@ -155,11 +130,7 @@ def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
 
 
 def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
-    """Parts of a RESPONSE.
-
-    Raises:
-        ProtocolError: it does not answer this ephemeral key.
-    """
+    """Parts of a RESPONSE; ProtocolError if it does not answer this ephemeral key."""
     if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
         raise ProtocolError(Drop.LENGTH)
     if not is_authentic(key, packet, public):

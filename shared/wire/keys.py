@@ -19,9 +19,7 @@ from skytether.shared.base.errors import ConfigError
 
 SECRET_BYTES = 32
 KEYS_MAX = 2
-"""Number of keys that a vehicle may have."""
 VEHICLES, NUMBERS = range(2**16), range(2**8)
-"""Valid numbers of a vehicle, and of a key of a vehicle."""
 FILE_BYTES_MAX = 16_000_000
 """Largest size of a file of keys [B]: enough for two keys of every vehicle, with comments."""
 
@@ -35,9 +33,8 @@ class VehicleKey:
     """A key that a vehicle shares with the server."""
 
     vehicle: int
-    """Number of the vehicle."""
     number: int
-    """Number of the key among the vehicle's."""
+    """Number of the key among the vehicle's keys."""
     psk: bytes = field(repr=False)
     """Pre-shared key of the handshake."""
     mac: bytes = field(repr=False)
@@ -54,29 +51,23 @@ class VehicleKey:
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """Keys of several vehicles."""
-
     name: str
-    """Name of the file, for messages."""
     keys: Mapping[tuple[int, int], VehicleKey] = field(repr=False)
-    """Keys by vehicle and number."""
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def find(self, vehicle: int, number: int) -> VehicleKey | None:
-        """Key with a number; None if the vehicle does not have it."""
         return self.keys.get((vehicle, number))
 
     def numbers(self, vehicle: int) -> list[int]:
-        """Numbers of a vehicle's keys, ascending."""
         return [number for number in NUMBERS if (vehicle, number) in self.keys]
 
     def of(self, vehicle: int, number: int | None = None) -> VehicleKey:
         """Key that a vehicle uses: the one with a number, or by default with the highest.
 
         Raises:
-            ConfigError: there is none.
+            ConfigError: the vehicle has no such key.
         """
         numbers = self.numbers(vehicle)
         if not numbers:
@@ -95,7 +86,7 @@ def load(path: Path) -> Keyring:
     """Keys in a file.
 
     Raises:
-        ConfigError: there are none, or not only the file's owner can read or write it.
+        ConfigError: the file has none, or others than its owner can read or write it.
     """
     name = str(path)
     try:
@@ -138,7 +129,6 @@ def parse(name: str, content: bytes) -> Keyring:
 
 
 def write(vehicle: int, number: int, secret: bytes) -> str:
-    """Line of a key in a file."""
     return f"{vehicle} {number} {secret.hex()}\n"
 
 

@@ -29,7 +29,7 @@ _NONCE = bytes(12)
 
 
 class NoiseError(Exception):
-    """A message of the handshake is not from the peer, or of another handshake."""
+    """A message of the handshake is invalid, or belongs to another handshake."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -54,16 +54,13 @@ class Symmetric:
     """Key k of the next payload."""
 
     def mix_hash(self, data: bytes) -> "Symmetric":
-        """MixHash(data)."""
         return Symmetric(self.chaining, _hash(self.digest + data), self.key)
 
     def mix_key(self, material: bytes) -> "Symmetric":
-        """MixKey(material)."""
         chaining, key = _derive(self.chaining, material, 2)
         return Symmetric(chaining, self.digest, key)
 
     def mix_key_and_hash(self, material: bytes) -> "Symmetric":
-        """MixKeyAndHash(material)."""
         chaining, data, key = _derive(self.chaining, material, 3)
         return Symmetric(chaining, _hash(self.digest + data), key)
 
@@ -80,7 +77,7 @@ class Symmetric:
         """DecryptAndHash(sealed): the next state, and the payload.
 
         Raises:
-            NoiseError: it was not encrypted in this state.
+            NoiseError: the payload was not encrypted in this state.
         """
         try:
             payload = ChaCha20Poly1305(self.key).decrypt(_NONCE, sealed, self.digest)
@@ -89,7 +86,6 @@ class Symmetric:
         return self.mix_hash(sealed), payload
 
     def split(self) -> Keys:
-        """Split(): the keys of the two directions."""
         forth, back = _derive(self.chaining, b"", 2)
         return Keys(forth, back)
 
@@ -107,17 +103,15 @@ class Initiator:
     def __init__(self, psk: bytes, prologue: bytes, private: bytes, payload: bytes) -> None:
         self._ephemeral = X25519PrivateKey.from_private_bytes(private)
         self.public = self._ephemeral.public_key().public_bytes_raw()
-        """Public ephemeral key."""
         state = _begin(psk, prologue).mix_ephemeral(self.public)
         self._state, sealed = state.seal(payload)
         self.message = self.public + sealed
-        """First message."""
 
     def open(self, message: bytes) -> tuple[bytes, Keys]:
         """Payload of the second message, and the derived keys.
 
         Raises:
-            NoiseError: it does not answer the first message.
+            NoiseError: the message does not answer the first one.
         """
         public, sealed = message[:KEY_BYTES], message[KEY_BYTES:]
         state = self._state.mix_ephemeral(public).mix_key(_exchange(self._ephemeral, public))
@@ -142,14 +136,9 @@ class Responder:
         """Public ephemeral key of the initiator."""
         state = _begin(psk, prologue).mix_ephemeral(self.public)
         self._state, self.payload = state.open(message[KEY_BYTES:])
-        """Payload of the first message."""
 
     def answer(self, private: bytes, payload: bytes) -> tuple[bytes, Keys]:
-        """Second message, and the derived keys.
-
-        Args:
-            private: private ephemeral key, 32 bytes that were never used.
-            payload: payload of the message.
+        """Second message, and the derived keys; `private` is an ephemeral key that was never used.
 
         Raises:
             NoiseError: the initiator's ephemeral key is invalid.
@@ -180,7 +169,6 @@ def _exchange(private: X25519PrivateKey, public: bytes) -> bytes:
 
 
 def _hash(data: bytes) -> bytes:
-    """HASH(data)."""
     return hashlib.blake2s(data).digest()
 
 

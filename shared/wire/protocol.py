@@ -17,13 +17,12 @@
 |      |             |         | silence                                                    |
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 
-With the scheme "trajectory" TRAJECTORY stands in place of HORIZON.
+With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
 
-`docs/protocol.md` has the bytes. What the receiver knows is not sent: a state is sampled at the
-begin of its step, so that the vehicle's clock is its step; a stamp is told in microseconds modulo
-2^32 (71 minutes), and is the one of these times that lies nearest to what the receiver expects. A
-datagram that is not exactly one of these messages is a `ProtocolError`: the peer's mistake, to be
-dropped and counted by its reason, never answered.
+A state is sampled at the start of its step, so the step number is also its time stamp. Other time
+stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 that
+comes nearest to the expected time. A datagram that is not exactly one of these messages is an error
+of the peer (`ProtocolError`): dropped, counted by its reason, and never answered.
 """
 
 import math
@@ -52,11 +51,9 @@ PAYLOAD_BYTES_MAX = 1200
 
 AXES_MAX = 3
 TEXT_MAX = 32
-"""Largest number of characters of a text in the terms."""
 INPUTS_MAX = 270
 """Largest number of inputs of all axes in one horizon, limited by the packet size."""
 KNOTS_MAX = 16
-"""Largest number of knots in one trajectory."""
 STAMPS = 2**32
 """Modulus of time stamps [µs]: 71 minutes."""
 
@@ -87,45 +84,37 @@ rounds."""
 
 
 class Refusal(IntEnum):
-    """Why a server opens no session for a vehicle."""
-
     ACCEPTED = 0
-    """The server opens a session."""
     OTHER_TERMS = 1
-    """The vehicle has other terms."""
     FULL = 2
-    """The server is full."""
     TAKEN = 3
-    """Another client uses the vehicle's number."""
 
     def __str__(self) -> str:
         return self.name.lower().replace("_", " ")
 
 
 NO_HORIZON = -1
-"""`Observation.in_force` while no horizon has arrived yet."""
+"""`Observation.in_force` before the first horizon has arrived."""
 
 
 class Hello(NamedTuple):
-    """Request of a vehicle for a session."""
-
     vehicle: int
     boot_id: int
     terms: Terms
 
 
 class Welcome(NamedTuple):
-    """Answer to HELLO: a session, or why there is none."""
+    """Answer to HELLO: a session, or the reason for a refusal."""
 
     vehicle: int
     session: int
-    """Number of the session; 0 if there is none."""
+    """Number of the session; 0 for a refusal."""
     boot_id: int
     """Boot id of the HELLO: an answer to another run of the client is dropped."""
     server_boot_id: int
     server_ns: int
     refusal: int
-    """Why there is no session, one of `Refusal`."""
+    """One of `Refusal`."""
     terms: Terms
 
 
@@ -133,23 +122,21 @@ class Mode(IntEnum):
     """Mode of a vehicle, see `client.failsafe`."""
 
     INIT = 0
-    """No session yet."""
     SYNC = 1
     """Waits until the link has been good for long enough."""
     READY = 2
     """Waits for a horizon, and to be armed."""
     TRACK = 3
-    """Flies a horizon."""
     COAST = 4
     """Flies on along a horizon without a newer one."""
     BRAKE = 5
     """Brakes to a stop, beginning at its last input."""
     HOVER = 6
-    """Stands still."""
+    """At rest, holding the position."""
     LAND = 7
-    """Descends, and stays down."""
+    """Descends, and stays on the ground."""
     FAULT = 8
-    """Has a fault: stands still, and flies nothing more."""
+    """Has a fault: holds the position, and ignores horizons."""
     MANUAL = 9
     """Flown by a pilot or nobody: nothing is sent to its autopilot."""
     RETURN = 10
@@ -160,9 +147,9 @@ class Mode(IntEnum):
 
 
 class Observation(NamedTuple):
-    """The vehicle's state at the start of a step, and what it does from there on.
+    """The vehicle's state at the start of a step, and the input flown from there on.
 
-    A further field stands last here, and its check last in the row of `_TYPES`.
+    A new field has to be appended here, and its check to the row of `_TYPES`.
     """
 
     vehicle: int
@@ -179,7 +166,6 @@ class Observation(NamedTuple):
     heard: int
     """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
-    """Mode of the vehicle, one of `Mode`."""
     takes: int
     """1 if the vehicle would use a plan that arrives now, else 0."""
     state: Array
@@ -190,7 +176,7 @@ class Observation(NamedTuple):
     number: int = 0
     """Number of packets that the vehicle has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the vehicle asks of the server [half steps]; 0 for no bound."""
+    """Longest silence that the vehicle allows the server [half steps]; 0 for no bound."""
 
 
 class Horizon(NamedTuple):
@@ -212,7 +198,7 @@ class Horizon(NamedTuple):
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
+    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
 
 
 class Trajectory(NamedTuple):
@@ -233,52 +219,46 @@ class Trajectory(NamedTuple):
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
+    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
 
 
 class Idle(IntEnum):
-    """Why the server makes no plan for a vehicle."""
-
     PLANS = 0
-    """Plans are made, and sent when the trigger asks for it."""
+    """Plans are made, and sent when the trigger says so."""
     OBSERVATION = 1
     """The newest observation is older than `link.age_max_s`, or would be when a plan began."""
     DELAY = 2
     """The delay to the vehicle is longer than a horizon can cover."""
     UNSOLVED = 3
-    """The solver has found no plan."""
 
     def __str__(self) -> str:
         return IDLE_TEXTS[self]
 
 
 IDLE_TEXTS = {
-    Idle.PLANS: "no newer horizon has come",
+    Idle.PLANS: "no newer horizon has arrived",
     Idle.OBSERVATION: "its newest observation at the server is older than link.age_max_s",
-    Idle.DELAY: "the delay to it is longer than a horizon has room for",
-    Idle.UNSOLVED: "the solver has found none",
+    Idle.DELAY: "the delay to it is longer than a horizon can cover",
+    Idle.UNSOLVED: "the solver has found no plan",
 }
 
 
 class Heartbeat(NamedTuple):
-    """Heartbeat of a server that has nothing else to send."""
-
     vehicle: int
     session: int
     server_us: int
     """Time stamp: the server's clock when it was sent."""
     idle: int
-    """Why no plan is made for the vehicle, one of `Idle`."""
     degraded: int
     """1 if the server misses too many ticks, else 0."""
     number: int = 0
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server asks of the vehicle [half steps]; 0 for no bound."""
+    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
 
 
 class Close(NamedTuple):
-    """Announcement that the sender ends; sent `CLOSES` times."""
+    """Announcement that the sender ends; sent `CLOSES` times, since packets are lost."""
 
     vehicle: int
     session: int
@@ -299,7 +279,6 @@ class Time(NamedTuple):
 
 # With 10 % loss, all three are lost once in a thousand times.
 CLOSES = 3
-"""Number of times that CLOSE is sent, since some may be lost."""
 
 
 def stamp_us(time_ns: int) -> int:
@@ -311,11 +290,11 @@ def stamp_us(time_ns: int) -> int:
 def stamped_ns(stamp: int, near_ns: int) -> int:
     """Time with a given stamp that is nearest to `near_ns` [ns].
 
-    Correct to the microsecond if the time is known to within half an hour.
+    Correct to the microsecond if `near_ns` is correct to half an hour.
     """
     near = near_ns // MICROSECOND_NS
     half = STAMPS // 2
-    # Signed distance of the stamp from what is expected, from -half to half - 1.
+    # Signed distance of the stamp from the expected one, from -half to half - 1.
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
@@ -333,7 +312,6 @@ _Check = range | _OrNone | Callable[[object, Terms], object]
 
 
 def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
-    """Received values after their checks."""
     for i, check in enumerate(checks):
         if type(check) is range:
             # `type`, not `isinstance`: True is not an integer on this wire.
@@ -348,7 +326,7 @@ def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> 
 
 
 def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms: they may differ from ours, but must have the same types."""
+    """The peer's terms, which may differ from ours, but must have the same types."""
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
@@ -395,7 +373,7 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
         raise ProtocolError(Drop.TYPE)
     most = ours.horizon + committed_max(ours)
     inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
-    largest = np.abs(inputs).max(axis=1).tolist()  # NaN where there is one
+    largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row has one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError(Drop.NOT_FINITE)
     for most, bound in zip(largest, ours.u_max, strict=True):
@@ -449,7 +427,7 @@ _U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
-# Negative if the server's clock was set and its clock map lags: the step then lies before the
+# Negative if the server's clock was set and its clock map lags: the step is then before the
 # observation.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
@@ -478,7 +456,6 @@ _FIELDS = _TYPES[_OBSERVATION - 1][1]
 
 
 def _kind(check: _Check) -> Any:
-    """Type of a field on the wire, as msgspec checks it."""
     if isinstance(check, _OrNone):
         return _kind(check.integers) | None
     return Annotated[int, Meta(ge=check[0], le=check[-1])] if isinstance(check, range) else bytes
@@ -486,7 +463,7 @@ def _kind(check: _Check) -> Any:
 
 _QUICK = msgspec.msgpack.Decoder(tuple[int, int, *map(_kind, _FIELDS)])  # type: ignore[misc]
 """Decoder of an observation that checks types and ranges at once. A packet that it refuses is
-decoded again field by field, which finds the reason."""
+decoded again field by field to find the reason."""
 _MADE = [(i, check) for i, check in enumerate(_FIELDS) if callable(check)]
 """Converters of those fields of an observation that are bytes, by the index of the field."""
 # 0x90 + n is msgpack's header of an array of n < 16 elements.
@@ -520,7 +497,6 @@ def _told(said: Observation) -> list[object]:
 
 
 def _observation(told: Iterable[Any]) -> Observation:
-    """Observation from its fields on the wire, each of which has been checked."""
     vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = told
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
@@ -577,7 +553,7 @@ def decode(payload: bytes, terms: Terms) -> Message:
     """Message in a datagram, every field checked against our own terms.
 
     Raises:
-        ProtocolError: it is not one of our messages.
+        ProtocolError: the datagram is not one of our messages.
     """
     # First of all checks: nothing is parsed of a packet that is too long.
     if len(payload) > PAYLOAD_BYTES_MAX:
@@ -589,7 +565,7 @@ def decode(payload: bytes, terms: Terms) -> Message:
                 told[i] = made_of(told[i], terms)
             return _observation(told)
     try:
-        # No message has a map or an extension, so none is ever built from a stranger's bytes.
+        # No message has a map or an extension, so none is ever built from received bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
     except (ValueError, msgpack.UnpackException) as error:
         raise ProtocolError(Drop.NOT_MSGPACK) from error

@@ -291,7 +291,7 @@ def test_an_autopilot_that_ends_in_a_climb_is_told_to_be_silent(flavour: Flavour
 def test_without_a_position_nothing_is_armed() -> None:
     air = Air("ardupilot", ready_s=60.0, mavlink={"patience_s": 3.0})
     air.end(30.0)
-    assert why(air) == ("not ready in 3 s", "it does not tell where it is")
+    assert why(air) == ("not ready in 3 s", "its position is unknown")
     assert not air.commands(ARM)
 
 

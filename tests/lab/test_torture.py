@@ -133,7 +133,7 @@ EFFECTS = [
     (fault(FaultKind.RESTART, "netem", 5, 1.5), f"brake: {Reason.LOST}"),
     (fault(FaultKind.FREEZE, "client", 5, 1.0), f"brake: {Reason.STALLED}"),
     (fault(FaultKind.FREEZE, "server", 5, 2.0), f"brake: {Reason.LOST}"),
-    (fault(FaultKind.SOLVER, "server", 5, 4), "brake: the solver has found none"),
+    (fault(FaultKind.SOLVER, "server", 5, 4), "brake: the solver has found no plan"),
     (fault(FaultKind.OVERLOAD, "server", 5, 6, 20.0), f"brake: {Reason.LOST}"),
     (fault(FaultKind.REPLAY, "both", 5, 4, 1.0), "packets: replay"),
     (fault(FaultKind.DELAY, "uplink", 5, 6, 3.0), f"brake: {Reason.LOST}"),

@@ -26,23 +26,16 @@ number."""
 
 
 class Delay(Impairment):
-    """Delay that is drawn from a distribution."""
-
     kind = "delay"
 
     def __init__(self, correlation_s: float = 0.0) -> None:
         self._correlation_s = correlation_s
 
     def quantile_ns(self, share: float) -> int:
-        """Quantile of the delay [ns].
-
-        Args:
-            share: probability, from 0 to 1.
-        """
+        """Quantile of the delay [ns] for a probability from 0 to 1."""
         raise NotImplementedError
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         correlation_s = self._correlation_s
         drawn = draws.lasting(fate, correlation_s) if correlation_s else draws.uniform(fate)
         fate.delay_ns += self.quantile_ns(drawn)
@@ -58,11 +51,9 @@ class Constant(Delay):
         self._delay_ns = seconds_to_ns(delay_s)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """See `Impairment`."""
         fate.delay_ns += self._delay_ns
 
     def quantile_ns(self, share: float) -> int:  # noqa: ARG002
-        """See `Delay`."""
         return self._delay_ns
 
 
@@ -86,7 +77,6 @@ class Paper(Delay):
         self._fewest, self._cumulative = _poisson(slots_mean)
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         slots = self._fewest + bisect_right(self._cumulative, share)
         return self._least_ns + slots * self._slot_ns
 
@@ -103,7 +93,6 @@ class Uniform(Delay):
         self._low_s, self._width_s = low_s, high_s - low_s
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         return seconds_to_ns(self._low_s + self._width_s * share)
 
 
@@ -120,7 +109,6 @@ class Normal(Delay):
         self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         return max(0, seconds_to_ns(self._mean_s + self._sd_s * _standard(share)))
 
 
@@ -138,7 +126,6 @@ class Lognormal(Delay):
         self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         return seconds_to_ns(self._least_s + self._scale_s * exp(self._sigma * _standard(share)))
 
 
@@ -159,19 +146,12 @@ class Gamma(Delay):
         self.least_s = self.quantile_ns(0.0) / SECOND_NS
 
     def quantile_ns(self, share: float) -> int:
-        """See `Delay`."""
         multiple = interpolated(share, self._shares, self._multiples)
         return seconds_to_ns(self._constant_s + self._scale_s * multiple)
 
 
 def interpolated(at: float, places: Sequence[float], values: Sequence[float]) -> float:
-    """Linear interpolation; beyond the ends, the first or last value.
-
-    Args:
-        at: place of the result.
-        places: rising places.
-        values: values at these places.
-    """
+    """Linear interpolation between ascending `places`; beyond the ends, the first or last value."""
     after = bisect_right(places, at)
     if after == 0 or after == len(places):
         return values[0 if after == 0 else -1]
@@ -181,16 +161,11 @@ def interpolated(at: float, places: Sequence[float], values: Sequence[float]) ->
 
 
 def _standard(share: float) -> float:
-    """Quantile of the standard normal distribution."""
     return _NORMAL.inv_cdf(min(max(share, _TAIL), 1.0 - 2.0**-53))
 
 
 def _over(least_s: float, mean_s: float) -> float:
-    """Mean minus smallest delay [s].
-
-    Raises:
-        ValueError: it is negative.
-    """
+    """Mean minus smallest delay [s]; raises ValueError if it is negative."""
     if mean_s < least_s:
         raise ValueError(f"mean_s to be at least least_s = {least_s:g}")
     return mean_s - least_s
@@ -202,7 +177,7 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
 
     Returns:
         number that the first probability belongs to, and the probabilities P(N ≤ number), P(N ≤
-        number + 1), …
+            number + 1), …
     """
     if mean == 0.0:  # log(0) would fail
         return 0, (1.0,)
@@ -216,7 +191,7 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
 
 @lru_cache(maxsize=64)
 def _gamma(shape: float) -> tuple[Sequence[float], Sequence[float]]:
-    """Cumulative probabilities of a gamma distribution of scale 1, and the values they belong to.
+    """Cumulative probabilities of a gamma distribution of scale 1, and their values.
 
     The density is integrated over x^shape if shape < 1, where it is unbounded in x, and over x
     otherwise.

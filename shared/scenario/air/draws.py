@@ -2,8 +2,8 @@
 
 The fate of a packet depends on the seed, its direction, its flow and the slot of SLOT_NS in which
 it enters, counted from the start of the flow. It does not depend on earlier packets. So two
-controllers meet the same network, however often each of them sends. Packets of one flow in one slot
-are numbered by rank.
+controllers are compared on the same network, however often each of them sends. Packets of one flow
+in one slot are numbered by rank.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from struct import Struct
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 SLOT_NS = MILLISECOND_NS
-"""Length of a slot [ns]: shorter than any step, so that two horizons or two observations never
-share one."""
+"""Length of a slot: shorter than any step, so that two horizons or two observations never share
+one."""
 SLOT_S = SLOT_NS / SECOND_NS
 _PLACE = Struct("<qq")
 """Input of the hash: slot and rank, or cell and number."""
@@ -104,14 +104,14 @@ class Draws:
         """Random number below 1 that is redrawn at the events of a Poisson process.
 
         Its distribution is uniform and its autocorrelation falls exponentially. It depends on the
-        newest event only, which is found by drawing the events of a cell of length `mean_s` after
-        the other, backwards from the packet's time. A cell has one event on average, and none with
-        probability 1/e.
+        newest event only. To find that event, the events of one cell of length `mean_s` after the
+        other are drawn, backwards from the packet's time. A cell has one event on average, and none
+        with probability 1/e.
 
         Args:
             fate: the packet.
-            mean_s: mean time between two events [s]. If it is not longer than a slot, each packet
-                has an independent number.
+            mean_s: mean time between two events [s]. If it is not longer than a slot, each
+                packet has an independent number.
         """
         mean_ns = mean_s * SECOND_NS
         if mean_ns <= SLOT_NS:

@@ -23,7 +23,6 @@ class Loss(Impairment):
         self.loss = share
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         if draws.uniform(fate) < self.loss:
             fate.lost = True
 
@@ -44,7 +43,6 @@ class GilbertElliott(Impairment):
         self._cell_s = burst_s * (1.0 - share)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         if self._cell_s <= SLOT_S:  # the state is independent for each packet
             fate.lost |= draws.uniform(fate) < self.loss
             return
@@ -65,7 +63,6 @@ class Outage(Impairment):
         self.loss = for_s / every_s if every_s else 0.0
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """See `Impairment`."""
         since_s = fate.time_s - self._at_s
         if since_s < 0.0:
             return
@@ -82,7 +79,6 @@ class Outages(Impairment):
         self._cell_s = for_s * (1.0 - self.loss)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         if draws.lasting(fate, self._cell_s) < self.loss:
             fate.lost = True
 
@@ -95,7 +91,6 @@ class Duplicate(Impairment):
         self._share = share
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         if draws.uniform(fate) < self._share:
             fate.copies += 1
 
@@ -108,7 +103,6 @@ class Corrupt(Impairment):
         self._share = share
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """See `Impairment`."""
         drawn = draws.uniform(fate)
         if drawn < self._share:
             fate.flipped = drawn / self._share

@@ -14,17 +14,11 @@ from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, Entry, Files
 
 TEXT_MAX = 1000
-"""Largest number of characters of a direction's text."""
 PARTS_MAX = 16
-"""Largest number of impairments of a direction."""
 
 
 class Path:
-    """Impairments of one direction.
-
-    Args:
-        calls: calls of the impairments.
-        files: files that they name.
+    """Impairments of one direction, from their calls and the files that these name.
 
     Raises:
         GrammarError: an impairment refuses its arguments, or there are two queues.
@@ -37,31 +31,25 @@ class Path:
             for call, each in zip(calls, impairments, strict=True)
             if not isinstance(each, Ordered | Queued)
         )
-        """Impairments that act on packets one by one, with their names."""
         self.is_ordered = any(isinstance(each, Ordered) for each in impairments)
-        """Whether packets of a flow stay in order."""
         finite = [each for each in impairments if isinstance(each, Queued)]
         if len(finite) > 1:
             raise GrammarError(
                 " & ".join(each.text for each in calls), "one rate or deliveries in a direction"
             )
         self.queue: Queued | None = finite[0] if finite else None
-        """Finite rate with its queue, if there is one."""
         self.least_s = sum(each.least_s for each in impairments)
-        """Smallest delay, with an empty queue [s]."""
         self.mean_s = sum(each.mean_s for each in impairments)
-        """Mean delay, with an empty queue [s]."""
         self.loss = 0.0
         for each in impairments:
             self.loss += each.loss * (1.0 - self.loss)
-        """Mean share of packets that are lost, not counting the queue's losses."""
+        """Mean share of packets that are lost, without the losses of the queue."""
 
 
 def path(text: str, files: Files = ()) -> Path:
-    """Parse the impairments of a direction; an empty text has none.
+    """Parse the impairments of a direction, joined by &; an empty text has none.
 
     Args:
-        text: impairments joined by &.
         files: files that the text names, with their contents.
 
     Raises:

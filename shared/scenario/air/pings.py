@@ -1,14 +1,14 @@
-"""Logs of ping and its kin, in any language: lines, then runs of packets, then times and trips.
+"""Logs of ping, fping and similar programs, in any language: round trips of packets.
 
-`LINES` has the kinds of lines, each with what it does to the log. Words are not read, because ping
-prints them in the user's language: an answer has `=20.3 ms` in it, a packet has a number, and what
-has a number and no time was not answered. Windows numbers nothing: between its first line and an
-empty one each line is a packet.
+`_TABLE` lists the kinds of lines, and the function that handles each. Words are not interpreted,
+because ping prints them in the user's language: an answer contains a round trip such as `=20.3 ms`,
+every packet a number, and a line with a number but no round trip is a lost packet. Windows prints
+no numbers: there each line between the first line and an empty one is a packet.
 
-A run is one call of ping. It ends with its summary, which counts what was sent after the last
-answer. A new one begins with ping's first line, where a number is answered twice that is not marked
-as a copy (`DUP!`), or with a number far below the one before, unless icmp_seq, a number of 16 bits,
-has wrapped.
+A run is one call of ping. It ends with its summary, which counts the packets sent after the last
+answer too. A new run begins with ping's first line, with a number that is answered twice without
+the mark of a copy (`DUP!`), or with a number far below the previous one, unless icmp_seq, a number
+of 16 bits, has wrapped.
 """
 
 import re
@@ -22,15 +22,12 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 ROWS_MAX = 1_000_000
-"""Largest number of packets in a file."""
 LINES_MAX = 2 * ROWS_MAX
-"""Largest number of lines of a file."""
 LINE_MAX = 400
-"""Number of characters of a line that are read."""
+"""Number of characters read of a line."""
 EVERY_S = 1.0
-"""Time between two packets, where neither times, summary nor a command line tell it [s]."""
+"""Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
-"""Number after which icmp_seq begins again."""
 NEAR = 1000
 """Largest number of packets by which an answer is late, or that are lost where icmp_seq wraps."""
 BACK_MAX_S = 10.0
@@ -38,40 +35,35 @@ BACK_MAX_S = 10.0
 
 
 class LogError(ValueError):
-    """Log that contradicts itself: the line, what it is, and what was expected."""
+    """A log that contradicts itself; the message names the line, its content and the expected
+    content.
+    """
 
 
 @dataclass(slots=True)
 class Run:
-    """Packets of one call of ping."""
-
     first: int | None = None
-    """Number of its first packet; None where the log does not show the beginning."""
+    """Number of the first packet; None if the log begins later."""
     numbered: bool = True
-    """Whether its packets have numbers in the log."""
     peer: str = ""
     """Host, in a log of fping."""
     trips: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """Time of the answer, or NaN, and round trip [s] by number; NaN of what was not answered."""
+    """Time of the answer, or NaN, and round trip [s] by number; NaN for a packet without an
+    answer."""
     last: int = -1
-    """Largest number of a packet."""
     every_s: float | None = None
-    """Time between two packets, where the log tells it [s]."""
+    """Time between two packets [s]; None if unknown."""
     at_s: float = -np.inf
-    """Time of the newest answer [s]."""
     copies: int = 0
-    """Number of further answers to a packet."""
 
     def answered(self) -> int:
-        """Number of packets that were answered."""
         return sum(isfinite(trip_s) for _, trip_s in self.trips.values())
 
     def low(self) -> int:
-        """Smallest number of a packet."""
         return min([self.last if self.first is None else self.first, *self.trips])
 
     def place(self, number: int) -> int | None:
-        """Number counted on over wraps; None where it belongs to a new run."""
+        """Number continued over wraps of icmp_seq; None if it belongs to a new run."""
         if self.last < 0:
             return number
         wrap = WRAP if number < WRAP else 0
@@ -103,28 +95,23 @@ class Run:
 
 @dataclass(slots=True)
 class Log:
-    """Runs that have been read so far."""
-
     runs: list[Run] = field(default_factory=list)
     run: Run | None = None
     """Run that the next line belongs to."""
     in_list: bool = False
-    """Whether every line is a packet, as in a list of Windows."""
+    """Whether every line is a packet, as in the output of Windows."""
     every_s: float | None = None
     """Time between two packets of the newest command line [s]."""
 
     def begin(self, first: int | None, *, numbered: bool = True) -> Run:
-        """Begin a run."""
         self.run = Run(first, numbered, every_s=self.every_s if numbered else None)
         self.runs.append(self.run)
         self.in_list = not numbered
         return self.run
 
     def add(self, number: int, trip_s: float, at_s: float, *, copy: bool, peer: str = "") -> None:
-        """Add a packet of a run with numbers.
-
-        Raises:
-            LogError: it contradicts the packets before.
+        """Add a packet of a run with numbers; raises LogError if it
+        contradicts the packets before.
         """
         run = self.run
         if run is None or not run.numbered:
@@ -149,23 +136,20 @@ class Log:
             run.trips[placed] = at_s, trip_s
 
     def list_one(self, trip_s: float) -> None:
-        """Add a packet of a run without numbers."""
         run = self.run if self.run and self.in_list else self.begin(0, numbered=False)
         run.last += 1
         run.trips[run.last] = nan, trip_s
 
     def end(self, sent: int, came: int, time_ms: int | None = None) -> None:
-        """End the run with its summary.
-
-        Raises:
-            LogError: the summary contradicts the lines above it.
+        """End the run with its summary; raises LogError if the summary contradicts the lines above
+        it.
         """
         run, self.run, self.in_list = self.run, None, False
         if run is None:
             return
         first = run.first if run.first is not None else int(time_ms is not None)
         answered, last = run.answered(), first + sent - 1
-        # Where the log begins late, the answers before its first line are not in it.
+        # If the log begins late, the answers before its first line are missing in it.
         before = 0 if run.first is not None else max(min(run.trips, default=0) - first, 0)
         if last < run.last or came < answered:
             raise LogError(
@@ -189,7 +173,7 @@ def _command(log: Log, found: re.Match[str]) -> None:
 
 
 def _head(log: Log, found: re.Match[str]) -> None:
-    # iputils counts from 1; busybox and BSD from 0, and they have a colon: "(192.0.2.1): 56 data".
+    # iputils counts from 1; busybox and BSD from 0, and print a colon: "(192.0.2.1): 56 data".
     log.begin(0 if found["six"] or found["colon"] else 1)
 
 
@@ -277,8 +261,8 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
     ("", r".", _other),
 )
 LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
-"""Kinds of lines, of which the first that fits is taken: what is in each (a quick look), its form,
-and what it does to the log. No form takes longer than its line is long."""
+"""Kinds of lines, the first match applies: a substring for a quick check, the pattern, and the
+function that handles the line. Every pattern takes linear time."""
 _PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|^PING6?\b", re.MULTILINE)
 
 
@@ -287,7 +271,7 @@ def _number(text: str) -> float:
 
 
 def _trip_s(found: re.Match[str]) -> float:
-    """Round trip [s]; NaN without one, and half of what it is less than, as in `time<1ms`."""
+    """Round trip [s]; NaN without one, and half of the bound for `time<1ms`."""
     if not found["ms"]:
         return nan
     return _number(found["ms"]) * 1e-3 * (0.5 if found["sign"] == "<" else 1.0)
@@ -298,16 +282,11 @@ def _at_s(found: re.Match[str]) -> float:
 
 
 def is_log(text: str) -> bool:
-    """Whether a text is a log of ping: it shows a packet early."""
     return _PACKET.search(text[:100_000]) is not None
 
 
 def runs(text: str) -> list[Run]:
-    """Runs in a log.
-
-    Raises:
-        LogError: it contradicts itself, or is too long.
-    """
+    """Runs in a log; raises LogError if it contradicts itself, or is too long."""
     log = Log()
     for number, whole in enumerate(StringIO(text), 1):
         if number > LINES_MAX:
@@ -324,7 +303,8 @@ def runs(text: str) -> list[Run]:
 
 
 def joined(found: Sequence[Run]) -> tuple[Array, Array]:
-    """Times of sending [s] and round trips [s], NaN of lost packets; one run behind the other.
+    """Times of sending [s] and round trips [s], NaN of lost packets; the runs are appended to each
+    other.
 
     Raises:
         LogError: there are too many packets, or no answer.

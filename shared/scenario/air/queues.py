@@ -33,7 +33,6 @@ class Queued(Impairment):
 
     @property
     def bytes_per_s(self) -> float:
-        """Mean rate [B/s]."""
         raise NotImplementedError
 
 
@@ -53,7 +52,6 @@ class Rate(Queued):
 
     @property
     def bytes_per_s(self) -> float:
-        """See `Queued`."""
         return self._bytes_per_s
 
 
@@ -77,5 +75,4 @@ class Deliveries(Queued):
 
     @property
     def bytes_per_s(self) -> float:
-        """See `Queued`."""
         return len(self.times_s) * DELIVERY_BYTES / float(self.times_s[-1])

@@ -1,12 +1,12 @@
-"""Recorded paths: files of measured delays, told apart by their content.
+"""Recorded paths: files of measured delays, in one of several formats.
 
 - CSV with a line of names: a column of times, one of delays or round trips, and maybe `lost`
-  (`_TIMES`, `_DELAYS`). This is what `skytether probe` writes, with `time_s,delay_s,lost`.
-- Logs of ping and its kin (`pings`).
+(`_TIMES`, `_DELAYS`). `skytether probe` writes this format, with `time_s,delay_s,lost`.
+- Logs of ping and similar programs (`pings`).
 - The JSON that `irtt client -o` writes, gzipped or not.
 
-Each becomes rows of a time, a delay or NaN; `_checked` turns these into a path. Of a round trip
-half is taken for each direction, and a packet that was not answered is lost in both.
+Each becomes rows of a time, and a delay or NaN; `_checked` turns these into a path. Half of a round
+trip is used for each direction, and a packet without an answer is lost in both.
 """
 
 import re
@@ -26,11 +26,10 @@ from skytether.shared.scenario.air.pings import BACK_MAX_S, ROWS_MAX
 from skytether.shared.scenario.registry import File
 
 DELAY_MAX_S = 3600.0
-"""Largest delay [s]."""
 TEXT_BYTES_MAX = 256 * 1024 * 1024
-"""Largest size of a file that was gzipped [B]."""
+"""Largest size of a file after decompression [B]."""
 TIE_S = 1e-6
-"""Time between two packets that were sent at one time, as the file has it [s]."""
+"""Difference of times up to which two packets count as sent at the same time [s]."""
 
 CAPTURES = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
 """First bytes of a pcap file: both byte orders, with times in microseconds and nanoseconds."""
@@ -42,31 +41,29 @@ Way = Literal["auto", "send", "receive"]
 
 @dataclass(frozen=True, slots=True)
 class RecordedPath:
-    """Delays of a recorded path, a row a packet."""
+    """Delays of a recorded path, one row per packet."""
 
     time_s: Array
     """Times at which packets were sent, rising from 0 [s]; shape (n,)."""
     delay_s: Array
     """One-way delays [s]; those of lost packets are interpolated; shape (n,)."""
     lost: Flags
-    """Whether each was lost; shape (n,)."""
     halved: bool = False
-    """Whether the delays are halves of round trips."""
     copies: int = 0
-    """Number of further answers to a packet, where the file has them."""
+    """Number of further answers to a packet, if the file lists them."""
 
 
 @lru_cache(maxsize=16)
 def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
-    """Path that a file holds.
+    """Path recorded in a file.
 
     Args:
         file: its name and content.
-        way: of a file of irtt, the delay from client to server (send) or back (receive), which
+        way: for a file of irtt, the delay from client to server (send) or back (receive), which
             needs synchronised clocks; auto: half of the round trip.
 
     Raises:
-        ValueError: it holds no delays, or they contradict each other.
+        ValueError: the file has no delays, or they contradict each other.
     """
     try:
         text = text_in(file)
@@ -119,16 +116,16 @@ def text_in(file: File) -> str:
 
 _TIMES = ("time", "sent", "timestamp", "t")
 _DELAYS = {"delay": 1.0, "rtt": 0.5}
-"""Names of columns, before their unit, and what makes a delay a one-way delay."""
+"""Names of columns, without their unit, and the factor from a delay to a one-way delay."""
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _NAME = re.compile(r"([a-z]+)(?:[ _]?[\[(]?(s|sec|ms|msec|us|µs|ns)[\])]?)?", re.IGNORECASE)
 
 
 def table(text: str, columns: Sequence[int], delimiter: str = ",") -> Array:
-    """Numbers of columns below a line of names; shape (rows, columns). What is left out is NaN.
+    """Numbers of columns below a line of names; shape (rows, columns). An empty cell is NaN.
 
     Raises:
-        ValueError: there are too many rows, none, or one with something else.
+        ValueError: there are too many rows, none, or one with an invalid cell.
     """
     rows = text.rstrip().count("\n")
     if rows > ROWS_MAX:
@@ -156,7 +153,7 @@ def _cell(word: str) -> float:
 
 
 def _wrong_cell(text: str, columns: Sequence[int], delimiter: str) -> str:
-    """The first line that has no number where one is expected."""
+    """The first line without a number in a column that needs one."""
     for number, line in enumerate(StringIO(text), 1):
         cells = line.rstrip("\r\n").split(delimiter)
         if number == 1 or not line.strip():
@@ -203,7 +200,9 @@ def _of_csv(text: str) -> RecordedPath:
 
 
 def _unit_of_times(times: Array, name: str) -> float:
-    """Unit of a column of times that does not say it: of times since 1970 their size tells it."""
+    """Unit of a column of times without a unit: that of times since 1970
+    follows from their size.
+    """
     largest = float(np.nanmax(times, initial=0.0))
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest >= least:
@@ -215,7 +214,7 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
     """Unit of a column: seconds if its median is below `low`, milliseconds if above `high`.
 
     Raises:
-        ValueError: it lies between.
+        ValueError: the median lies between.
     """
     known = values[np.isfinite(values)]
     median = float(np.median(known)) if len(known) else 0.0
@@ -229,41 +228,36 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
 
 
 class _Stamp(msgspec.Struct):
-    """Time at which a packet was sent, on a clock that only rises, or of day [ns]."""
+    """Time at which a packet was sent, on a monotonic clock, or of day [ns]."""
 
     monotonic: float | None = None
     wall: float | None = None
 
 
 class _OfClient(msgspec.Struct):
-    """Times of the end that measured."""
-
     send: _Stamp
 
 
 class _Stamps(msgspec.Struct):
-    """Times of one packet."""
-
     client: _OfClient
 
 
 class _Trip(msgspec.Struct):
-    """Packet there and back."""
-
     lost: str | bool
     timestamps: _Stamps
     delay: dict[str, float] = {}
 
 
 class _Irtt(msgspec.Struct):
-    """File of irtt: everything else in it takes no memory."""
+    """Part of irtt's JSON that is used; the rest is not stored."""
 
     round_trips: list[_Trip]
 
 
 _LOST = (np.nan, np.nan)
 CLOCKS_S = 1e-3
-"""Largest error of a one-way delay of irtt that does not show that clocks differ [s]."""
+"""Largest error of a one-way delay of irtt that may come from measurement alone, not from clocks
+[s]."""
 
 
 def _of_irtt(text: str, way: Way) -> RecordedPath:
@@ -288,15 +282,11 @@ def _of_irtt(text: str, way: Way) -> RecordedPath:
     return _checked(times, np.clip(delays, 0.0, None))
 
 
-# -- what they have in common ---------------------------------------------------------------------
+# -- all formats ---------------------------------------------------------------------
 
 
 def _refuse(wrong: Flags, values: Array, expected: str) -> None:
-    """Refuse rows of which one is wrong.
-
-    Raises:
-        ValueError: with the first of them.
-    """
+    """Raise ValueError with the first row that is `wrong`, if there is one."""
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ValueError(f"row {row + 1}: got {values[row]:.10g}, expected {expected}")
@@ -312,7 +302,7 @@ def _checked(
         delay_s: one-way delays, NaN of lost packets [s]; shape (n,).
 
     Raises:
-        ValueError: with the first row that is not possible.
+        ValueError: with the first invalid row.
     """
     if not 0 < len(time_s) <= ROWS_MAX:
         raise ValueError(f"got {len(time_s)} rows, expected 1 to {ROWS_MAX}")
@@ -324,7 +314,7 @@ def _checked(
     _refuse(delay_s < 0.0, delay_s, "a delay of at least 0, or -1 of a lost packet")
     _refuse(delay_s > DELAY_MAX_S, delay_s, f"a delay of at most {DELAY_MAX_S:g} s")
     if lost.all():
-        raise ValueError("got lost packets alone, expected at least one that came")
+        raise ValueError("got lost packets only, expected at least one that arrived")
     order = np.argsort(time_s, kind="stable")
     time_s, delay_s, lost = time_s[order] - time_s[order[0]], delay_s[order], lost[order]
     if time_s[-1] > 1e9:

@@ -1,7 +1,8 @@
-"""Recorded networks: delays of a recorded path (`recorded`), and times at which packets may go.
+"""Recorded networks: delays of a recorded path (`recorded`), and times at which packets are
+delivered.
 
-Times at which packets may go are files as mahimahi has them: a line for each packet of 1504 bytes,
-with the millisecond at which it may go.
+Delivery times are files in mahimahi's format: a line for each packet of 1504 bytes, with the
+millisecond of its delivery.
 """
 
 from functools import lru_cache
@@ -18,7 +19,7 @@ from skytether.shared.scenario.air.recorded import Way, recorded_in, table, text
 from skytether.shared.scenario.registry import File
 
 DELIVERY_BYTES = 1504
-"""Bytes that may go at a time of mahimahi's."""
+"""Bytes delivered at each time of a mahimahi file."""
 
 
 @impairment(name="trace")
@@ -45,7 +46,7 @@ class Trace(Impairment):
         self.loss = float(recorded.lost.mean())
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """See `Impairment`; a packet between two of the file is lost as the nearer was."""
+        """A packet between two of the file is lost if the nearer one was."""
         time_s = fate.time_s % self._loop_s if self._loop_s else fate.time_s
         fate.delay_ns += seconds_to_ns(interpolated(time_s, self._times_s, self._delays_s))
         if self._loses and interpolated(time_s, self._times_s, self._lost) > 0.5:
@@ -54,10 +55,10 @@ class Trace(Impairment):
 
 @lru_cache(maxsize=16)
 def deliveries_in(file: File) -> Array:
-    """Times at which packets of DELIVERY_BYTES may go [s], in a file of mahimahi; shape (n,).
+    """Times at which packets of DELIVERY_BYTES are delivered [s], from a mahimahi file; shape (n,).
 
     Raises:
-        ValueError: it holds no such times.
+        ValueError: the file has no such times.
     """
     try:
         times = table("\n".join(["ms", *text_in(file).split()]), [0])[:, 0]
