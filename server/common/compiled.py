@@ -43,12 +43,10 @@ def axis_of(record: Axis) -> Axis:
 
 @inline
 def axis_at(model: Axes, axis: int) -> Axis:
-    """Model of one of several axes."""
     return axis_of(model[axis])
 
 
 def axes_of(model: Model) -> Axes:
-    """Model as an array for kernels; shape (axes,)."""
     return np.array([tuple(axis) for axis in model.axes()], dtype=AXIS)
 
 

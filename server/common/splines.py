@@ -1,4 +1,4 @@
-"""Splines that are sent to vehicles: their messages, and their inputs for the record."""
+"""Splines sent to vehicles: their messages, and their inputs for the record."""
 
 from collections.abc import Callable, Iterator
 
@@ -20,14 +20,15 @@ class SplineScheme(Scheme):
     properties = SchemeProperties(flown_as="trajectory", feedback=True)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
         sent, told = batch.sent, batch.foresight.splines
         rows, old = batch.rows[sent], told.age[sent]
         step = batch.step[sent] - old
         age = step - self.observed_step[rows]
-        # A motion that is sent again is older than the newest observation, from which it was not
-        # planned; its age is 0. Others have a negative age if the server's clock was set and the
-        # clock map lags, as a horizon has: it must name an existing observation.
+        # A trajectory that is sent again is older than the newest observation: its age is set to 0.
+        # Others
+        # have a negative age if the server's clock was set and the clock map lags, as a horizon
+        # has: the age
+        # must lead to the step of an existing observation.
         age = np.where(old > 0, np.maximum(age, 0), age)
         columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
         for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
@@ -37,7 +38,6 @@ class SplineScheme(Scheme):
             yield row, encode(Trajectory(*said))
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
         terms, sent, told = self.terms, batch.sent, batch.foresight.splines
         step = batch.step[sent] - told.age[sent]
         knots = told.knots[sent].astype(np.float64)
