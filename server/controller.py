@@ -67,7 +67,7 @@ def other_schemes(scenario: Scenario) -> set[str]:
     """Modules whose kernels are not called in a scenario."""
     own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
     every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
-    names = tuple(f"{each.__name__}." for each in every.difference(own))
+    names = tuple(f"{module.__name__}." for module in every.difference(own))
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 

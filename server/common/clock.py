@@ -260,10 +260,10 @@ class ClockMap:
 
 @inline
 def least(values: I1) -> int:
-    found = values[0]
+    smallest = values[0]
     for value in values:
-        found = min(found, value)
-    return found
+        smallest = min(smallest, value)
+    return smallest
 
 
 @part

@@ -30,8 +30,7 @@ class Splines(NamedTuple):
     """Trajectories sent by the scheme "trajectory"; with other schemes `block` is 0."""
 
     knots: S3
-    """Position [m] and velocity [m/s] of each knot, alternating; shape (block, axes, 2 KNOTS_MAX).
-    """
+    """Position [m] and velocity [m/s] of each knot in turn; shape (block, axes, 2 KNOTS_MAX)."""
     number: I1
     """Number of knots; shape (block,)."""
     spacing: I1

@@ -20,35 +20,35 @@ class SplineScheme(Scheme):
     properties = SchemeProperties(flown_as="trajectory", feedback=True)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        sent, told = batch.sent, batch.foresight.splines
-        rows, old = batch.rows[sent], told.age[sent]
+        sent, splines = batch.sent, batch.foresight.splines
+        rows, old = batch.rows[sent], splines.age[sent]
         step = batch.step[sent] - old
         age = step - self.observed_step[rows]
         # A trajectory that is sent again is older than the newest observation: its age is set to 0.
-        # Others
-        # have a negative age if the server's clock was set and the clock map lags, as a horizon
-        # has: the age
-        # must lead to the step of an existing observation.
+        # Others have a negative age if the server's clock was set and the clock map lags, as a
+        # horizon has: the age must lead to the step of an existing observation.
         age = np.where(old > 0, np.maximum(age, 0), age)
-        columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
-        for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
-            knots = told.knots[i, :, : 2 * n].reshape(-1, n, 2)
+        columns = (sent, rows, step, age, splines.spacing[sent], splines.number[sent])
+        for i, row, k, age_steps, spacing, n in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            knots = splines.knots[i, :, : 2 * n].reshape(-1, n, 2)
             vehicle, session, sent_us, number, silence = header(row)
-            said = (vehicle, session, k, sent_us, o, spacing, knots, number, silence)
-            yield row, encode(Trajectory(*said))
+            fields = (vehicle, session, k, sent_us, age_steps, spacing, knots, number, silence)
+            yield row, encode(Trajectory(*fields))
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        terms, sent, told = self.terms, batch.sent, batch.foresight.splines
-        step = batch.step[sent] - told.age[sent]
-        knots = told.knots[sent].astype(np.float64)
+        terms, sent, splines = self.terms, batch.sent, batch.foresight.splines
+        step = batch.step[sent] - splines.age[sent]
+        knots = splines.knots[sent].astype(np.float64)
         inputs = np.empty((len(sent), terms.axes, terms.horizon))
         inputs_along(
             axes_of(terms.model),
             np.array(terms.u_max),
             terms.dt_s,
             knots,
-            told.number[sent],
-            told.spacing[sent],
+            splines.number[sent],
+            splines.spacing[sent],
             inputs,
         )
         return SentPlans(step, step + batch.foresight.ahead[sent], knots[:, :, :2], inputs)

@@ -14,21 +14,19 @@ from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.zones import Zones
 
 NODES_MAX = 200
-"""Largest number of nodes; beyond it the corners of further zones are left out, the sharpest
-last."""
+"""Largest number of nodes; with more, corners of the last zones are left out."""
 OFF_M = 0.1
 """Distance of nodes from corners beyond the clearance [m]."""
 GRAPHS_MAX = 64
 """Largest number of cached graphs, each for the zones at some heights."""
 TINY_M = 1e-6
-"""Rounding tolerance."""
+"""Rounding tolerance [m]."""
 
 
 class Routes:
     """Routes around zones.
 
     Args:
-        zones: the zones.
         clearance_m: distance of routes from zones [m].
     """
 
@@ -37,13 +35,8 @@ class Routes:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """Shortest route: its corners, then the goal; only the goal if there is no route.
-
-        Args:
-            place, goal: positions; shape (axes,).
-
-        Returns:
-            shape (n, axes); n >= 1.
+        """Shortest route: its corners, then the goal; only the goal if there is no route; shape (n,
+        axes).
         """
         if not self._zones:
             return goal[None]
@@ -53,7 +46,6 @@ class Routes:
         return points
 
     def reaches(self, place: Array, goal: Array) -> bool:
-        """Whether there is a route; shapes (axes,)."""
         graph = self._graph(self._heights(place, goal))
         return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
 
@@ -79,10 +71,9 @@ class Routes:
 
 
 class Graph:
-    """Visibility graph in the plane.
+    """Visibility graph in the plane; the zones are taken as infinitely high.
 
     Args:
-        zones: the zones, taken as infinitely high.
         clearance_m: distance of routes from zones [m].
     """
 
@@ -93,14 +84,14 @@ class Graph:
             clear = zones.clearance(self._nodes).min(axis=1) >= clearance_m
             self._nodes = self._nodes[clear][:NODES_MAX]
         n = len(self._nodes)
-        here, there = np.triu_indices(n, 1)
+        first, second = np.triu_indices(n, 1)
         far = np.full((n, n), np.inf)
         np.fill_diagonal(far, 0.0)
         if n > 1:
-            sees = self.sees(self._nodes[here], self._nodes[there])
-            here, there = here[sees], there[sees]
-            far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
-            far[there, here] = far[here, there]
+            sees = self.sees(self._nodes[first], self._nodes[second])
+            first, second = first[sees], second[sees]
+            far[first, second] = np.linalg.norm(self._nodes[first] - self._nodes[second], axis=1)
+            far[second, first] = far[first, second]
         after = np.where(np.isfinite(far), np.arange(n), -1)
         for via in range(n):
             longer = far > far[:, [via]] + far[[via]]
@@ -114,10 +105,10 @@ class Graph:
         """Corners of the shortest path between two positions; empty if there is none or it is
         straight.
         """
-        here, there, nodes = place[None], goal[None], self._nodes
-        if not len(nodes) or self.sees(here, there)[0]:
+        start, end, nodes = place[None], goal[None], self._nodes
+        if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]
-        long = self._lengths(here)[:, None] + self._far + self._lengths(there)
+        long = self._lengths(start)[:, None] + self._far + self._lengths(end)
         via, at = np.unravel_index(int(long.argmin()), long.shape)
         if not np.isfinite(long[via, at]):
             return nodes[:0]
@@ -126,17 +117,17 @@ class Graph:
             path.append(int(self._after[path[-1], at]))
         return nodes[path]
 
-    def sees(self, here: Array, there: Array) -> Flags:
+    def sees(self, starts: Array, ends: Array) -> Flags:
         """Whether straight lines keep their clearance; shape (n,), for points of shape (n, 2)."""
-        return are_clear(self._zones, here, there, self._clearance_m - TINY_M)
+        return are_clear(self._zones, starts, ends, self._clearance_m - TINY_M)
 
-    def _lengths(self, here: Array) -> Array:
-        """Distances of nodes from a position, infinite if not joined by a clear line; shape
+    def _lengths(self, start: Array) -> Array:
+        """Distances of nodes from a position [m], infinite if not joined by a clear line; shape
         (n,).
         """
         nodes = self._nodes
-        sees = self.sees(np.repeat(here, len(nodes), axis=0), nodes)
-        return np.where(sees, np.linalg.norm(nodes - here, axis=1), np.inf)
+        sees = self.sees(np.repeat(start, len(nodes), axis=0), nodes)
+        return np.where(sees, np.linalg.norm(nodes - start, axis=1), np.inf)
 
 
 def _nodes(zones: Zones, off_m: float) -> Array:
@@ -155,6 +146,6 @@ def _nodes(zones: Zones, off_m: float) -> Array:
         straight = size[:, 0] < 1e-6
         halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
         size[straight] = 1.0
-        # On both sides: vehicles may be on either.
+        # Vehicles may be on either side.
         points += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
     return np.concatenate(points)

@@ -9,8 +9,8 @@ with the target g, and a half-plane for each near motion and zone and each time,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
-where q is that motion, or the zone's nearest point, and p̃ the motion in force. That fulfils all
-constraints, so there is always a solution.
+where q is the near motion, or the zone's nearest point, and p̃ the motion in force. The motion in
+force fulfils all constraints, so there is always a solution.
 
 For a vehicle far from all others there are no half-planes, and no constraint couples the axes:
 `solve_axes` solves them one by one. Its result equals that of `solve` to the last bit, where the
@@ -45,14 +45,12 @@ LAST_WEIGHT = 5.0
 
 
 class QPConstants(NamedTuple):
-    """Constants of all motion QPs."""
-
     T: float
-    """Time from one knot of a motion to the next [s]."""
+    """Time between successive knots of a motion [s]."""
     acceleration: float
     """Largest acceleration on an axis, a_max [m/s²]."""
     most: F1
-    """Bound of v_n + τ a_n on each axis, u [m/s]; shape (axes,)."""
+    """Bound u of v_n + τ a_n [m/s]; shape (axes,)."""
     weights: F1
     """Weights w_n of positions; shape (N,)."""
     to_position: F2
@@ -80,7 +78,6 @@ class TrajectoryQP:
     """Solver of the QP for one motion.
 
     Args:
-        terms: terms of the flight.
         acceleration_mps2: largest acceleration on an axis, a_max [m/s²].
         speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
     """
@@ -91,14 +88,14 @@ class TrajectoryQP:
         tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
         most = INPUT_SHARE * np.array(terms.u_max) * gain
         if speed_mps:
-            # A bound per axis keeps the constraints linear: exact on the diagonal, cautious along
+            # A bound per axis keeps the constraints linear: exact on the diagonal, stricter along
             # an axis.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         place = np.arange(n)
         to_velocity = T * np.tril(np.ones((n, n)))
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * TIMES_PER_INTERVAL + 1) / TIMES_PER_INTERVAL
-        """Times at which distances are kept, from the begin of the plan [intervals]."""
+        """Times at which distances are kept, from the beginning of the plan [intervals]."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         hessian = to_position.T @ (weights[:, None] * to_position)
@@ -134,7 +131,6 @@ class TrajectoryQP:
             x=np.zeros(n),
             scratch=workspace(n, m),
         )
-        """QPs of single axes."""
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
@@ -147,8 +143,8 @@ class TrajectoryQP:
         without a solution.
 
         Args:
-            kept_p, kept_v: knots of the motion in force up to the begin of the plan [m, m/s]; shape
-                (kept, axes).
+            kept_p, kept_v: knots of the motion in force up to the beginning of the plan [m, m/s];
+                shape (kept, axes).
             goal: target g [m]; shape (axes,).
             planes: constraints on positions at `times`.
         """
@@ -172,8 +168,7 @@ class TrajectoryQP:
         """QP for `DualActiveSet`: linear term, columns of the constraints, and their bounds.
 
         Args:
-            p0, v0: state at the begin of the plan [m, m/s]; shape (axes,).
-            goal, planes: see `solve`.
+            p0, v0: state at the beginning of the plan [m, m/s]; shape (axes,).
         """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
@@ -197,7 +192,6 @@ class TrajectoryQP:
 
 @kernel
 def _fill_qp(constants: QPConstants, p0: F1, v0: F1, goal: F1, linear: F1, bounds: F1) -> None:
-    """Fill in the linear term, and the bounds of the constraints that are always present."""
     axes = len(p0)
     for x in range(axes):
         _fill_axis(constants, x, p0[x], v0[x], goal[x], linear, bounds, x, axes)
@@ -238,10 +232,9 @@ def solve_axes(
     """Fill in the knots of a motion without half-planes; returns whether there is a solution.
 
     Args:
-        constants, problem: see `TrajectoryQP`.
-        kept: number of given knots, those of the motion in force.
+        kept: number of knots taken from the motion in force.
         goal: target g [m]; shape (axes,).
-        position, velocity: knots, the given ones first [m, m/s]; shape (kept + N, axes).
+        position, velocity: knots, the kept ones first [m, m/s]; shape (kept + N, axes).
     """
     linear, bounds = problem.linear, problem.bounds
     for x in range(len(goal)):
@@ -283,7 +276,6 @@ def _integrate_axis(
 def _append_half_planes(
     constants: QPConstants, p0: F1, v0: F1, planes: HalfPlanes, columns: F2, bounds: F1
 ) -> None:
-    """Fill in the columns and bounds of half-planes, which come last."""
     n, fixed = len(constants.weights), len(bounds) - len(planes.time)
     for m in range(len(planes.time)):
         at = planes.time[m]
@@ -300,7 +292,6 @@ def _append_half_planes(
 def _integrate(
     constants: QPConstants, accelerations: F1, kept: int, position: F2, velocity: F2
 ) -> None:
-    """Fill in the planned knots from the accelerations."""
     n = len(constants.weights)
     for x in range(position.shape[1]):
         _integrate_axis(constants, accelerations, x * n, x, kept, position, velocity)
@@ -315,7 +306,6 @@ def _positions(times: Array, place: Indices, T: float) -> Array:
 
 
 def _blocks(blocks: list[Array]) -> Array:
-    """Block-diagonal matrix."""
     rows, columns = (sum(block.shape[axis] for block in blocks) for axis in (0, 1))
     whole, row, column = np.zeros((rows, columns)), 0, 0
     for block in blocks:
