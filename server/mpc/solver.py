@@ -5,7 +5,8 @@ from typing import Protocol
 from skytether.shared.law.model import Array, Flags
 
 NEAR = 1.0 - 1e-6
-"""Share of its bound from which on a guessed input counts as at the bound: guesses were float32."""
+"""Share of its bound above which a guessed input counts as at the bound; guesses were rounded to
+float32."""
 
 
 class SolverFailed(Exception):

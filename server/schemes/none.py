@@ -1,4 +1,6 @@
-"""The scheme "none": the paper's MPC, which plans from the newest observation as if it were new."""
+"""The scheme "none": the paper's MPC, which plans from the newest observation as if it had no
+delay.
+"""
 
 from skytether.server.schemes import predictive
 

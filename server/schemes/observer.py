@@ -5,8 +5,8 @@ difference to the observed velocity updates the estimate:
 
     ŵ ← ŵ + (1 - e^(-m Δt / T)) (w' - ŵ)          w': constant input that explains the difference
 
-with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with the
-flown inputs as it knows them.
+with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with its own
+record of the flown inputs.
 """
 
 import numpy as np
