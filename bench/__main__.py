@@ -121,7 +121,6 @@ def machines(results: Mapping[Section, Any]) -> TextTable:
 
 
 def packages(results: Mapping[Section, Any]) -> TextTable:
-    """Table of the versions of the solvers' packages; empty if no solvers were measured."""
     versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
     return TextTable(["package", "version"], [list(pair) for pair in versions.items()])
 

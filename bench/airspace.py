@@ -75,7 +75,6 @@ class PlannedFleet:
 
     @property
     def x(self) -> Array:
-        """State of each vehicle [m, m/s]; shape (n, axes, 2)."""
         return self._vehicles.x
 
     def plan(self) -> None:

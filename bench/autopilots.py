@@ -151,7 +151,6 @@ def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
 
 
 def began_ns(flown: Record) -> int:
-    """Time at which the first step began, on the clock of the record's events [ns]."""
     return next(each.time_ns for each in flown.events if isinstance(each.event, Flying))
 
 
@@ -257,7 +256,6 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
 
 
 def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
-    """Rows that compare the real ArduCopter with the simulated one."""
     rows = []
     for (name, air), actual_m in ACTUAL.items():
         case = name, "ardupilot", air
@@ -302,7 +300,7 @@ class AutopilotBenchmarkOptions:
     jobs: int = 1
     """Number of flights at once."""
     out: Path | None = None
-    """Folder that keeps the flights: after Ctrl-C the same command goes on."""
+    """Folder for the flights: after Ctrl-C the same command continues."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -320,7 +318,6 @@ def main(argv: Sequence[str]) -> None:
 
 
 def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
-    """Tables of docs/compare.md by name, from the flights in a folder."""
     kinds = product(get_args(FlavourName), get_args(Air), range(1, 6))
     cells = [Cell(name, *kind) for kind in kinds for name in contenders(kind[0])]
     return tables(study(fly_cell, cells, FlownCell, {}, folder, flags))

@@ -182,7 +182,6 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
 
 
 def _reference(scenario: Scenario, times_s: Array) -> Array:
-    """Horizontal reference positions at times of flight (n,) [m]; shape (n, 2)."""
     return scenario.make_reference()(times_s)[:, :2, 0]
 
 
@@ -240,7 +239,6 @@ def tables(outcomes: Sequence[FaultOutcome]) -> dict[str, TextTable]:
 
 
 def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
-    """Row of a fault: range of times over its flights, and largest distances."""
     return [
         case,
         "gone" if case == "client killed" else _sequences([each.modes for each in outcomes]),
@@ -255,7 +253,6 @@ def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
 
 
 def _sequences(changes: Sequence[Changes]) -> str:
-    """Sequences of modes, and the times of each; flights with equal sequences are merged."""
     alike: dict[tuple[str, ...], list[list[float]]] = {}
     for each in changes:
         names = tuple(name for name, _ in each)
@@ -270,7 +267,6 @@ def _sequences(changes: Sequence[Changes]) -> str:
 
 
 def _span(times_s: Sequence[float]) -> str:
-    """Range of some times; "never" for NaN."""
     finite_s = [time_s for time_s in times_s if not np.isnan(time_s)]
     if not finite_s:
         return "never"
@@ -284,7 +280,7 @@ class FailsafeBenchmarkOptions:
     seeds: int = 3
     """Number of seeds, from 1 on."""
     only: tuple[CaseName, ...] = get_args(CaseName)
-    """Faults."""
+    """Faults to fly."""
     flavours: tuple[FlavourName, ...] = get_args(FlavourName)
     """Flavours of the autopilot."""
     jobs: int = 1

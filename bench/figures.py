@@ -53,7 +53,7 @@ class Figure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: Literal["fast", "slow"] = "slow"
     """`fast`: some seconds, made by the tests as well; `slow`: by `make figures` alone."""
     minutes: float = 0.1
-    """Time to make the figure on two cores; shorter ones are made first."""
+    """Time to make the figure on two cores; figures with shorter times are made first."""
     text: str = ""
     """Text of the page with placeholders for its numbers; any white space matches any other."""
     commands: Mapping[str, str] = {}
@@ -88,9 +88,6 @@ class Number(NamedTuple):
         return f"{self.found:.{len(self.written.partition('.')[2])}f}"
 
     def is_within(self, tolerance: float) -> bool:
-        """Whether the measured number equals the written one after rounding, or within a relative
-        change.
-        """
         written = float(self.written)
         change = abs(self.found - written)
         return self.rounded() == self.written or change <= tolerance * abs(written)
@@ -142,7 +139,6 @@ def fly(cell: Flights) -> list[dict[str, Any]]:
 
 
 def cells(figure: Figure) -> dict[tuple[str, int], Flights]:
-    """Tasks of a figure by the name of the command and the first seed."""
     first, last = figure.seeds
     return {
         (name, seed): Flights(line, tuple(range(seed, min(seed + CHUNK, last + 1))))
@@ -193,7 +189,6 @@ def compare(figure: Figure, page: str, results: Mapping[tuple[str, int], Any]) -
 
 
 def compare_tables(figure: Figure, page: str, made: Mapping[str, TextTable]) -> Verdict:
-    """Comparison of tables, number by number, with the tables that their module has made anew."""
     written = refresh(page, {name: made[name] for name in figure.tables})
     numbers = list[Number]()
     for name in figure.tables:

@@ -324,7 +324,6 @@ def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
 def _sender(
     stack: ExitStack, kind: str, counts: FloodCounts, port: int, packets: list[bytes]
 ) -> Connection | None:
-    """Attacking process, started and waiting; None for a run without a flood."""
     match kind:
         case "forged packets":
             sender = start(stack, flood, port, packets, counts.forged, counts.seconds)

@@ -138,7 +138,6 @@ def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict
 
 
 def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, float]:
-    """Ratios of another contestant's figures of `figures_us` to ours."""
     return {name: theirs[f"{name}_us"] / ours[f"{name}_us"] for name in ("p50", "p99")}
 
 
@@ -200,12 +199,10 @@ def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
 
 
 def us(value: float) -> str:
-    """Number of microseconds as text, with three digits."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def times(ratio: float, target: float | None = None) -> str:
-    """Ratio as text, with its target in brackets."""
     text = f"{ratio:.0f} x" if ratio >= 100 else f"{ratio:.1f} x"
     return text if target is None else f"{text} (≥ {target:g})"
 

@@ -76,7 +76,6 @@ class Ends:
         self.begin()
 
     def begin(self) -> None:
-        """Create a new link for the vehicle, with the same random numbers as the previous one."""
         entropy = stream(1, "link", self._vehicle).bytes
         self.link = client.SecureLink(self._key, entropy=entropy)
 
@@ -184,9 +183,7 @@ def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
 
 
 def _handshakes(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
-    """Cost of a handshake to either end; each handshake is another vehicle's, since their rate is
-    limited.
-    """
+    """Cost of a handshake to either end; each is another vehicle's, since their rate is limited."""
     terms, count = load("demo").terms(), counts.handshakes
     hello = encode(Hello(1, 2**60, terms))
     welcome = encode(Welcome(1, 2**31, 2**60, 2**60, NOW_NS, 0, terms))

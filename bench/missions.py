@@ -68,8 +68,7 @@ C = TypeVar("C")
 GOAL_AT_S = 2.0
 """Time from which the goals of random and published missions hold [s]."""
 ARRIVED_M, PUBLISHED_ARRIVED_M = 0.3, 0.1
-"""Distance from its goal at which a vehicle has arrived [m]; the second is that of
-`comp_dmpc_bvc.m`."""
+"""Distances from the goal at which a vehicle has arrived [m]; the second: `comp_dmpc_bvc.m`."""
 ROOM_M2 = 12.0
 """Area for each vehicle and zone of a random mission [m²]."""
 UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
@@ -166,8 +165,8 @@ class MissionFlight(NamedTuple):
     """Smallest distance of a vehicle from a zone [m]; None without zones."""
     late: int
     arrived_s: float | None
-    """Time from which all vehicles stay at their goals, counted from the goals' start [s]; None if
-    a vehicle has not arrived."""
+    """Time from the start of the goals until all vehicles stay at them [s]; None if one has not
+    arrived."""
     left: int
     """Number of observations of a vehicle outside its tube."""
     landed: int
@@ -236,7 +235,6 @@ def fly_mission(
 
 @contextmanager
 def timed() -> Iterator[list[float]]:
-    """Computing time of the planner in each tick within the block [s]."""
     real, spent = MissionPlanner.plan, list[float]()
 
     def plan(self: MissionPlanner, rows: Indices, step: Indices, foresight: Foresight) -> None:
@@ -308,7 +306,6 @@ def mission_scenario(
 
 
 def arrivals(flown: Sequence[MissionFlight]) -> str:
-    """Median and maximum of the last arrival, over flights in which all vehicles arrived."""
     done = [each.arrived_s for each in flown if each.arrived_s is not None]
     return f"{np.median(done):.1f}, {max(done):.1f}" if done else "-"
 
@@ -558,7 +555,6 @@ def places(task: Task, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _spread(task: Task, rng: np.random.Generator, keep_m: float, scale: Array) -> Array:
-    """Random positions in a box with a minimum distance; starts again if no more positions fit."""
     while True:
         chosen = np.zeros((0, 3))
         for _ in range(20_000):
@@ -578,7 +574,7 @@ def published_scenario(
     table["mission"] |= {
         "separation_m": task.separation_m,
         "height_m": task.separation_m * task.stretch,
-        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # which Skytether plans with besides
+        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # Skytether's plans add MARGIN_M
         "acceleration_mps2": 1.0,
     }
     # A vehicle above another one must not land.

@@ -35,8 +35,8 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 
 ROWS = 64
-"""OSQP's problems are padded to a multiple of this number of constraints with constraints that
-always hold, so that OSQP is set up for a few sizes only."""
+"""OSQP's problems are padded to a multiple of this number with constraints that always hold, so
+that OSQP is set up for a few sizes only."""
 FLEETS = (16, 64, 200)
 SHARES = (0.0, 0.1, 0.5)
 """Shares of vehicles near others."""
@@ -71,7 +71,6 @@ class MotionProblem(NamedTuple):
 
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
-    """Record every QP that is solved within the block."""
     real = TrajectoryQP.solve
 
     def solve(
@@ -240,7 +239,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 def _beside_osqp(
     spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
 ) -> dict[str, Any]:
-    """Planning time of the ticks with planned vehicles, and OSQP's time."""
     root = problems[planned[0]][0].solver.root
     rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
     looked_at = planned[:: max(1, len(planned) // RIVALS)]

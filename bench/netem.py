@@ -71,13 +71,11 @@ class NetemRun:
     dropped_before: int
     """Number of packets dropped before netem read them, because its receive buffer was full."""
     dropped_within: int
-    """Number of packets dropped by netem, because its queue was full or the kernel refused to send.
-    """
+    """Number of packets dropped by netem: its queue was full, or the kernel refused to send."""
     dropped_after: int
     """Number of packets dropped after netem, because the receiver's buffer was full."""
     measured: int
-    """Number of packets whose drawn delay is known: those before the first that netem never read.
-    """
+    """Number of packets with a known drawn delay: those before the first that netem never read."""
     error_ms_p50: float
     error_ms_p99: float
     error_ms_max: float
@@ -216,7 +214,6 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
 
 
 def start_netem(stack: ExitStack, server_port: int, seed: int, record: Path) -> ChildProcess:
-    """Run netem with the paper's delays and without loss."""
     at = f"--bind={HOST}:0", f"--server={HOST}:{server_port}", f"--record={record}"
     return ChildProcess(stack, "netem", "paper", f"--seed={seed}", *at, "--network.downlink.loss=0")
 
@@ -290,5 +287,4 @@ def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
 
 
 def lost(run: NetemRun) -> int:
-    """Number of packets that never arrived; netem was configured to lose none."""
     return run.sent - run.received

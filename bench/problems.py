@@ -80,7 +80,6 @@ class RecordedProblems:
         return self.gradient.shape[1]
 
     def active(self) -> float:
-        """Share of the axis problems that have an input at its bound."""
         flat = self.gradient.reshape(-1, *self.gradient.shape[2:])
         inputs, _ = ExactSolver(self.problem).solve(flat, np.zeros_like(flat))
         return saturated(inputs, self.problem)

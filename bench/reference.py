@@ -14,8 +14,7 @@ from scipy.optimize import lsq_linear
 from skytether.shared.law.model import Array
 
 AT_BOUND = 1e-7
-"""Distance from a bound within which an input is assumed to be at the bound, before the proof
-[m/s]."""
+"""Distance from a bound within which an input is assumed to be at the bound [m/s]."""
 ROUNDS_MAX = 10
 """Largest number of corrections of the assumed set of inputs at a bound."""
 ROUNDING = 1e-11

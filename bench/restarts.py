@@ -159,7 +159,6 @@ def scenario() -> Scenario:
 
 
 def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
-    """Sequence of outages: the processes take turns."""
     kills: list[tuple[Subject, Way]] = [
         (subject, CLOSED if number % 2 else KILLED)
         for number in range(counts.kills)
@@ -188,7 +187,6 @@ class Processes:
         self.wait_for_flight()
 
     def _start(self, subject: str) -> ChildProcess:
-        """Start a process again, at its previous address."""
         self._lives += 1
         addresses = self._addresses
         match subject:
@@ -203,7 +201,6 @@ class Processes:
         return child
 
     def suffer(self, subject: Subject, way: Way) -> ProcessOutage:
-        """Kill or stop a process, and bring it back."""
         child = self._children[subject]
         if way == STOPPED:
             return ProcessOutage(subject, way, *child.freeze(DOWN_S))
@@ -265,7 +262,6 @@ def judge(
 
 
 def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
-    """Run of the vehicle that continues or starts after an outage."""
     for life in lives:
         if life.time_ns[-1] > outage.back_ns:
             return life
@@ -273,7 +269,6 @@ def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
 
 
 def _first(which: NDArray[np.bool_]) -> int:
-    """Index of the first true value; the length if there is none."""
     return int(which.argmax()) if which.any() else len(which)
 
 

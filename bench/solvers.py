@@ -42,9 +42,7 @@ FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=20, tuning=20)
 
 
 def flights() -> dict[str, Scenario]:
-    """Scenarios of a flight that never reaches its bounds, and of a flight that does at every
-    corner.
-    """
+    """Scenarios of a flight that never reaches its bounds, and of one that does at every corner."""
     control = {"dt": 0.02, "horizon": 50}
     square = {"shape": "square", "period_s": 6.0}
     return {
@@ -123,7 +121,6 @@ class SolverEntry:
         return np.array([[inputs[0] for inputs, _ in both] for both in answers]).swapaxes(0, 1)
 
     def unsolved(self) -> int:
-        """Number of problems without a solution so far."""
         return sum(not solved[0] for both in self._answers.values() for _, solved in both)
 
 

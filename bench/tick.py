@@ -43,8 +43,7 @@ TARGET_FLEET, TARGET_P99_MS = 150.0, 10.0
 """Targets for fleets: OSQP's time over that of a batch, and the p99 of STAGES [ms]."""
 FIGURE = Path(__file__).parents[1] / "docs" / "scaling.png"
 SETTLE = 50
-"""Number of ticks that are not measured: vehicles start on the reference, where they do not stay.
-"""
+"""Number of ticks before the measurement, in which vehicles leave the reference."""
 STAGES = ("estimate", "plan", "trigger")
 """Laps of the stopwatch to which TARGET_P99_MS applies."""
 
@@ -103,7 +102,6 @@ def measure(counts: TickCounts) -> dict[str, Any]:
 
 
 def tune(counts: TickCounts, lateness: WakeLateness) -> dict[str, Tuning]:
-    """Fastest tuning of OSQP for each flight of `solvers.flights`."""
     return {
         name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
         for name, scenario in solvers.flights().items()
@@ -256,7 +254,6 @@ def _scaling(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> 
 
 
 def _bytes_per_vehicle(scenario: Scenario) -> float:
-    """Memory that each further vehicle in session takes up in a server [B]."""
     few, many = (_server_bytes(scenario, count) for count in (100, 300))
     return (many - few) / 200
 
@@ -327,7 +324,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 
 
 def fleet_table(fleets: Mapping[str, Any]) -> TextTable:
-    """Table of planning in one batch against OSQP one by one, with the target."""
     rows = []
     for name, figures in fleets.items():
         row = [f"{name} ({figures['active']:.0%})"]

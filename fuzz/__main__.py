@@ -80,7 +80,6 @@ def guided(name: str, folder: Path, seconds: float) -> str:
 
 
 def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
-    """Let atheris search; ends the process."""
     target = TARGETS[name](folder)
     for function in (each for space in target.code for each in functions(space)):
         atheris.instrument_func(function)

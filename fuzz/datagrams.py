@@ -59,9 +59,7 @@ class Datagrams(Target):
 
 
 class Decoder(Datagrams):
-    """Decoder with the terms of a scenario: it rejects a payload, or returns a message that
-    re-encodes.
-    """
+    """Decoder of a scenario's messages: it rejects a payload, or its message encodes again."""
 
     code = (protocol,)
 
@@ -119,7 +117,6 @@ class EndpointInFlight(Datagrams):
             self._pass()
 
     def _pass(self) -> None:
-        """Advance time by a step; datagrams arrive at once."""
         self._now_ns += STEP_NS
         ends = ((self.client, self.server, "client"), (self.server, self.client, "server"))
         for sender, receiver, name in ends:
@@ -140,9 +137,7 @@ class EndpointInFlight(Datagrams):
         self._pass()
 
     def seeds(self) -> Sequence[bytes]:
-        """Messages of each type, odd payloads, and, twice as often, the newest datagrams of both
-        ends.
-        """
+        """Messages of each type, odd payloads, and, twice as often, both ends' newest datagrams."""
         newest = list(self.newest.values())
         return (*KNOWN, *newest * (2 * len(KNOWN) // max(1, len(newest))))
 

@@ -28,9 +28,7 @@ POINTS = 50
 
 
 class FeedTarget(Text):
-    """Target for a process's feed, in pieces: it raises `FeedError`, or decodes to frames that
-    re-encode.
-    """
+    """Target for a process's feed in pieces: it raises `FeedError`, or its frames encode again."""
 
     code: Sequence[ModuleType] = (feed,)
 

@@ -42,9 +42,7 @@ HOLDER_LIFE = 500
 
 
 class Strangers(EndpointInFlight):
-    """Target for raw datagrams to both ends of an encrypted flight, and to a vehicle without a
-    server.
-    """
+    """Target for raw datagrams to both ends of an encrypted flight, and to a client alone."""
 
     code = CODE
 
@@ -69,7 +67,6 @@ class Strangers(EndpointInFlight):
         return list(self.newest.values())
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Packet with another header or other bytes, or sometimes unchanged."""
         draw, head = rng.random(), channel.HEADER.size
         if draw < 0.1:
             return payload
@@ -100,8 +97,8 @@ class Strangers(EndpointInFlight):
         assert self.newcomer._session.number is None, payload.hex()
 
     def _unheard(self, end: Server | Client, payload: bytes, peer: Address) -> None:
-        """Send a datagram that its peer has not sealed to an end: it must be dropped, or answered
-        by a cookie.
+        """Send an end a datagram that no peer has sealed: it must be dropped, or answered by a
+        cookie.
         """
         dropped = end.dropped.total()
         end.receive(Datagram(payload, peer), now_ns=self._now_ns)
@@ -151,12 +148,10 @@ class Holder(Datagrams):
         return (b"\0" + hello, b"\1" + hello, b"\2" + bytes(16), b"\3" + welcome, b"\4" + welcome)
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Payload of the same kind, or another kind, with changed content."""
         kind = payload[:1] if rng.random() < 0.9 else rng.randbytes(1)
         return kind + super().mutated(rng, payload[1:])
 
     def __call__(self, payload: bytes) -> None:
-        """Send the packet to its destination."""
         if self._heard == HOLDER_LIFE or self.client.finished:
             self._begin()
         self._heard += 1

@@ -117,7 +117,6 @@ def fields_changed(rng: Random, payload: bytes) -> bytes:
 
 
 def _floats(rng: Random, packed: bytes) -> bytes:
-    """Change numbers in an array of a message."""
     changed = bytearray(packed)
     odd = (np.nan, np.inf, -np.inf, 1e308, -1e9, 1e-310, -0.0, 0.1)
     value = rng.choice(odd)

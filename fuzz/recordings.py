@@ -122,7 +122,6 @@ def of_topic(found: list[Any], topic: str) -> list[int]:
 
 
 def frames_of(found: list[Any], kind: str) -> dict[int, dict[str, Any]]:
-    """Frames of a type, by their positions in `found`."""
     frames = {i: msgspec.msgpack.decode(found[i].data) for i in of_topic(found, FEED)}
     return {i: frame for i, frame in frames.items() if frame["type"] == kind}
 
@@ -170,7 +169,6 @@ def changed_column(rng: Random, found: list[Any]) -> None:
 
 
 def changed_columns(rng: Random, found: list[Any]) -> None:
-    """Change the columns or the parts of a process."""
     at, opened = rng.choice(list(frames_of(found, "Opened").items()))
     part = rng.choice([*opened["parts"], "client", "netem", "plan", ""])
     parts = {**opened["parts"], part: rng.choice([*COLUMNS, *opened["parts"].values()])}
@@ -178,7 +176,6 @@ def changed_columns(rng: Random, found: list[Any]) -> None:
 
 
 def changed_channel(rng: Random, found: list[Any]) -> None:
-    """Change the topic or the encoding of a channel."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Channel)])
     if rng.random() < 0.5:
         topics = [e.topic for e in found if isinstance(e, Channel)]
@@ -188,7 +185,6 @@ def changed_channel(rng: Random, found: list[Any]) -> None:
 
 
 def changed_words(rng: Random, found: list[Any]) -> None:
-    """Change the scenario of the recording, or of a process in it."""
     (begun,) = of_topic(found, BEGUN)
     at = rng.choice([begun, *frames_of(found, "Opened")])
     message = msgspec.msgpack.decode(found[at].data)
@@ -208,7 +204,6 @@ def changed_words(rng: Random, found: list[Any]) -> None:
 
 
 def changed_times(rng: Random, found: list[Any]) -> None:
-    """Change the time of a frame."""
     at = rng.choice(of_topic(found, FEED))
     frame = msgspec.msgpack.decode(found[at].data)
     time_ns = rng.choice([0, 1, 2**31, 2**50, 2**61, 2**62, 2**63, 2**64 - 1, -1, -(2**63)])
@@ -216,7 +211,6 @@ def changed_times(rng: Random, found: list[Any]) -> None:
 
 
 def repeated(rng: Random, found: list[Any]) -> None:
-    """Repeat a message many times."""
     message = rng.choice([each for each in found if isinstance(each, Message)])
     found += [message] * rng.choice([100, 2000])
 
@@ -289,7 +283,6 @@ def misled(rng: Random, content: bytes) -> bytes:
 
 
 def scattered(rng: Random, content: bytes) -> bytes:
-    """Change bytes, or cut the file off."""
     changed = bytearray(content)
     for _ in range(rng.randrange(1, 5)):
         changed[rng.randrange(len(changed))] = rng.randrange(256)
@@ -345,7 +338,6 @@ class RecordingFile(Target):
         return hostile(rng, payload, self._records)[1]
 
     def __call__(self, payload: bytes) -> None:
-        """Read, export and join the recording, and sometimes draw a report of it."""
         self._path.write_bytes(payload)
         with suppress(RecordingError):
             known = read(self._path)

@@ -235,7 +235,6 @@ class LogLines(Text):
         super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
 
     def __call__(self, payload: bytes) -> None:
-        """Read the bytes as a line, and as an answer."""
         line = line_of(payload)
         assert line is None or str(line.event).splitlines(), payload.hex()
         with suppress(ControlError):

@@ -35,9 +35,7 @@ class Waiting(Generic[T]):
 
 @dataclass(slots=True)
 class Codel:
-    """Controlled delay, RFC 8289: drops packets that waited too long, increasingly often, until
-    waits fall.
-    """
+    """Controlled delay (RFC 8289): drops packets ever more often until queueing times fall."""
 
     above_ns: int = 0
     """Time at which waits will have been too long for INTERVAL_NS; 0 while they are short."""
@@ -48,8 +46,10 @@ class Codel:
     dropping: bool = False
 
     def drops(self, now_ns: int, *, is_fine: bool) -> bool:
-        """Whether to drop the packet at the front; `is_fine`: it waited briefly, or the queue
-        behind it is nearly empty.
+        """Whether to drop the packet at the front.
+
+        Args:
+            is_fine: whether it waited briefly, or the queue behind it is nearly empty.
         """
         late = False
         if is_fine:
@@ -131,7 +131,7 @@ class Bottleneck(Generic[T]):
             self.dropped.append(last.item)
 
     def release(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
-        """Packets that have passed by now, each with the time at which it did [ns]."""
+        """Packets that have passed by now, each with the time at which it passed [ns]."""
         while self._served is not None and self._done_ns <= now_ns:
             item, at_ns = self._served.item, self._done_ns
             self._served = None
@@ -156,7 +156,6 @@ class Bottleneck(Generic[T]):
         self._done_ns = self._pace.done_ns(now_ns, packet.size)
 
     def _next(self, now_ns: int) -> Waiting[T] | None:
-        """Next packet to be served, after those that CoDel drops."""
         while self.waiting:
             key, queue = next(iter(self._lines.items()))
             # Deficit round robin: a queue that has used up its credit goes to the end with a new
@@ -197,7 +196,7 @@ class _Rate:
         self._bytes_per_s = bytes_per_s
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet has passed whose service starts now."""
+        """Time at which a packet of this size has passed, if its service starts now."""
         return now_ns + round(size / self._bytes_per_s * SECOND_NS)
 
 
@@ -214,7 +213,6 @@ class _Deliveries:
         """Bytes of the deliveries so far that were used or lost."""
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """See `_Rate.done_ns`."""
         if self._began_ns is None:
             self._began_ns = now_ns
         times_ns = self._times_ns

@@ -55,7 +55,7 @@ class Fates:
         """Fate of a packet.
 
         Args:
-            slot: time slot in which it enters.
+            slot: time slot in which the packet enters.
             rank: number of packets of the flow that entered in that slot before it.
         """
         fate = Fate(slot, rank)
@@ -80,7 +80,7 @@ class Fates:
 
 
 def _possible(fate: Fate) -> Fate:
-    """Convert the numbers that a plug-in has set to integers.
+    """Fate after a plug-in, with its numbers converted to integers.
 
     Raises:
         ValueError, TypeError: the fate contains an impossible value.

@@ -17,8 +17,8 @@ from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 
 QUEUE_MAX = 65536
-"""Largest number of packets queued in one direction; further packets are dropped, and not counted
-as lost."""
+"""Largest number of packets queued in one direction; further ones are dropped, not counted as lost.
+"""
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
 """Largest UDP payload queued in one direction, with any `network.mtu` [B]: with both directions
 full, and Python's overhead, netem stays below 256 MiB."""
@@ -210,7 +210,6 @@ class Link:
         return True
 
     def _wait(self, entered: Entered, now_ns: int) -> None:
-        """Put a packet into the bottleneck, or delay it at once if there is none."""
         bottleneck, size = self._bottleneck, len(entered.datagram.payload)
         if bottleneck is None:
             self._delay(*entered, now_ns)
@@ -310,7 +309,7 @@ class Link:
                     pack(direction, flow, number, size, entered_ns, delay_ns, False, overtaken)
                 )
             out.append(datagram)
-        # At once: a call per packet would take longer than the work itself.
+        # All packets in one call: a call per packet would take longer than the work itself.
         counts.forwarded += len(out)
         counts.delay.add_all(delays_ns)
         counts.error.add_all(errors_ns)
@@ -339,7 +338,7 @@ class Link:
         return self._queue.size + waiting
 
     def depth_bytes(self) -> int:
-        """UDP payload in queue and bottleneck, with headers in the latter [B]."""
+        """UDP payload in queue and bottleneck, plus headers in the bottleneck [B]."""
         return self._bytes + (self._bottleneck.waiting_bytes if self._bottleneck else 0)
 
     def figures(self) -> dict[str, Any]:

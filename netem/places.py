@@ -50,7 +50,7 @@ class Flow:
     order: "Order"
     """Flows among which this flow is ordered: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of other addresses from which its first packet had come before."""
+    """Number of other addresses that had sent the flow's first packet before, see `Proxy._laps`."""
     asks: bool = False
     """Whether a packet of the client has come since the newest exchange."""
     exchanges: int = 0
@@ -95,9 +95,7 @@ class Order:
         return next(iter(flows.values())) if flows else None
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
-        """Oldest flow of a host with more than HOST_FLOWS, other than the host `but`; None if there
-        is none.
-        """
+        """Oldest flow of a host with more than HOST_FLOWS, except the host `but`, or None."""
         return next((self.oldest(host) for host in self._crowded if host != but), None)
 
 

@@ -34,8 +34,7 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 FLOWS_MAX = 512
 """Default largest number of clients at once; packets of further clients are dropped and counted."""
 LAPS_MAX = 16
-"""Largest number of flows that one packet opens, each from another address, before the server has
-answered."""
+"""Largest number of flows, each from another address, that one packet opens before an answer."""
 
 
 class Proxy(Endpoint):
@@ -82,8 +81,8 @@ class Proxy(Endpoint):
         self._faults: set[str] = set()
         """Tracebacks of plug-ins' errors that were reported."""
         self.refused = 0
-        """Number of packets from clients without a flow, and from other senders than the server at
-        a flow's socket."""
+        """Number of packets from clients without a flow, and to a flow's socket not from the
+        server."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         payload, peer, socket = datagram
@@ -148,7 +147,6 @@ class Proxy(Endpoint):
         return up_ns
 
     def _open(self, datagram: Datagram, now_ns: int) -> Flow | None:
-        """Open a flow for the sender of a packet; None if there is no place."""
         client = host, port = datagram.peer
         laps = self._laps(datagram)
         if laps > LAPS_MAX:
@@ -194,7 +192,6 @@ class Proxy(Endpoint):
         return laps
 
     def _note(self, payload: bytes, flow: Flow) -> None:
-        """Note that a packet passes through a flow."""
         digest = _digest(payload)
         laps, client = self._passed.pop(digest, (0, flow.client))
         self._passed[digest] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)

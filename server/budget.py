@@ -72,7 +72,6 @@ class SharedBudget:
         self._bytes[row], self._asked[row] = GUESS_BYTES, NEVER
 
     def fill(self, rows: Indices, now_ns: int) -> None:
-        """Begin a tick: subtract the bytes sent since the last one, and fill the bucket."""
         passed_s = 0.0 if self._filled_ns is None else (now_ns - self._filled_ns) / SECOND_NS
         self._filled_ns = now_ns
         if self._fixed is None:
@@ -119,7 +118,6 @@ class SharedBudget:
         """Subtract a packet from the budget.
 
         Args:
-            row: row of the vehicle.
             size: bytes of its payloads with one header each [B].
             is_plan: True for a plan granted by `choose`, False for a heartbeat.
         """

@@ -112,7 +112,7 @@ class Controller:
         self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
         """Longest uplink delay at which a horizon can still be flown [ns]."""
         if not terms.indexed:
-            self._uplink_max_ns = UNSEEN  # its first input is flown whenever it arrives
+            self._uplink_max_ns = UNSEEN  # the first input is flown whenever the horizon arrives
         self.desired = Desired(scenario, terms, capacity, block, references)
         self.faults: list[str] = []
         """Tracebacks of the first error of each plug-in, to be reported."""
@@ -228,7 +228,6 @@ class Controller:
 
         Args:
             rows: vehicles returned by `able`, no more than BLOCK; shape (n,).
-            step: step k of each; shape (n,).
 
         Source: algorithms 1, 2.
         """
@@ -292,9 +291,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `able`, and `idle` of vehicles whose step is new; returns the number of able
-    vehicles.
-    """
+    """Fill in `able`, and `idle` of vehicles with a new step; returns the number of the able."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
@@ -305,7 +302,7 @@ def _able(
         if step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # Its horizon would have ended, or would be refused as too late, on arrival.
+            # The horizon would have ended, or would be refused as too late, on arrival.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]

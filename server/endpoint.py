@@ -137,7 +137,6 @@ class Server(Endpoint):
         return self._grid.due_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """Run the tick that is due; missed ticks are only counted."""
         tick_ns = self._grid.next_tick(now_ns)
         if tick_ns is None:
             return
@@ -158,9 +157,7 @@ class Server(Endpoint):
                 self._out += session.sealed(encode(Close(session.vehicle, session.number)))
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; it improves the clock offsets of vehicles that also report the time of
-        day.
-        """
+        """See `Endpoint`; improves the clock offsets of vehicles that also report the time of day."""
         self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:

@@ -25,8 +25,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import NO_HORIZON, Observation
 
 REPEATS = 3
-"""Number of rejected observations in a row that, if consistent with each other, replace the
-accepted observation."""
+"""Number of consistent rejected observations in a row that replace the accepted observation."""
 SLACK_NS = 50 * MILLISECOND_NS
 """Time by which drifting clocks may shorten a measured round trip [ns]."""
 
@@ -38,14 +37,13 @@ class Statement:
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
-    """First step flown with that horizon."""
+    """First step flown with the horizon in force."""
     forward: int
     """F of `server.common.clock` [ns]."""
     backward: int
     """G of `server.common.clock` [ns]."""
     count: int
-    """Number of rejected observations in a row that are consistent, including this one; 0 if
-    accepted."""
+    """Number of consistent rejected observations in a row, this one included; 0 if accepted."""
 
 
 STATEMENT = record(Statement)
@@ -167,7 +165,6 @@ def _judge(
     dt: float,
     noise_m: float,
 ) -> int:
-    """Judge a new observation and store it with the others of its vehicle."""
     numbers, place = observed.numbers, LAST
     new = numbers[NEW, row]
     new.step, new.in_force, new.since = step, in_force, since

@@ -69,8 +69,7 @@ class RateControl:
         self._passes: float | None = None
         """Rate p that passed at the last cut [B/s]; None before the first cut."""
         self._risen_s, self._ignored_epochs = 0.0, 0
-        """Time t for which r has risen since the last cut [s], and number of epochs still to be
-        ignored."""
+        """Time t since which r has risen [s], and number of epochs still to be ignored."""
         self._low_s: deque[float] = deque(maxlen=BASE)
         """Q of the newest epochs [s]."""
         self._sent = 0.0
@@ -115,7 +114,6 @@ class RateControl:
         self._trip_ns = int(np.median(least.sum(axis=1)))
 
     def _end(self, delays_s: Array, sent: float, passed_ns: int) -> None:
-        """End an epoch in which `sent` bytes a second were sent [B/s]."""
         low, middle = np.quantile(delays_s, (QUANTILE, 0.5)).tolist()
         self._low_s.append(low)
         before, q, most = self.queueing_s, low - min(self._low_s), TARGET_S + middle - low

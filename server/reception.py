@@ -112,7 +112,6 @@ class Reception:
         """Earliest time of the next report of unauthenticated datagrams."""
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
-        """Process a datagram; returns the reason if it was dropped."""
         self._stopwatch.start()
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
@@ -243,9 +242,7 @@ class Reception:
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:
-        """Narrow the bounds of a vehicle's clock offset by its time of day, if the host knows it
-        too.
-        """
+        """Narrow the bounds of a clock offset by the vehicle's time of day, if the host knows it."""
         session = self._sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)

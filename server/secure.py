@@ -39,10 +39,11 @@ COOKIE_NS = 60 * SECOND_NS
 HANDSHAKES = 5
 """Number of handshake attempts of a vehicle per second, and of answers to repeats of an attempt."""
 PENDING_MAX = 64
-"""Number of pending channels of a vehicle. It uses the first that reaches it; up to a round trip of
-12 s this limit is not exceeded, even if an attacker replays its HELLOs (five a second)."""
+"""Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
+Up to a round trip of 12 s this limit is not exceeded, even if an attacker replays its HELLOs (five
+a second)."""
 COMPLETED_MAX = 16
-"""Number of a vehicle's newest completed attempts, which are not answered any more."""
+"""Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
 """Number of the gate's answers waiting to be sent; the oldest are dropped."""
 
@@ -63,7 +64,7 @@ FORMS = (
     Form(bytes((0x92 + len(Hello._fields),)), 1, PAYLOAD_BYTES_MAX),
 )
 """Formats of vehicles' datagrams: packets of a channel, and INITIATIONs. A plaintext HELLO (an
-array of msgpack) is dropped, but admitted so that it can be reported."""
+array of msgpack) passes this filter too, so that it can be reported when it is dropped."""
 
 
 class _HandshakeRate:
@@ -73,11 +74,11 @@ class _HandshakeRate:
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Time up to which shares of a second have been granted [ns]."""
+        """Virtual time of the rate limit, which each handshake advances by 1 / HANDSHAKES [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""
-        # A bucket of one second: what was not used earlier is lost.
+        # Unused handshakes are saved up for one second at most.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False
@@ -121,16 +122,14 @@ class _KeyedVehicle:
             del self.pending[next(iter(self.pending))]
 
     def promote(self, number: int, now_ns: int) -> None:
-        """Make a pending channel the live channel, and drop the channels that were pending before
-        it.
-        """
+        """Make a pending channel the live one, and drop the channels pending before it."""
         channel, public, _ = self.pending[number]
         self.completed.append(public)
         for older in list(self.pending):
             del self.pending[older]
             if older == number:
                 break
-        # Both are opened for a while: packets of the old channel are still on their way.
+        # Packets of the previous channel are opened for a while: some are still on their way.
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
         self.previous, self.live = self.live, channel

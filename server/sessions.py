@@ -24,8 +24,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation, Time
 
 WELCOME_NS = 5 * SECOND_NS
-"""Time after its last HELLO for which a welcomed vehicle's row stays reserved without an
-observation [ns]."""
+"""Time after the last HELLO for which a row is kept for a vehicle without an observation [ns]."""
 
 
 @dataclass(slots=True)
@@ -61,13 +60,12 @@ class Session:
     """Number of packets sent in the session, modulo NUMBERS."""
 
     def number_next(self, now_ns: int) -> int:
-        """Number of a packet that is sent now."""
         number = self.sent
         self.sent, self.sent_ns = (number + 1) % NUMBERS, now_ns
         return number
 
     def is_heartbeat_due(self, now_ns: int) -> bool:
-        """Whether nothing was sent for as long as the vehicle allows."""
+        """Whether the longest silence that the vehicle allows has passed since the last packet."""
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
     def sealed(self, payload: bytes) -> Sequence[Datagram]:
@@ -141,7 +139,7 @@ class Sessions:
         return self._by_row[row]
 
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
-        """Session of another run that holds the vehicle's number, so that this HELLO must wait.
+        """Session of another run that holds the vehicle's number, so that this HELLO is refused.
 
         It is the live session while its packets arrive; otherwise a welcomed session whose first
         observation may still come.
@@ -172,7 +170,7 @@ class Sessions:
         return oldest is None or _is_expected(oldest, now_ns)
 
     def welcome(self, hello: Hello, address: Address, line: ReplyPath, now_ns: int) -> Session:
-        """Session for the sender of a HELLO, a new or its present one; `is_full` must be False."""
+        """Session of the sender of a HELLO, present or new; `is_full` must be False."""
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
             live.home = address

@@ -50,8 +50,10 @@ class Grid:
 
     def arm(self, now_ns: int) -> None:
         dt_ns = self._dt_ns
-        if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also if our clock was set back
-            self.due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
+        if (
+            self.due_ns is None or self.due_ns > now_ns + dt_ns
+        ):  # also if the server's clock was set back
+            self.due_ns = -(-now_ns // dt_ns) * dt_ns  # next multiple of Δt, or now
 
     def rest(self) -> None:
         self.due_ns = None
@@ -72,7 +74,7 @@ class Grid:
     def _note_missed(self, count: int, now_ns: int) -> None:
         if not (count or self.degraded):
             return
-        # An hour of suspension is many ticks, of which the deque keeps the newest few only.
+        # After an hour of suspension `count` is large; the deque keeps the newest few only.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
         if many != self.degraded:
@@ -176,7 +178,6 @@ class Ticker:
             self._send(sessions.at(row), payload, is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
-        """Send a heartbeat to each vehicle that was sent nothing at this tick."""
         for session in due:
             if session.is_heartbeat_due(now_ns):
                 idle = int(self._sessions.idle[session.row])

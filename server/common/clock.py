@@ -45,8 +45,8 @@ OLD = 8
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
-"""Smallest detected step of a clock [ns]: the delay of one direction rises, that of the other falls
-by about as much."""
+"""Smallest detected step of a clock [ns]: one direction's delay rises, the other's falls as much.
+"""
 
 ECHOES = 4
 """Number of newest echoes kept per vehicle, from which the present delay to it is estimated."""
@@ -57,7 +57,7 @@ UNSEEN = 2**61
 
 
 class Contradiction(IntEnum):
-    """The knowledge of a clock offset that a sample contradicts."""
+    """Knowledge of a clock offset that a sample contradicts."""
 
     NOTHING = 0
     CLOCK = 1
@@ -75,11 +75,11 @@ class VehicleClock:
     """Numpy record: clock of one vehicle."""
 
     newest: int
-    """Interval of its newest sample, counted from zero of the server's clock."""
+    """Interval of the newest sample, counted from zero of the server's clock."""
     heard: int
-    """`Observation.heard` of its newest observation; -1 before the first."""
+    """`Observation.heard` of the newest observation; -1 before the first."""
     echoes: int
-    """Number of the server's packets for which it has reported G."""
+    """Number of the server's packets for which the vehicle has reported G."""
     adopted: int
     """Offset in use, the vehicle's clock minus the server's [ns], or UNSEEN."""
     low: int
@@ -110,7 +110,7 @@ class StepError(NamedTuple):
     early: float
     """Largest number of steps by which the vehicle may be ahead of the counted step."""
     late: float
-    """Largest number of steps by which the vehicle may be behind it."""
+    """Largest number of steps by which the vehicle may be behind the counted step."""
 
 
 EXACT = StepError(0.0, 0.0)
@@ -162,7 +162,6 @@ class ClockMap:
         """Reset the row for another vehicle, or for a new session.
 
         Args:
-            row: row of the vehicle.
             life: its number and the boot id of its client, or None if unknown. With the same boot
                 id, step 0 is the same and bounds found earlier remain valid.
         """
@@ -193,7 +192,6 @@ class ClockMap:
         """Add one F and one G of a vehicle; returns what they contradict.
 
         Args:
-            row: row of the vehicle.
             forward_ns: F [ns].
             backward_ns: G [ns].
             heard: number of the server's packet that G belongs to.
@@ -208,7 +206,6 @@ class ClockMap:
         """Narrow the offset of a vehicle's clock by its time of day; returns what that contradicts.
 
         Args:
-            row: row of the vehicle.
             offset_ns: the vehicle's clock minus the server's [ns].
             error_ns: largest error of the offset [ns].
             now_ns: server's time [ns].
@@ -226,7 +223,7 @@ class ClockMap:
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
-        """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
+        """Vehicle's clock minus the server's, for observed vehicles [ns]; shape (n,)."""
         # Updates `adopted`; the steps are not needed.
         _steps(self.seen, rows, 0, self._dt_ns, rows.copy())
         offsets: Indices = self.seen.vehicles["adopted"][rows]
@@ -274,9 +271,7 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest estimated delay of the newest ECHOES packets to a vehicle [ns]; negative while there
-    are fewer.
-    """
+    """Shortest estimated delay of the newest ECHOES packets [ns]; negative if there are fewer."""
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
@@ -313,9 +308,7 @@ def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds of settings and time of day [ns]; if the result is contradictory, reset
-    them and return False.
-    """
+    """Narrow the bounds of settings and time of day [ns]; if contradictory, reset them: False."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -367,8 +360,6 @@ def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now:
     """Narrow the bounds of a vehicle's clock offset by F and G [ns]; returns what these contradict.
 
     Args:
-        seen: clock samples.
-        row: row of the vehicle.
         forward, backward: F and G [ns].
         is_new: whether G is of an echo that no earlier observation contained.
         now: server's time [ns].
@@ -442,7 +433,7 @@ def _change(minimum: I1, newest: int, recently: int) -> int:
 
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
-    """Forget minima from before a step of the vehicle's clock or ours, if there was one."""
+    """Drop minima from before a step of the vehicle's clock or the server's, if there was one."""
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]

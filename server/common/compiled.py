@@ -12,7 +12,7 @@ from skytether.shared.law.terms import Terms
 
 AXIS = record(Axis)
 Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
-"""Model as an array for kernels; shape (axes,)."""
+"""Model of each axis, for kernels; shape (axes,)."""
 
 
 class AxisLaw(Axis):

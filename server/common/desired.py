@@ -36,7 +36,7 @@ EMPTY = -1
 FOUND = -1
 """Result of a search that finds every vehicle's page."""
 TRAJECTORY = 2**40
-"""Stride between the keys of trajectories: page p of trajectory t has the key t TRAJECTORY + p."""
+"""Stride between keys of trajectories: page p of trajectory t has the key t * TRAJECTORY + p."""
 SPREAD = 31
 """Number of slots between the first pages of successive trajectories; odd, so that all differ."""
 TINY = 1e-9
@@ -84,8 +84,7 @@ class Desired:
         self._point = _live(scenario) if wanted.shape == "live" else None
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Number of steps in a page after its PAGE steps; without a full preview, the visible
-        steps."""
+        """Steps in a page after its PAGE steps; without a full preview, the visible steps."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             # TINY: 0.15 / 0.05 is 2.9999999999999996.
@@ -133,9 +132,7 @@ class Desired:
         return int(self._number[row])
 
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; without a position it continues from its present
-        one.
-        """
+        """Move a live point, see `LivePoint.move`; default: from its present position."""
         if self._point:
             position = self._point.at(now_ns)[:, 0] if position is None else position
             self._point.move(position, velocity, now_ns)
@@ -157,7 +154,7 @@ class Desired:
         return states
 
     def due(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states when the inputs of the steps k take effect, after the dead time; see
+        """Desired states at the steps k plus the dead time, when their inputs take effect; see
         `now`.
         """
         if not self._late:
@@ -191,7 +188,7 @@ class Desired:
             return self._found
         keys = self._keys
         while (i := _find(keys, self._number, rows, steps, ahead, self._found)) != FOUND:
-            # The search of `_place` needs an empty slot to end: before the last one is used, all
+            # The search of `_slot` needs an empty slot to end: before the last one is used, all
             # pages are dropped. A block of vehicles needs half of PAGES at most.
             if np.count_nonzero(keys == EMPTY) == 1:
                 keys[:] = EMPTY
@@ -225,9 +222,7 @@ def _slot(keys: I1, number: int, page: int) -> int:
 
 @kernel
 def _find(keys: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
-    """Fill in slots and stages from k + d on; returns the index of the first vehicle whose page is
-    missing, or FOUND.
-    """
+    """Fill in slots and stages from k + d on; returns the first vehicle without page, or FOUND."""
     for i in range(len(rows)):
         step = steps[i] + ahead[i]
         number, page = numbers[rows[i]], step // PAGE
@@ -256,10 +251,8 @@ def _foresee(
 
     Args:
         visible: slots and stages of the desired states from k on; none after k + reach is used.
-        n: number of vehicles.
         ahead: d of each; shape (block,).
         outlook: visible part of the trajectory.
-        dt_s: length of a step [s].
         bound_m: coordinate at which the extrapolation is reflected [m].
         window: output [m, m/s]; shape (block, axes, H + 1, 2).
     """

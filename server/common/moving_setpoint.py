@@ -13,8 +13,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 
 MEMORY_S = 0.2
-"""Time constant of the mean velocity [s]; chosen as the smallest that tolerates errors of 2 cm in
-the moves."""
+"""Time constant of the mean velocity [s]; the smallest that tolerates errors of 2 cm in moves."""
 REST_S = 1.0
 """Time without a move after which a point is at rest [s]."""
 
@@ -42,7 +41,7 @@ class LivePoint:
         self._position, self._moved_ns = position, now_ns
 
     def at(self, now_ns: int) -> Array:
-        """State: the newest move extrapolated at its velocity [m, m/s]; shape (axes, 2)."""
+        """State of the point: its newest move, extrapolated [m, m/s]; shape (axes, 2)."""
         if self._moved_ns is None:
             if not self._has_velocity:
                 return np.stack([self._position, self._velocity], axis=-1)

@@ -61,9 +61,9 @@ class Foresight(NamedTuple):
     """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape (block,
     loss_cases), with 0 cases if no trigger uses them."""
     start_if_lost: F4
-    """State at k+d in each of these cases [m, m/s]; shape (block, loss_cases, axes, 2)."""
+    """State at k+d in each loss case [m, m/s]; shape (block, loss_cases, axes, 2)."""
     inputs_if_lost: F4
-    """Inputs from k+d on in each of these cases, if no further packet is sent [m/s]; shape (block,
+    """Inputs from k+d on in each loss case, if no further packet is sent [m/s]; shape (block,
     loss_cases, axes, H)."""
     usable: I1
     """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`; shape
@@ -172,9 +172,9 @@ class SentPlans(NamedTuple):
     step: Indices
     """Step k that each plan is made for; shape (m,)."""
     begins: Indices
-    """Step of its first planned input; shape (m,)."""
+    """First planned step of each plan; shape (m,)."""
     state: Array
-    """Predicted state at that step [m, m/s]; shape (m, axes, 2)."""
+    """Predicted state at the step `begins` [m, m/s]; shape (m, axes, 2)."""
     inputs: NDArray[np.floating]
     """Planned inputs [m/s]; shape (m, axes, H)."""
 
@@ -295,9 +295,7 @@ class Scheme(ABC):
         return ""
 
     def clock_m(self, row: int) -> float | None:  # noqa: ARG002
-        """Position error that the uncertainty of the vehicle's clock may cause [m]; None without a
-        mission.
-        """
+        """Position error that the vehicle's clock error may cause [m]; None without a mission."""
         return None
 
     def restart(self, row: int) -> bool:  # noqa: ARG002

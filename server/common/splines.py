@@ -63,7 +63,6 @@ def inputs_along(
     Args:
         model: eq. (4).
         bounds: u_max of each axis [m/s]; shape (axes,).
-        dt_s: length of a step [s].
         knots: knots of each spline, as in `Splines` [m, m/s]; shape (n, axes, 2 KNOTS_MAX).
         number: number of knots; shape (n,).
         spacing: steps from one knot to the next; shape (n,).

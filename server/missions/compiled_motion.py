@@ -18,7 +18,6 @@ class MotionMetric(NamedTuple):
     scale: F1
     """Factor of each coordinate in distances; shape (axes,)."""
     dt_s: float
-    """Length of a step [s]."""
 
 
 class Extent(NamedTuple):
@@ -31,9 +30,7 @@ class Extent(NamedTuple):
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
-    """Positions [m] and velocities [m/s] of a motion at `count` steps, SPACING apart; each of shape
-    (count, axes).
-    """
+    """Positions [m] and velocities [m/s] at `count` steps, SPACING apart; shapes (count, axes)."""
     position, velocity = np.empty((2, count, motion.position.shape[1]))
     _states(motion, begin, dt_s, position, velocity)
     return position, velocity

@@ -93,7 +93,6 @@ def solve_qp(
         linear: g; shape (n,).
         x: output; shape (n,).
         columns, bounds, equal: see `DualActiveSet.solve`.
-        scratch: see `workspace`.
 
     Returns:
         SOLVED, INFEASIBLE or TOO_MANY_ROUNDS.
@@ -169,7 +168,6 @@ def _start_unconstrained(root: F2, linear: F1, x: F1, J: F2) -> None:
 
 @part
 def _most_violated(columns: R2, bounds: F1, equal: int, x: F1, slack: F1) -> int:
-    """Index of the most violated inequality, or -1."""
     for i in range(len(bounds)):
         slack[i] = -bounds[i]
     for j in range(len(x)):

@@ -122,7 +122,6 @@ def _half_planes(
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
-            # Out of reach, the constraint could never be active; at the very same place it has no
             # Out of reach, the constraint could never be active; at the same position it has no
             # direction.
             if away >= keep + reach[i] or away == 0.0:

@@ -54,24 +54,23 @@ from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""
 ARRIVED_M = 0.02
-"""Distance from the goal within which a motion's end counts as having arrived [m]."""
+"""Distance from the goal within which the end of a motion counts as at the goal [m]."""
 ROUNDS = 5
 """Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""A plan counts as stuck if it moves less than this share of the distance to its waypoint, 2 m at
-most."""
+"""A plan is stuck if it moves less than this share of the distance to its waypoint, 2 m at most."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
 """Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Tolerance for a vehicle that leaves a zone: by so much it may come nearer to the zone [m]."""
+"""Tolerance for a vehicle that leaves a zone: it may come nearer to the zone by this [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
 """Number of possible steps of a vehicle that `clock_m` evaluates."""
 BINDS_M = 1e-4
-"""Distance from a half-plane within which it counts as limiting a motion [m]."""
+"""Distance from its half-plane within which a constraint counts as limiting a motion [m]."""
 
 SILENT = np.zeros((), dtype=FIGURES)
 """Figures of a vehicle without a packet to send."""
@@ -133,7 +132,7 @@ class MissionPlanner(SplineScheme):
         foresight.estimate[:n] = foresight.start[:n] = self._state.state[rows]
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """Plan for each vehicle every SPACING steps, not for all at the same step."""
+        """Plan for each vehicle every SPACING steps; different vehicles plan at different steps."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
         figures["expected_gap"][:n] = 0.0
@@ -162,7 +161,6 @@ class MissionPlanner(SplineScheme):
         self.planned[:n] = self._state.state[rows]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """Fill in the knots of the motions that are sent, and note these motions."""
         for i in event.nonzero()[0].tolist():
             vehicle, k = self._state.vehicles[int(rows[i])], int(step[i])
             if vehicle.repeat:
@@ -191,9 +189,7 @@ class MissionPlanner(SplineScheme):
             vehicle.goal = None  # closed positions and progress belong to the old zones
 
     def objection(self, zones: Zones) -> str:
-        """Reason why these zones are refused: a vehicle may fly into a zone, or its position is
-        unknown; empty if they are accepted.
-        """
+        """Reason why these zones are refused; empty if they are accepted."""
         if zones and (number := self._state.unknown()) is not None:
             return f"zones before it is known where vehicle {number} is"
         for row, vehicle in self._state.vehicles.items():
@@ -239,8 +235,8 @@ class MissionPlanner(SplineScheme):
     # -- decisions ---------------------------------------------------------------------------------
 
     def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
-        """Whether a new motion may be planned for a vehicle at its step k; otherwise sets
-        `waits_for`, or sends the motion in force again.
+        """Whether a motion may be planned at step k; otherwise sets `waits_for`, or repeats the
+        motion.
         """
         in_force = vehicle.in_force
         assert in_force is not None
@@ -256,9 +252,7 @@ class MissionPlanner(SplineScheme):
         return not vehicle.waits_for
 
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
-        """Reason why this vehicle has to wait before it is sent a motion, in words; empty if it has
-        not.
-        """
+        """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
         if row in self._state.restarted:
             return "its client, which has begun anew"
         if vehicle.sent:
@@ -276,7 +270,6 @@ class MissionPlanner(SplineScheme):
         return ""
 
     def _plan_to_goal(self, row: int, vehicle: VehicleMotions, k: int) -> None:
-        """Plan a motion to a vehicle's goal, or to its yielding position, at its step k."""
         assert vehicle.in_force is not None
         home = self._state.goal(row)
         yields = vehicle.yielding
@@ -309,8 +302,7 @@ class MissionPlanner(SplineScheme):
         """Nearest position clear of zones, for a vehicle that rests within a zone [m]; None if it
         rests outside.
 
-        No motion leads into a zone: the vehicle was there when the server started, without zones
-            from an earlier run.
+        No motion leads into a zone, so the vehicle has been there since the server started.
         """
         clearance_m = self._clearances.tube_m
         if not self._zones or self._zones.clearance(place[None]).min() >= clearance_m:
@@ -348,9 +340,7 @@ class MissionPlanner(SplineScheme):
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
-        """Ask the first vehicle that rests at its goal in another vehicle's way to yield; returns
-        whether it does.
-        """
+        """Ask the first vehicle at rest at its goal in the way to yield; False if none does."""
         keep_m = self._clearances.planned_apart_m
         rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
@@ -493,8 +483,8 @@ class MissionPlanner(SplineScheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a polyline comes too near to a zone; from a zone that it starts too near to, it
-        may only lead away.
+        """Whether a polyline comes too near to a zone, unless it leads away from a zone at its
+        start.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

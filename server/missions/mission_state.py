@@ -24,7 +24,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
-"""Largest number of steps that a motion takes."""
+"""Largest duration of a motion [steps]."""
 RESTART_STEPS = 20
 """Number of steps after a client's restart in which an observation may be from before it."""
 PLAN_DUE, REPEAT_DUE = 1, 2
@@ -51,11 +51,10 @@ class VehicleRows(NamedTuple):
     sent_step: I1
     """Step of the latest motion sent and not acknowledged; 0 if there is none."""
     repeats_for: I1
-    """Number of steps after `sent_step` for which the motion is repeated, see
-    `VehicleMotions.repeats`."""
+    """Steps after `sent_step` for which the motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
-    """Largest number of steps by which the vehicle is ahead of its counted step, see
-    `clock.StepError`."""
+    """Largest number of steps by which the vehicle is ahead of its counted step, see `StepError`.
+    """
     late: F1
     """Largest number of steps by which the vehicle is behind its counted step."""
 
@@ -93,8 +92,8 @@ class MissionState:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.left_tube: list[tuple[int, float]] = []
-        """Vehicles that have left their tube since the list was last emptied, and how far outside
-        they were [m]."""
+        """Vehicles that have left their tube since the list was emptied, and their distance to it
+        [m]."""
         self.state = np.zeros((capacity, terms.axes, 2))
         """Newest observed states; shape (capacity, axes, 2)."""
         self.vehicles: dict[int, VehicleMotions] = {}
@@ -128,9 +127,8 @@ class MissionState:
         self.decided: set[int] = set()
         """Rows of the vehicles with a motion to be sent at their newest step."""
         self.restarted: dict[int, int] = {}
-        """Step of a client's restart without saved state, by row. Until an observation from after
-        it, the vehicle may be anywhere on its motions.
-        """
+        """Step of a client's restart without saved state, by row. The vehicle may be anywhere on
+        its motions until it is observed after the restart."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None if there is none."""
 
@@ -153,9 +151,7 @@ class MissionState:
         return True
 
     def brakes_m(self, vehicle: VehicleMotions) -> float:
-        """Braking distance from the observed position of a vehicle without a motion [m]; 0 with a
-        motion.
-        """
+        """Braking distance from the observed position, without a motion [m]; 0 with a motion."""
         brakes = vehicle.in_force is not None and vehicle.in_force.step < 0
         return self._stopping_m(vehicle) if brakes else 0.0
 
@@ -178,7 +174,6 @@ class MissionState:
         return StepError(float(self.rows.early[row]), float(self.rows.late[row]))
 
     def note_sent(self, row: int, step: int, motion: Motion) -> None:
-        """Note a motion sent at a step."""
         vehicle = self.vehicles[row]
         vehicle.sent.append(SentMotion(step, motion))
         self._mark_changed(row, vehicle)
@@ -263,7 +258,7 @@ class MissionState:
         match observation.mode:
             # The first observation may be from another run of the client, with steps of its own.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
-                # The vehicle may land sooner than now known, but not sooner than computed before.
+                # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)
             case Mode.HOVER | Mode.LAND | Mode.MANUAL | Mode.FAULT:
                 lands[row] = k
@@ -290,9 +285,7 @@ class MissionState:
         return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Resting position of a vehicle without a motion: its start on the mission if near,
-        otherwise where it is [m].
-        """
+        """Resting position without a motion: the start of the mission if near, or as observed."""
         number = self.number_of(row)
         if number not in self.absent:
             return observed
@@ -319,7 +312,6 @@ class MissionState:
         self.foreign = None if foreign < 0 else foreign
 
     def update_possible(self) -> None:
-        """Update the possible motions of vehicles for which they have changed; once a step."""
         if self._is_updated:
             return
         self._is_updated = True

@@ -147,9 +147,7 @@ def _add(
 
 @making_kernel
 def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
-    """Remove the motions of a vehicle by moving the last motions into their places; returns the
-    number left.
-    """
+    """Remove a vehicle's motions, whose places the last ones take; returns the number left."""
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1
@@ -161,7 +159,6 @@ def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) ->
 
 @part
 def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) -> bool:
-    """Whether a box is further than a distance from the box of the motion at index m."""
     square = 0.0
     for x in range(len(low)):
         off = max(low[x] - arrays.high[m, x], arrays.low[m, x] - high[x], 0.0)

@@ -18,7 +18,7 @@ NODES_MAX = 200
 OFF_M = 0.1
 """Distance of nodes from corners beyond the clearance [m]."""
 GRAPHS_MAX = 64
-"""Largest number of cached graphs, each for the zones at some heights."""
+"""Largest number of cached graphs, one for each choice of zones by height."""
 TINY_M = 1e-6
 """Rounding tolerance [m]."""
 
@@ -35,7 +35,7 @@ class Routes:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """Shortest route: its corners, then the goal; only the goal if there is no route; shape (n,
+        """Corners of the shortest route, then the goal; without a route only the goal; shape (n,
         axes).
         """
         if not self._zones:
@@ -50,7 +50,6 @@ class Routes:
         return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
 
     def _heights(self, place: Array, goal: Array) -> tuple[bool, ...]:
-        """Flags of the zones at heights between those of two positions."""
         if len(place) < 3:
             return (True,) * len(self._zones.zones)
         low, high = sorted((float(place[2]), float(goal[2])))
@@ -98,13 +97,11 @@ class Graph:
             far = np.where(longer, far[:, [via]] + far[[via]], far)
             after = np.where(longer, after[:, [via]], after)
         self._far, self._after = far, after
-        """Length of the shortest path between two nodes, infinite without one [m], and the next
-        node on it."""
+        """Length of the shortest path between two nodes [m], infinite without one, and its next
+        node."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest path between two positions; empty if there is none or it is
-        straight.
-        """
+        """Corners of the shortest path between two positions; empty if straight, or without path."""
         start, end, nodes = place[None], goal[None], self._nodes
         if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]
@@ -122,9 +119,7 @@ class Graph:
         return are_clear(self._zones, starts, ends, self._clearance_m - TINY_M)
 
     def _lengths(self, start: Array) -> Array:
-        """Distances of nodes from a position [m], infinite if not joined by a clear line; shape
-        (n,).
-        """
+        """Distances of nodes from a position [m], infinite without a clear line; shape (n,)."""
         nodes = self._nodes
         sees = self.sees(np.repeat(start, len(nodes), axis=0), nodes)
         return np.where(sees, np.linalg.norm(nodes - start, axis=1), np.inf)

@@ -58,7 +58,7 @@ class QPConstants(NamedTuple):
     times: F1
     """Times at which distances are kept [intervals]; shape (times,)."""
     to_sample: F2
-    """Positions at these times from accelerations [s²]; shape (times, N)."""
+    """Positions at `times` from accelerations [s²]; shape (times, N)."""
 
 
 class AxisProblem(NamedTuple):
@@ -107,7 +107,7 @@ class TrajectoryQP:
         self.constants = QPConstants(
             T, acceleration_mps2, most, weights, to_position, self.times, to_sample
         )
-        # Bounds of the input v + τ a at the end and at the begin of each interval.
+        # Bounds of the input v + τ a at the end and at the beginning of each interval.
         ends = [to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
         before = np.vstack([np.zeros(n), to_velocity[:-1]])
         begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
@@ -134,7 +134,7 @@ class TrajectoryQP:
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
-        """Largest distance at these times between two motions from the same state [m]."""
+        """Largest distance at `times` between two motions from the same state [m]."""
 
     def solve(
         self, kept_p: Array, kept_v: Array, goal: Array, planes: HalfPlanes | None = None
@@ -214,7 +214,7 @@ def _fill_axis(
     bounds[at] = -v
     for i in range(n):
         linear[at * n + i] = 0.0
-        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and begins of
+        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and beginnings of
         # intervals, each lower and then upper bound.
         for group, limit in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
             bounds[axes + (group * axes + at) * n + i] = limit

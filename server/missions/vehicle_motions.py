@@ -56,8 +56,7 @@ class VehicleMotions:
         """Positions on routes between zones that are too close for a motion [m]."""
         self.goal: Array | None = None
         """Goal to which progress is measured [m]; shape (axes,). None before the first, and after
-        the zones or the client's steps have changed.
-        """
+        the zones or the client's steps have changed."""
         self.remaining_m = 0.0
         """Shortest remaining path to `goal` so far [m]."""
         self.progress_step = 0
@@ -65,7 +64,7 @@ class VehicleMotions:
         self.zone_blocks = False
         """Whether a zone has limited its plans since it was last found stuck."""
         self.yielding: Yielding | None = None
-        """Position to which it yields; None if it flies to its own goal."""
+        """Temporary goal of a yielding vehicle; None if it flies to its own goal."""
         self.in_zone = False
         self.waits_for = ""
         """Reason for waiting, for the operator; empty if it does not wait."""
@@ -121,9 +120,7 @@ class VehicleMotions:
 
     @property
     def repeats(self) -> tuple[int, int]:
-        """Step of the latest motion sent, and number of steps after it up to which it is repeated,
-        every COPY_STEPS; zeros if there is none.
-        """
+        """Step of the latest motion sent, and number of steps for which it is repeated; or 0, 0."""
         if not self.sent:
             return 0, 0
         return self.sent[-1].step, (self.copies - 1) * COPY_STEPS
@@ -131,7 +128,5 @@ class VehicleMotions:
 
 @shared
 def repeats_after(since: int, repeats_for: int) -> bool:
-    """Whether a motion is repeated `since` steps after it was first sent; `repeats_for`: see
-    `VehicleMotions.repeats`.
-    """
+    """Whether a motion is repeated `since` steps after it was first sent, see `repeats`."""
     return 0 < since <= repeats_for and since % COPY_STEPS == 0

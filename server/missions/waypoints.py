@@ -20,10 +20,9 @@ AHEAD_M = 1.5
 """Distance of a waypoint ahead on a route around zones [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """Angles to the right by which waypoints of a stuck vehicle turn: step, largest before random
-directions, and step back once it moves [rad].
-"""
+directions, and step back once it moves [rad]."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Distance within which a stuck vehicle flies around resting vehicles [m], and for how long [s]."""
+"""Distance and time for which a stuck vehicle flies around resting vehicles [m, s]."""
 CLOSED_M = 0.6
 """Least distance ahead of a vehicle at which its route is closed [m]; at least three tubes."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
@@ -122,7 +121,7 @@ class Waypoints:
     def _detour(
         self, place: Array, goal: Array, resting: Iterable[Array], closed: Iterable[Array]
     ) -> Routes:
-        """Routes around zones, closed positions, and vehicles that rest nearby, except those at the
+        """Routes around zones, closed positions, and vehicles at rest nearby that are not at the
         goal.
         """
         zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m

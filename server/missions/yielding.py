@@ -63,8 +63,8 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     """Distances to keep between a vehicle at `at` and vehicles at some positions [m]; shape (n,).
 
-    Plans keep a larger distance than motions must. Vehicles at rest may be nearer than that, and
-    then only must not come nearer.
+    Plans keep a larger distance than motions must. A vehicle that is nearer already must only not
+    come nearer.
     """
     kept: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
     return kept

@@ -118,9 +118,7 @@ def _first_set(bound: float, simd: SimdBatch) -> None:
 
 @lanes
 def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
-    """One iteration with every input of every vehicle free; `stages` is the backward pass, shape
-    (H, 7).
-    """
+    """One iteration with every input free; `stages` is the backward pass, shape (H, 7)."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1 = model.b0, model.b1
     q0, q1, x0, x1 = simd.p, simd.v, simd.leader_p, simd.leader_v
@@ -232,7 +230,6 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
 
 @lanes
 def _change_worst(simd: SimdBatch) -> None:
-    """Let the input with the largest violation enter or leave each vehicle's active set."""
     for lane in range(len(simd.p)):
         i = int(simd.worst_at[lane])
         if i >= 0:
@@ -242,7 +239,6 @@ def _change_worst(simd: SimdBatch) -> None:
 
 @lanes
 def _any(number: F1) -> bool:
-    """Whether a number is positive for any vehicle."""
     is_any = False
     for lane in range(len(number)):
         is_any |= number[lane] > 0.0
@@ -256,7 +252,7 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
     Args:
         which: FIRST or LATER weights.
         simd: reads gradient and previous, whose active set is the first; fills in inputs [m/s].
-        free: of `RiccatiWorkspace`.
+        free: `RiccatiWorkspace.free`.
         settled: set to False for a vehicle without a solution; shape (L,).
 
     Source: eqs. (6), (8), (10).
@@ -363,7 +359,7 @@ class ExactSolver:
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
         )
-        # It may leave an input short of its bound by a rounding error.
+        # DAQP may leave an input short of its bound by a rounding error.
         answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
         inputs: Array = np.clip(answer, -bound, bound)
         slope = hessian @ inputs + gradient

@@ -138,7 +138,6 @@ class Planner:
         """Time taken to plan for the last block [ns], or -1 if not measured."""
 
     def forget(self, row: int) -> None:
-        """Make the next plan of this vehicle its first."""
         self._memory.step[row] = -1
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
@@ -161,7 +160,6 @@ class Planner:
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _batch_of(self, window: Window, foresight: Foresight) -> PlanBatch:
-        """Arguments of the planning kernels in one tuple, kept until an array is replaced."""
         return PlanBatch(
             mpc=self._mpc,
             terminal_weight=self._terminal_weight,
@@ -181,7 +179,7 @@ class Planner:
     def _plan_with_solvers(
         self, batch: PlanBatch, rows: Indices, step: Indices, undone: int
     ) -> None:
-        """Plan with the solvers, for all vehicles or for those that the compiled pass left
+        """Plan with the solvers for all vehicles, or for those that the compiled pass left
         unsolved.
         """
         left = np.arange(len(rows))
@@ -371,7 +369,6 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1) -> None:
-    """Compute figures and store plans of the vehicles `left`, solved by another solver."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

@@ -37,7 +37,7 @@ class Nominal(NamedTuple):
     inputs: F3
     """Latest planned inputs [m/s]; shape (capacity, axes, H)."""
     step: I1
-    """Step of these plans, or -1; shape (capacity,)."""
+    """Step of the latest plans, or -1; shape (capacity,)."""
     settled: B1
     """Scratch: whether a plan is solved; shape (1,)."""
 

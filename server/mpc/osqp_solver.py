@@ -15,11 +15,9 @@ from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, for 30 iterations in place of
-20."""
+"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, after 30 iterations."""
 RHO_PER_CURVATURE = 2.5
-"""OSQP's step size over the mean curvature of the Hessian; chosen for the fewest iterations in the
-worst case."""
+"""OSQP's step size over the mean curvature of the Hessian, for the fewest iterations."""
 
 
 class OsqpSolver:

@@ -124,9 +124,7 @@ WIDTH = 16
 
 
 class SimdBatch(NamedTuple):
-    """Scratch for the problems of several vehicles on one axis; L = WIDTH or 1 vehicles, last
-    index.
-    """
+    """Scratch for the problems of several vehicles on one axis; L = WIDTH or 1 vehicles."""
 
     p: F1
     """Position, or its costate, at the current stage; shape (L,)."""
@@ -243,7 +241,6 @@ def set_target(states: F2, simd: SimdBatch, lane: int) -> None:
 
 @lanes
 def set_inputs(inputs: Inputs, simd: SimdBatch, lane: int) -> None:
-    """Fill in inputs computed elsewhere [m/s]; shape (H,)."""
     for stage in range(len(inputs)):
         simd.inputs[stage, lane] = inputs[stage]
 

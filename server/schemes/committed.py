@@ -175,9 +175,7 @@ def _foresee(
     steps: I1,
     foresight: Foresight,
 ) -> int:
-    """Fill in the predictions of vehicles at their steps k; returns the number of horizons newly
-    known to be lost.
-    """
+    """Fill in the predictions at the steps k; returns the number of horizons newly known lost."""
     axes, H, sent, lost = len(settings.laws), settings.H, memory.sent, 0
     for i in range(len(rows)):
         row, k, bound = rows[i], steps[i], sent.bound.steps

@@ -78,8 +78,8 @@ def add_sample(bound: DelayBound, row: int, delay: int) -> None:
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # It rises at once: with too small a d every horizon comes into force after other inputs than
-    # its plan assumes.
+    # d rises at once: with too small a d every horizon comes into force after other inputs than its
+    # plan assumes.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
     needed, since = 0, count  # samples of d or more, and number of samples after the last of them

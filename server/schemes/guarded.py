@@ -107,9 +107,6 @@ class GuardedScheme(Scheme):
             return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
 
     def _call(self, n: int, call: Callable[[slice], None]) -> list[int]:
-        """Call for n vehicles at once, or for each alone if that fails; returns the indices that
-        failed.
-        """
         failed = []
         try:
             call(slice(0, n))

@@ -72,8 +72,7 @@ class EstimatorMemory(NamedTuple):
     disturbance: F2
     """Disturbance ŵ [m/s]; shape (capacity, axes)."""
     inputs: F3
-    """Input history û, a ring over the steps, initially 0 [m/s]; shape (capacity, axes, age_max).
-    """
+    """Input history û, a ring over the steps [m/s]; shape (capacity, axes, age_max)."""
     last: I1
     """Newest step with an entry in the input history, or -1; shape (capacity,)."""
 

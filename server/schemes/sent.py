@@ -38,7 +38,7 @@ class Delivery:
     """Numpy record: delivery of the plans sent to a vehicle, as its observations report it."""
 
     in_force: int
-    """Step that the plan in force at its newest observation was made for, or NO_HORIZON."""
+    """Step that the plan in force at the newest observation was made for, or NO_HORIZON."""
     since: int
     """First step flown with the plan in force."""
     acknowledged: int
@@ -56,7 +56,7 @@ class Delivery:
 class SentPlan:
     step: int
     due: int
-    """Step at which it is either in force or lost."""
+    """Step at which the plan is either in force or lost."""
 
 
 DELIVERY, SENT_PLAN = record(Delivery), record(SentPlan)
@@ -72,7 +72,6 @@ class Sent(NamedTuple):
     """Newest plans, in a ring: plan n has index n modulo `ring`; shape (capacity, ring)."""
     bound: DelayBound
     dt_ns: int
-    """Length of a step [ns]."""
 
 
 def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
@@ -103,8 +102,8 @@ def forget(sent: Sent, row: int) -> None:
 
 @part
 def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
-    """Update delay bound and loss rate of a vehicle from its newest observation; returns the number
-    of plans newly known to be lost.
+    """Update delay bound and loss rate from the newest observation; returns the number of plans
+    lost.
     """
     delivery, bound, observed = sent.delivery[row], sent.bound, sent.observed[row]
     # No sample yet: half a round trip, rounded up, plus a margin.

@@ -54,9 +54,7 @@ class SentHorizon:
 
 
 class ReferenceState:
-    """Numpy record: reference state x̄ of a horizon on one axis, advanced to the newest
-    observation.
-    """
+    """Numpy record: reference state x̄ of a horizon on one axis at the newest observation."""
 
     stage: int
     """Stage of the horizon that x̄ belongs to."""
@@ -83,8 +81,8 @@ class ReplaySettings(NamedTuple):
     decay: float
     """See `observer.decay_of`."""
     follow: float
-    """Share of a jump of the observed velocity that the observer's low-pass filter has not followed
-    after a step."""
+    """Share of a velocity jump that the observer's low-pass filter has not followed after a step.
+    """
     feeds_back: bool
 
 

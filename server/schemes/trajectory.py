@@ -80,8 +80,7 @@ COMPARED = 3
 IGNORED = 1e-3
 """Total probability of cases that are left out of the expected gap."""
 RUNS_OUT = 1e-2
-"""Probability of losing all trajectories in flight above which a trajectory that ends soon is
-replaced."""
+"""Probability of losing all trajectories in flight above which one that ends soon is replaced."""
 TINY = 1e-9
 """Smallest K_p, so that weights with K_p = 0 do not divide by 0 [1/s]."""
 
@@ -94,7 +93,7 @@ class SentTrajectory:
     """Numpy record: a trajectory that was sent, without its knots."""
 
     ends: int
-    """First step at which it is too old to be flown."""
+    """First step at which the trajectory is too old to be flown."""
     spacing: int
     count: int
 
@@ -117,8 +116,7 @@ class Settings(NamedTuple):
     lead_s: F1
     """Time h [s]; shape (axes,)."""
     error_m: float
-    """`control.spline_error_m`: largest error of a spline on each axis, if KNOTS_MAX suffices [m].
-    """
+    """`control.spline_error_m`: largest error of a spline, if KNOTS_MAX suffices [m]."""
     plans: bool
     """Whether the nominal motion is sent, and not the desired trajectory itself."""
 
@@ -167,8 +165,7 @@ class Guidance(SplineScheme):
         self.observed_step = self._memory.sent.observed
         self._nominal = make_nominal(terms, control, capacity if plans else 0)
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
-        """Trajectory that would be sent now, from k on [m, m/s]; shape (block, axes, seen + 1, 2).
-        """
+        """Trajectory that would be sent now [m, m/s]; shape (block, axes, seen + 1, 2)."""
 
     def forget(self, row: int) -> None:
         tracker.forget(self._memory.sent, row)
@@ -336,9 +333,7 @@ def _appraise(
     planned: F3,
     intended: F4,
 ) -> tuple[int, int]:
-    """Fill in `figures`, `planned` and `intended`, see `Guidance.plan`; returns the number of
-    trajectories newly known to be lost, and of unsolved plans.
-    """
+    """See `Guidance.plan`; returns the numbers of newly lost trajectories and of unsolved plans."""
     sent, lost, unsolved, axes = memory.sent, 0, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
