@@ -157,7 +157,7 @@ class Server(Endpoint):
                 self._out += session.sealed(encode(Close(session.vehicle, session.number)))
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; improves the clock offsets of vehicles that also report the time of day."""
+        """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
         self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:

@@ -242,7 +242,7 @@ class Reception:
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:
-        """Narrow the bounds of a clock offset by the vehicle's time of day, if the host knows it."""
+        """Narrow the bounds of a clock offset by the vehicle's time of day, if known here too."""
         session = self._sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
