@@ -56,8 +56,6 @@ SECTIONS: dict[Section, ModuleType] = {
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """Options of a run."""
-
     only: tuple[Section, ...] = tuple(SECTIONS)
     """Benchmarks to run."""
     quick: bool = False
@@ -65,7 +63,6 @@ class BenchmarkOptions:
 
 
 def main() -> int:
-    """Run as the command line says, and return the exit code."""
     options = tyro.cli(BenchmarkOptions, prog="python -m bench", description=__doc__)
     for name in options.only:
         section = SECTIONS[name]
@@ -88,14 +85,15 @@ def write(
 
     Args:
         results: measured figures, by section.
-        file: file of the figures.
         document: document with places for some of the tables; the others are only printed.
         folder: folder for pictures.
     """
     if "tick" in results:
         tick.draw(results["tick"], folder / tick.FIGURE.name)
-    known = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
-    merged: dict[Section, Any] = {name: known[name] for name in SECTIONS if name in known}
+    all_results = {**(json.loads(file.read_text()) if file.exists() else {}), **results}
+    merged: dict[Section, Any] = {
+        name: all_results[name] for name in SECTIONS if name in all_results
+    }
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in merged.items())
     files.write(file, f"{{{lines}}}\n".encode())
     tables = {"machine": machines(merged), "packages": packages(merged)}
@@ -123,7 +121,6 @@ def machines(results: Mapping[Section, Any]) -> TextTable:
 
 
 def packages(results: Mapping[Section, Any]) -> TextTable:
-    """Table of the versions of the solvers' packages; empty if no solvers were measured."""
     versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
     return TextTable(["package", "version"], [list(pair) for pair in versions.items()])
 

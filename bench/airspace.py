@@ -34,7 +34,7 @@ from skytether.shared.wire.protocol import (
 )
 
 NOISE = np.array([0.001, 0.01])
-"""Standard deviation of a step's noise on position [m] and velocity [m/s]; shape (2,)."""
+"""Standard deviation of a step's noise on position [m] and velocity [m/s]."""
 DELAY_S = 0.44
 """Delay of an observation [s]: the mean of the paper's network."""
 START_NS = 20 * SECOND_NS
@@ -44,13 +44,6 @@ PERIOD_S = 27.5
 
 
 class Vehicles:
-    """Vehicles in flight, simulated by the model.
-
-    Args:
-        scenario: scenario that they fly.
-        count: number of vehicles, n.
-    """
-
     def __init__(self, scenario: Scenario, count: int) -> None:
         self._rng = np.random.default_rng(1)
         self._model = discretise(scenario.true_tau_s, scenario.control.dt)
@@ -68,12 +61,7 @@ class Vehicles:
 
 
 class PlannedFleet:
-    """Planner that knows the states of its vehicles, and plans in blocks as the server does.
-
-    Args:
-        scenario: scenario that they fly.
-        count: number of vehicles.
-    """
+    """Planner that knows the states of its vehicles, and plans in blocks as the server does."""
 
     def __init__(self, scenario: Scenario, count: int) -> None:
         terms = scenario.terms()
@@ -87,28 +75,19 @@ class PlannedFleet:
 
     @property
     def x(self) -> Array:
-        """State of each vehicle [m, m/s]; shape (n, axes, 2)."""
         return self._vehicles.x
 
     def plan(self) -> None:
-        """Plan for all vehicles."""
         for rows in self._blocks:
             self._found.start[: len(rows)] = self._vehicles.x[rows]
             self._planner.plan(rows, self._vehicles.step[rows], self._found)
 
     def fly(self) -> None:
-        """Fly one step as planned."""
         self._vehicles.fly(self._planner.inputs[:, :, 0])
 
 
 class Airspace:
-    """Server, and vehicles in session with it.
-
-    Args:
-        scenario: scenario that they fly, with a trigger that sends at every step.
-        count: number of vehicles.
-        stopwatch: stopwatch of the server.
-    """
+    """Server, and vehicles in session with it; the scenario's trigger must send at every step."""
 
     def __init__(self, scenario: Scenario, count: int, stopwatch: Stopwatch | None = None) -> None:
         self.server = Server(
@@ -121,7 +100,7 @@ class Airspace:
         self._vehicles = Vehicles(scenario, count)
         self._dt_ns = scenario.dt_ns
         self._late = round(DELAY_S / scenario.control.dt)
-        """Age of an observation in steps."""
+        """Age of an observation [steps]."""
         self._past = deque([self._vehicles.x] * (self._late + 1), maxlen=self._late + 1)
         self._due_ns = START_NS
         self._sessions = [self._open(number, scenario) for number in range(1, count + 1)]
@@ -136,7 +115,6 @@ class Airspace:
         return vehicle, welcome.session, address
 
     def _observe(self) -> None:
-        """Give the server an observation of every vehicle, with a delay."""
         now_ns, late_ns = self._due_ns - MILLISECOND_NS, self._late * self._dt_ns
         step = (self._vehicles.step - self._late).tolist()
         for (vehicle, session, address), k, x in zip(
@@ -160,11 +138,10 @@ class Airspace:
             self.server.receive(Datagram(encode(observation), address), now_ns=now_ns)
 
     def wake(self) -> None:
-        """Run the server's tick."""
         self.server.wake(now_ns=self._due_ns)
 
     def prepare(self) -> None:
-        """Fly the previous step, and give the server an observation of every vehicle."""
+        """Fly the previous step, and send the server an observation of every vehicle."""
         sent = len(self.server.outbox())
         if sent:
             assert sent == len(self._sessions), "no horizon was sent to some vehicle"

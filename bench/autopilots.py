@@ -3,8 +3,8 @@
 `python -m bench.autopilots` flies a figure eight over the paper's network with both flavours of the
 scripted autopilot, in calm air and in wind, in virtual time. The contenders are Skytether with
 `vehicle.kind = "mavlink"`, and set-points sent directly by each of the laws of `station.laws`. All
-fly with the same seeds of network and wind, counted from each flight's start. Each flight is
-repeated with the network cut for a while.
+contenders fly with the same seeds of network and wind, counted from each flight's start. Each
+flight is repeated with the network cut for a while.
 """
 
 import io
@@ -44,7 +44,7 @@ INPUTS: dict[str, Any] = {
     "terminal_weight": [50.0, 20.0],
     "input_reference": True,
 }
-"""Keys of `control` with which plans of inputs are sent."""
+"""Keys of `control` for contenders that send inputs."""
 OURS: dict[str, dict[str, dict[str, Any]]] = {
     "skytether": {},
     "skytether, inputs": {
@@ -59,8 +59,8 @@ OURS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 """Contenders with Skytether, and the keys that differ from the scenario. The scenario sends the
-desired trajectory; the other contenders send inputs. "patient" flies its plan to the end, 8 s, even
-if the server is silent; the first two brake after two seconds and after one."""
+desired trajectory; the other two contenders send inputs. "patient" flies its plan to the end, 8 s,
+even if the server is silent; the first two brake after two seconds and after one."""
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
@@ -74,13 +74,13 @@ MODELS: dict[FlavourName, dict[str, Any]] = {
         "dead_time_s": [0.13, 0.13, 0.04],
     },
 }
-"""Keys of the model identified with steps of 1 m/s, if they differ from the scenario. Skytether is
+"""Keys of the model, identified with steps of 1 m/s, that differ from the scenario. Skytether is
 not tuned to these flights."""
 SAFE: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
     "px4": {"COM_OBL_RC_ACT": 4},
 }
-"""Parameters without which Skytether refuses to fly."""
+"""Autopilot parameters that Skytether demands before it flies."""
 ACTUAL: dict[tuple[str, Air], float] = {
     ("velocity", CALM): 1.28,
     ("targets", CALM): 0.64,
@@ -139,7 +139,7 @@ def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
     """Scenario of a cell: the same for all contenders, except for keys that only Skytether uses.
 
     Args:
-        model: keys of the model that Skytether uses; those of `MODELS` unless given.
+        model: keys of the model that Skytether uses; default: those of `MODELS`.
     """
     table = reading.to_table(reading.load("autopilot"))
     table["seed"] = cell.seed
@@ -151,7 +151,6 @@ def scenario_of(cell: Cell, model: Mapping[str, Any] | None = None) -> Scenario:
 
 
 def began_ns(flown: Record) -> int:
-    """Time of the world at which the first step began [ns]."""
     return next(each.time_ns for each in flown.events if isinstance(each.event, Flying))
 
 
@@ -172,7 +171,7 @@ def fly(
 def autopilot_of(
     scenario: Scenario, flavour: FlavourName, faults: Sequence[ScriptedFault] = ()
 ) -> tuple[Autopilot, io.BytesIO]:
-    """Autopilot that is ready to fly, and the array for its true states: rows of TRUTH_COLUMNS."""
+    """Autopilot that is ready to fly, and the file for its true states: rows of TRUTH_COLUMNS."""
     truth = io.BytesIO()
     recorder = Recorder(TRUTH_COLUMNS, truth)
     autopilot = Autopilot(
@@ -187,8 +186,7 @@ def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
     """Record of Skytether's flight with true states, and packets from the first step to the last.
 
     Args:
-        scenario: scenario that was flown.
-        flown: record of the flight, with states as the client knew them.
+        flown: record of the flight, with states as estimated aboard.
         truth: rows of `record.TRUTH_COLUMNS`, on the clock of the record's events.
     """
     times_ns = began_ns(flown) + flown.client["step"] * scenario.dt_ns
@@ -199,7 +197,6 @@ def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
 
 
 def fly_cell(cell: Cell) -> FlownCell:
-    """Fly a cell twice: the second time with a cut."""
     scenario = scenario_of(cell)
     law = contenders(cell.flavour)[cell.contender]
     whole = fly(scenario, law, cell.flavour)
@@ -216,7 +213,7 @@ def fly_cell(cell: Cell) -> FlownCell:
 def judged(
     cell: Cell, scenario: Scenario, whole: Record, cut: Record, *, secure: bool = False
 ) -> FlownCell:
-    """Figures of both flights of a cell: with an intact network, and cut for a while."""
+    """Figures of both flights of a cell: with an intact network, and with the cut."""
     times_s = cut.client["step"] * scenario.control.dt
     watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
     errors = np.linalg.norm(position_error(scenario, cut.client)[watched], axis=1)
@@ -242,22 +239,23 @@ HEADINGS = [
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
-    """Tables by name: one for each flavour and air, and one of measurements elsewhere."""
-    made = {}
+    """Tables by name: for each flavour and air, and for measurements with a real autopilot."""
+    by_name = {}
     for flavour, air in product(get_args(FlavourName), get_args(Air)):
         of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
         flown = {each.contender for each in of_case}
         names = [name for name in contenders(flavour) if name in flown]
         if of_case:
             rows = [row(name, [e for e in of_case if e.contender == name]) for name in names]
-            made[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
-    if near := _near(flights):
-        made["actual"] = TextTable(["RMSE xy [m]", "actual", "simulated", "least to most"], near)
-    return made
+            by_name[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
+    if comparison := _near(flights):
+        by_name["actual"] = TextTable(
+            ["RMSE xy [m]", "actual", "simulated", "least to most"], comparison
+        )
+    return by_name
 
 
 def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
-    """Rows of ArduCopter's figures, with those of the simulated one."""
     rows = []
     for (name, air), actual_m in ACTUAL.items():
         case = name, "ardupilot", air
@@ -291,8 +289,6 @@ def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
 
 @dataclass(frozen=True)
 class AutopilotBenchmarkOptions:
-    """Options of this benchmark."""
-
     seeds: int = 5
     """Number of seeds, from 1 on."""
     only: tuple[str, ...] = ()
@@ -304,11 +300,10 @@ class AutopilotBenchmarkOptions:
     jobs: int = 1
     """Number of flights at once."""
     out: Path | None = None
-    """Folder that keeps the flights: after Ctrl-C the same command goes on."""
+    """Folder for the flights: after Ctrl-C the same command continues."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Fly as the command line says, and print the tables."""
     options = tyro.cli(AutopilotBenchmarkOptions, args=argv, description=__doc__)
     cells = [
         Cell(name, flavour, air, seed)
@@ -323,7 +318,6 @@ def main(argv: Sequence[str]) -> None:
 
 
 def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
-    """Tables of docs/compare.md by name, with the flights in a folder."""
     kinds = product(get_args(FlavourName), get_args(Air), range(1, 6))
     cells = [Cell(name, *kind) for kind in kinds for name in contenders(kind[0])]
     return tables(study(fly_cell, cells, FlownCell, {}, folder, flags))

@@ -1,4 +1,4 @@
-"""Processes of a flight as child processes, which can be killed, stopped and listened to."""
+"""Processes of a flight as child processes, which can be killed, stopped and monitored."""
 
 import contextlib
 import os
@@ -47,17 +47,16 @@ class ChildProcess:
         )
         stack.callback(self.kill)
         self.lines: list[LogLine] = []
-        """Events that the process has logged."""
         self.words: list[str] = []
-        """Other lines that it has printed."""
+        """Output that is no event."""
         self._heard = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        with self.process.stdout as said:
-            for text in said:
+        with self.process.stdout as output:
+            for text in output:
                 line = line_of(text)
                 if line is None:
                     self.words.append(text.decode(errors="replace").rstrip())
@@ -74,23 +73,22 @@ class ChildProcess:
         """
         with self._heard:
             if not self._heard.wait_for(lambda: len(self.all(kind)) >= count, PATIENCE_S):
-                said = [*self.words, *(str(line.event) for line in self.lines)][-3:]
-                raise TimeoutError(f"{self.name}: no event {kind.__name__}; its output: {said}")
+                output = [*self.words, *(str(line.event) for line in self.lines)][-3:]
+                raise TimeoutError(f"{self.name}: no event {kind.__name__}; its output: {output}")
             return self.all(kind)[count - 1]
 
     def all(self, kind: type[Event]) -> list[LogLine]:
-        """All log lines so far with events of a kind."""
         return [line for line in self.lines if isinstance(line.event, kind)]
 
     @property
     def address(self) -> Address:
-        """Address that the process listens on, waited for."""
+        """Address that the process listens on; waits for it."""
         event = self.wait_for(Listening).event
         assert isinstance(event, Listening)
         return event.host, event.port
 
     def listening_ns(self) -> int:
-        """Time since which the process has listened [ns; CLOCK_MONOTONIC], waited for."""
+        """Time since which the process has listened [ns; CLOCK_MONOTONIC]; waits for it."""
         return self.wait_for(Listening).time_ns
 
     def figures(self) -> dict[str, Any]:
@@ -102,9 +100,7 @@ class ChildProcess:
         return event.figures
 
     def kill(self) -> int:
-        """Kill the process with SIGKILL, and wait for its end; returns the time of the kill
-        [ns].
-        """
+        """Kill the process with SIGKILL, and wait for its end; returns when it was killed [ns]."""
         killed_ns = time.monotonic_ns()
         self.process.kill()
         self.process.wait()
@@ -112,7 +108,7 @@ class ChildProcess:
         return killed_ns
 
     def stop(self) -> int:
-        """Stop the process by SIGINT; returns its exit code."""
+        """Stop the process by SIGTERM; returns its exit code."""
         with contextlib.suppress(ProcessLookupError):
             self.process.terminate()
         code = self.process.wait(PATIENCE_S)
@@ -131,7 +127,6 @@ class ChildProcess:
         return began_ns, ended_ns
 
     def resident_bytes(self) -> int:
-        """Resident memory of the process [B]."""
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
 
@@ -142,7 +137,6 @@ class Lab:
     Args:
         stack: ends all processes when it closes.
         folder: folder for the scenario, the keys and the records.
-        scenario: scenario that they fly.
         vehicles: ids of the vehicles that have a key.
     """
 
@@ -159,16 +153,14 @@ class Lab:
             file.write("".join(keys.write(vehicle, 1, it) for vehicle, it in secrets).encode())
 
     def server(self, bind: Address = (HOST, 0), *more: str) -> ChildProcess:
-        """Start a server."""
         return self._start("server", "--bind", address_text(*bind), *self._keys(), *more)
 
     def netem(self, server: Address, bind: Address = (HOST, 0), *, seed: int = 1) -> ChildProcess:
-        """Start netem in front of a server, with a random network of its own."""
+        """Start netem in front of a server; its random numbers differ with `seed`."""
         arguments = ("--bind", address_text(*bind), "--server", address_text(*server))
         return self._start("netem", *arguments, "--seed", str(seed))
 
     def client(self, server: Address, record: Path, vehicle: int = 1, *more: str) -> ChildProcess:
-        """Start a vehicle that records its flight."""
         arguments = ("--server", address_text(*server), "--id", str(vehicle))
         return self._start("client", *arguments, *self._keys(), "--record", str(record), *more)
 

@@ -1,7 +1,7 @@
 """Solvers for the same QPs: each a `server.mpc.solver.Solver` for one vehicle, set up once.
 
 The QP of an axis is given to a solver in one of two forms: condensed, in the H inputs alone, or
-sparse, in inputs and states, with (4) as constraints. In the sparse form the free response is
+sparse, in inputs and states, with eq. (4) as constraints. In the sparse form the free response is
 eliminated as well (its states start at zero), so that both forms share one gradient:
 
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0,   |uᵢ| ≤ u_max
@@ -26,7 +26,6 @@ from skytether.server.mpc.solver import Solver
 from skytether.shared.law.model import Array, Flags
 
 Factory = Callable[[Problem], Solver]
-"""Sets up a solver for the QPs of one Hessian."""
 
 
 def by_axis(problem: Problem) -> Iterator[tuple[Array, float]]:
@@ -95,9 +94,7 @@ FORMS: dict[str, Form] = {
 
 @dataclass(frozen=True)
 class Tuning:
-    """OSQP's settings at a tolerance of 1e-6; the step size is fixed, so OSQP never
-    refactorises.
-    """
+    """OSQP's settings at a tolerance of 1e-6; with a fixed step size it never refactorises."""
 
     form: str
     rho: float
@@ -108,7 +105,6 @@ class Tuning:
         return f"{self.form}, eps 1e-6, rho {self.rho:g}, {scaled}, check every 10"
 
     def make(self, problem: Problem) -> Solver:
-        """OSQP with these settings."""
         return Osqp(
             problem,
             FORMS[self.form],
@@ -144,7 +140,6 @@ class Osqp:
             self._blocks.append((solver, q, block.axes))
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
         for solver, q, axes in self._blocks:
             g = gradient[0, axes].ravel()
@@ -168,7 +163,6 @@ class Daqp:
             self._models.append(model)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
         for axis, model in enumerate(self._models):
             model.update(f=gradient[0, axis])
@@ -191,7 +185,6 @@ class Quadprog:
         self._limits = [np.full(2 * H, -bound) for bound in problem.mpc.bounds]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         inputs = np.empty_like(gradient)
         for axis, (factor, limits) in enumerate(zip(self._factors, self._limits, strict=True)):
             g = gradient[0, axis]
@@ -214,7 +207,6 @@ class Piqp:
             self._solvers.append(solver)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
         for axis, solver in enumerate(self._solvers):
             solver.update(c=gradient[0, axis])
@@ -224,7 +216,7 @@ class Piqp:
 
 
 class QpOases:
-    """The solver qpOASES, condensed, by CasADi: a workspace an axis, its active set kept."""
+    """qpOASES, condensed, by CasADi: a workspace per axis, which keeps its active set."""
 
     def __init__(self, problem: Problem) -> None:
         import casadi
@@ -237,7 +229,6 @@ class QpOases:
             self._axes.append((solver, {"h": P, "lbx": -bound, "ubx": bound}))
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         inputs, solved = np.empty_like(gradient), True
         for axis, (solver, given) in enumerate(self._axes):
             inputs[0, axis] = np.asarray(solver(g=gradient[0, axis], **given)["x"])[:, 0]
@@ -246,9 +237,7 @@ class QpOases:
 
 
 class Hpipm:
-    """HPIPM, a Riccati interior-point solver, as distributed with CasADi: all axes in one
-    problem.
-    """
+    """HPIPM, a Riccati interior-point solver, by CasADi: all axes in one problem."""
 
     def __init__(self, problem: Problem) -> None:
         import casadi
@@ -286,14 +275,13 @@ class Hpipm:
         self._inputs = np.arange(H) * width + states + np.arange(axes)[:, None]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """See `Solver`; of one vehicle."""
         self._g[self._inputs] = gradient[0]
         answer = np.asarray(self._solver(g=self._g, **self._given)["x"])
         return answer[self._inputs, 0][None], np.array([self._solver.stats()["success"]])
 
 
 class Ipopt:
-    """IPOPT by CasADi, the usual way to write an MPC in Python: an NLP with states."""
+    """IPOPT by CasADi, with states: the usual way to write an MPC in Python."""
 
     def __init__(self, problem: Problem) -> None:
         import casadi
@@ -314,7 +302,6 @@ class Ipopt:
         self._z = np.zeros(columns)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `Solver`; of one vehicle."""
         self._z[: guess.size] = guess.ravel()
         answer = self._solver(x0=self._z, p=gradient.ravel(), **self._given)
         self._z = np.asarray(answer["x"])[:, 0]
@@ -328,7 +315,6 @@ class EmptySolver:
         self._solved = np.array([True])
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
-        """Return the guess."""
         return guess, self._solved
 
 
@@ -338,7 +324,7 @@ NOTHING = "nothing"
 
 
 def contestants(tuned: Tuning) -> dict[str, Factory]:
-    """Contestants that are installed, by name."""
+    """Installed contestants, by name."""
     extra: dict[str, tuple[str, Factory]] = {
         "quadprog": ("quadprog", Quadprog),
         "PIQP": ("piqp", Piqp),

@@ -1,9 +1,9 @@
 """Faults in flights of an autopilot: the vehicle's reaction, its distances, and its end state.
 
-`python -m bench.failsafe` flies the scenario `autopilot`, a figure eight over
-the paper's network, in calm air and in virtual time, with both of the scripted autopilot's
-flavours. A fault happens FAULT_S into each flight, and the vehicle is observed for WATCHED_S. If it
-flies on, distances are those until then.
+`python -m bench.failsafe` flies the scenario `autopilot`, a figure eight over the paper's network,
+in calm air and in virtual time, with both of the scripted autopilot's flavours. A fault happens
+FAULT_S into each flight, and the vehicle is observed for WATCHED_S. If the vehicle continues its
+mission, distances count until then.
 """
 
 import sys
@@ -38,7 +38,7 @@ FAULT_S, WATCHED_S, FOR_A_WHILE_S = 15.0, 40.0, 5.0
 """Time of flight of the fault, time for which the vehicle is observed after it, and length of a
 fault that ends by itself [s]."""
 DURATION_S = FAULT_S + WATCHED_S + 5.0
-"""Length of the flight [s], so long that its regular end is not observed."""
+"""Length of the flight [s]; its regular end comes after the observed time."""
 TRACK = str(Mode.TRACK).upper()
 STILL_MPS = 0.1
 """Horizontal speed below which the vehicle is at rest [m/s]."""
@@ -67,37 +67,32 @@ SCRIPTED: dict[CaseName, FaultName] = {
 }
 """Faults of the autopilot itself."""
 ENDING = frozenset({"link cut for 5 s", "autopilot sends nothing for 5 s"})
-"""Faults that end by themselves."""
 Ending = Literal["flies on", "hovers", "moves", "has landed", "pilot has it"]
 Changes = tuple[tuple[str, float], ...]
 """Modes in order, and the time at which each began, counted from the fault [s]."""
 
 
 class FaultOutcome(NamedTuple):
-    """Vehicle's behaviour after a fault."""
-
     case: CaseName
     flavour: FlavourName
     seed: int
     modes: Changes
     """Modes of the client's failsafe."""
     autopilot: Changes
-    """Modes of the autopilot."""
     moved_m: float
     """Largest horizontal distance from its position at the fault [m]."""
     off_path_m: float
-    """Largest horizontal distance from the nearest point of its desired path [m]."""
+    """Largest horizontal distance from the nearest point of the desired path [m]."""
     off_reference_m: float
-    """Largest horizontal distance from its moving reference [m]."""
+    """Largest horizontal distance from the moving reference [m]."""
     still_s: float
-    """Time until its horizontal speed was below STILL_MPS [s]; NaN for never."""
+    """Time until the horizontal speed was below STILL_MPS [s]; NaN for never."""
     down_s: float
-    """Time until its motors were off [s]; NaN for never."""
+    """Time until the motors were off [s]; NaN for never."""
     ending: Ending
 
 
 def scenario_of(flavour: FlavourName, seed: int) -> Scenario:
-    """Scenario that is flown."""
     cell = autopilots.Cell("skytether", flavour, autopilots.CALM, seed)
     return msgspec.structs.replace(autopilots.scenario_of(cell), duration=DURATION_S)
 
@@ -113,7 +108,6 @@ def beginning(flavour: FlavourName, seed: int) -> tuple[float, float]:
 
 
 def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
-    """Fly with a fault, and return the vehicle's behaviour."""
     scenario, (armed_s, began_s) = scenario_of(flavour, seed), beginning(flavour, seed)
     fault_s = began_s + FAULT_S
     end_s = fault_s + FOR_A_WHILE_S if case in ENDING else None
@@ -176,7 +170,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
         flavour,
         seed,
         modes=modes,
-        # On the ground PX4 is in the mode again that was asked for last.
+        # On the ground PX4 returns to the mode requested last.
         autopilot=tuple(change for change in since_fault(modes_aboard) if change[1] < down_s),
         moved_m=_largest(positions - positions[0]),
         off_path_m=_off_path(scenario, positions),
@@ -188,7 +182,6 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
 
 
 def _reference(scenario: Scenario, times_s: Array) -> Array:
-    """Horizontal reference positions [m] at some times of flight [s], shape (n,); shape (n, 2)."""
     return scenario.make_reference()(times_s)[:, :2, 0]
 
 
@@ -197,18 +190,17 @@ def _largest(vectors: Array) -> float:
 
 
 def _off_path(scenario: Scenario, positions: Array) -> float:
-    """Largest distance of positions [m], shape (n, 2), from the nearest point of the path [m]."""
+    """Largest distance of positions (n, 2) from the nearest point of the path [m]."""
     path = _reference(scenario, np.arange(0.0, DURATION_S, 0.02))
-    each = [np.linalg.norm(path - position, axis=1).min() for position in positions[::20]]
-    return float(max(each))
+    nearest_m = [np.linalg.norm(path - position, axis=1).min() for position in positions[::20]]
+    return float(max(nearest_m))
 
 
 def _ending(aboard: PilotedVehicle, speed: float, modes: Changes) -> Ending:
     """End state of the vehicle, in words.
 
     Args:
-        aboard: the autopilot's flight.
-        speed: its horizontal speed at the end [m/s].
+        speed: horizontal speed at the end [m/s].
         modes: modes of the client after the fault.
     """
     if not aboard.armed:
@@ -234,8 +226,7 @@ HEADINGS = [
 
 
 def tables(outcomes: Sequence[FaultOutcome]) -> dict[str, TextTable]:
-    """A table for each flavour, by its name."""
-    made = {}
+    by_name = {}
     for flavour in get_args(FlavourName):
         rows = [
             _row(case, of_case)
@@ -243,12 +234,11 @@ def tables(outcomes: Sequence[FaultOutcome]) -> dict[str, TextTable]:
             if (of_case := [e for e in outcomes if (e.case, e.flavour) == (case, flavour)])
         ]
         if rows:
-            made[f"failsafe {flavour}"] = TextTable(HEADINGS, rows)
-    return made
+            by_name[f"failsafe {flavour}"] = TextTable(HEADINGS, rows)
+    return by_name
 
 
 def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
-    """Row of a fault: range of times over its flights, and largest distances."""
     return [
         case,
         "gone" if case == "client killed" else _sequences([each.modes for each in outcomes]),
@@ -263,36 +253,34 @@ def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
 
 
 def _sequences(changes: Sequence[Changes]) -> str:
-    """Sequences of modes, and the times of each; flights with equal sequences are merged."""
     alike: dict[tuple[str, ...], list[list[float]]] = {}
     for each in changes:
         names = tuple(name for name, _ in each)
         alike.setdefault(names, []).append([time_s for _, time_s in each])
-    told = []
+    texts = []
     for names, times in alike.items():
         columns = zip(names, zip(*times, strict=True), strict=True)
-        told.append(", ".join(f"{name} {_span(column)}" for name, column in columns) or "no change")
-    return "; or ".join(told)
+        texts.append(
+            ", ".join(f"{name} {_span(column)}" for name, column in columns) or "no change"
+        )
+    return "; or ".join(texts)
 
 
 def _span(times_s: Sequence[float]) -> str:
-    """Range of some times; "never" for those that never came."""
-    known = [time_s for time_s in times_s if not np.isnan(time_s)]
-    if not known:
+    finite_s = [time_s for time_s in times_s if not np.isnan(time_s)]
+    if not finite_s:
         return "never"
-    least, most = f"{min(known):.1f}", f"{max(known):.1f}"
+    least, most = f"{min(finite_s):.1f}", f"{max(finite_s):.1f}"
     span = least if least == most else f"{least} to {most}"
-    return span if len(known) == len(times_s) else f"{span}, or never"
+    return span if len(finite_s) == len(times_s) else f"{span}, or never"
 
 
 @dataclass(frozen=True)
 class FailsafeBenchmarkOptions:
-    """Options of this benchmark."""
-
     seeds: int = 3
     """Number of seeds, from 1 on."""
     only: tuple[CaseName, ...] = get_args(CaseName)
-    """Faults."""
+    """Faults to fly."""
     flavours: tuple[FlavourName, ...] = get_args(FlavourName)
     """Flavours of the autopilot."""
     jobs: int = 1
@@ -300,12 +288,10 @@ class FailsafeBenchmarkOptions:
 
 
 def _fly(cell: tuple[CaseName, FlavourName, int]) -> FaultOutcome:
-    """See `fly`; called in a worker."""
     return fly(*cell)
 
 
 def main(argv: Sequence[str]) -> None:
-    """Fly as the command line says, and print the tables."""
     options = tyro.cli(FailsafeBenchmarkOptions, args=argv, description=__doc__)
     cells = product(options.only, options.flavours, range(1, options.seeds + 1))
     outcomes = study(_fly, list(cells), FaultOutcome, {}, None, Flags(options.jobs))

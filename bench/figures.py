@@ -1,10 +1,12 @@
-"""Figures of the documents: each is made anew by its command, and compared with what its page says.
+"""Figures of the documents: each is made anew by its command, and compared with the number in its
+page.
 
 `figures.toml` beside this file registers them. A figure is a text of a page in which every measured
 number is a placeholder, with the commands that fly for it and their seeds; or the tables that a
-module of `bench` makes. Pages alone have the numbers: here stands where they come from.
-`make figures` makes all of them, and goes on after Ctrl-C. With --write the numbers that have left
-their tolerance are corrected in the pages.
+module of `bench` makes. The register contains no numbers: only the pages do.
+
+`make figures` makes all of them, and continues after Ctrl-C. With --write the numbers that have
+left their tolerance are corrected in the pages.
 """
 
 import hashlib
@@ -37,64 +39,55 @@ from skytether.shell import command
 ROOT = Path(__file__).parents[1]
 REGISTER = Path(__file__).with_name("figures.toml")
 PLACEHOLDER = re.compile(r"\{([a-z]\w*)\.([\w.+]+)(?:([*/])([\d.]+))?\}")
-"""`{NAME.FIGURE}`: mean over the seeds of a figure in the summaries of the command NAME; also
-`A+B` for a sum, `.median`, `.least`, `.most`, `.half` (half of the 95 % interval), and `*100` or
-`/39` at the end.
-"""
+"""`{NAME.FIGURE}`: mean over the seeds of a figure in the summaries of the command NAME; also `A+B`
+for a sum, `.median`, `.least`, `.most`, `.half` (half of the 95 % interval), and `*100` or `/39` at
+the end."""
 NUMBER = r"-?\d+(?:\.\d+)?"
 STATISTICS: dict[str, Any] = {"mean": np.mean, "median": np.median, "least": np.min, "most": np.max}
 CHUNK = 10
-"""Number of flights in a task."""
 
 
 class Figure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Registered text or tables of a page."""
-
     page: str
-    """Page, from the top folder on."""
+    """Page, relative to the top folder."""
     kind: Literal["fast", "slow"] = "slow"
     """`fast`: some seconds, made by the tests as well; `slow`: by `make figures` alone."""
     minutes: float = 0.1
-    """Time that it takes on two cores; shorter ones are made first."""
+    """Time to make the figure on two cores; figures with shorter times are made first."""
     text: str = ""
-    """Text of the page with placeholders for its numbers; any white space fits any other."""
+    """Text of the page with placeholders for its numbers; any white space matches any other."""
     commands: Mapping[str, str] = {}
     """Commands by the names in the placeholders, without `skytether`, `--json` and `--seed`."""
     seeds: tuple[int, int] = (1, 1)
-    """First and last seed of each command."""
     module: str = ""
     """Module of `bench` whose `document_tables(folder, flags)` makes the tables."""
     tables: tuple[str, ...] = ()
-    """Names of these tables in the page."""
+    """Names of the tables in the page."""
     tolerance: float = 0.02
-    """Largest relative change of a number; one that is rounded to the written one has none."""
+    """Largest relative change of a number that still counts as unchanged."""
 
     def pattern(self) -> re.Pattern[str]:
-        """Pattern that finds the text in its page, with a group for each number."""
         literals = PLACEHOLDER.sub("\0", self.text).split("\0")
         spaced = (re.sub(r"(?:\\?\s)+", r"\\s+", re.escape(each)) for each in literals)
         return re.compile(f"({NUMBER})".join(spaced))
 
 
 class Flights(NamedTuple):
-    """Flights of a command, in a task."""
-
     command: str
     seeds: tuple[int, ...]
 
 
 class Number(NamedTuple):
-    """Number of a page, beside the one that was found."""
+    """Number of a page, and the number that was measured now."""
 
     written: str
     found: float
 
     def rounded(self) -> str:
-        """Found number with the decimals of the written one."""
+        """Measured number with the decimals of the written number."""
         return f"{self.found:.{len(self.written.partition('.')[2])}f}"
 
     def is_within(self, tolerance: float) -> bool:
-        """Whether the found number is the written one, but for rounding and a relative change."""
         written = float(self.written)
         change = abs(self.found - written)
         return self.rounded() == self.written or change <= tolerance * abs(written)
@@ -102,31 +95,28 @@ class Number(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Comparison of a figure."""
-
     numbers: Sequence[Number]
     page: str
-    """Page with the numbers that were found in place of the written ones."""
+    """Text of the page with the measured numbers in place of the written ones."""
 
 
 def register() -> dict[str, Figure]:
-    """All registered figures by their names."""
     return msgspec.convert(toml.loads(REGISTER.read_text()), dict[str, Figure])
 
 
 def code() -> str:
-    """Digest of all that flies, and of its scenarios: flights of other code are not reused."""
+    """Digest of all code that flies, and of its scenarios: flights of other code are not reused."""
     ours = (
         f"skytether/{room}" for room in ("autopilot", "quadrotor", "scenarios", "sim", "station")
     )
     rooms = ("server", "client", "netem", "shared", *ours)
-    kept = (
+    sources = (
         file
         for room in rooms
         for kind in ("*.py", "*.toml")
         for file in sorted((ROOT / room).rglob(kind))
     )
-    return hashlib.sha256(b"".join(file.read_bytes() for file in kept)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in sources)).hexdigest()[:12]
 
 
 def fly(cell: Flights) -> list[dict[str, Any]]:
@@ -136,7 +126,7 @@ def fly(cell: Flights) -> list[dict[str, Any]]:
         options = command.parse(FlyOptions(), argv, "skytether fly", None)
         summaries = sweep.summaries(options.scenario, options.config, cell.seeds)
         return [msgspec.to_builtins(summary) for summary in summaries]
-    found = []
+    results = []
     for seed in cell.seeds:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "summary.json"
@@ -144,12 +134,11 @@ def fly(cell: Flights) -> list[dict[str, Any]]:
             subprocess.run(
                 [*line, "--seed", str(seed), "--json", file], check=True, capture_output=True
             )
-            found.append(msgspec.json.decode(file.read_bytes()))
-    return found
+            results.append(msgspec.json.decode(file.read_bytes()))
+    return results
 
 
 def cells(figure: Figure) -> dict[tuple[str, int], Flights]:
-    """Tasks of a figure by the name of the command and the first seed."""
     first, last = figure.seeds
     return {
         (name, seed): Flights(line, tuple(range(seed, min(seed + CHUNK, last + 1))))
@@ -181,9 +170,9 @@ def compare(figure: Figure, page: str, results: Mapping[tuple[str, int], Any]) -
     Raises:
         ValueError: the page does not have the text exactly once.
     """
-    found = list(figure.pattern().finditer(page))
-    if len(found) != 1:
-        raise ValueError(f"{figure.page}: got {len(found)} places with the text, expected 1")
+    matches = list(figure.pattern().finditer(page))
+    if len(matches) != 1:
+        raise ValueError(f"{figure.page}: got {len(matches)} places with the text, expected 1")
     runs: dict[str, list[Any]] = {}
     for (name, _), summaries in results.items():
         runs.setdefault(name, []).extend(summaries)
@@ -191,35 +180,32 @@ def compare(figure: Figure, page: str, results: Mapping[tuple[str, int], Any]) -
     for group, (name, path, operator, by) in enumerate(PLACEHOLDER.findall(figure.text), 1):
         value = statistic(runs[name], path)
         factor = float(by or 1)
-        number = Number(found[0][group], value / factor if operator == "/" else value * factor)
-        kept = number.is_within(figure.tolerance)
-        parts += page[end : found[0].start(group)], number.written if kept else number.rounded()
+        number = Number(matches[0][group], value / factor if operator == "/" else value * factor)
+        within = number.is_within(figure.tolerance)
+        parts += page[end : matches[0].start(group)], number.written if within else number.rounded()
         numbers.append(number)
-        end = found[0].end(group)
+        end = matches[0].end(group)
     return Verdict(numbers, "".join(parts) + page[end:])
 
 
 def compare_tables(figure: Figure, page: str, made: Mapping[str, TextTable]) -> Verdict:
-    """Comparison of tables, number by number, with those that their module has made anew."""
     written = refresh(page, {name: made[name] for name in figure.tables})
     numbers = list[Number]()
     for name in figure.tables:
         place = place_of(name)
         before, after = (re.findall(NUMBER, place.findall(each)[0]) for each in (page, written))
         pairs = zip_longest(before, after, fillvalue="nan")
-        numbers += [Number(one, float(other)) for one, other in pairs]
-    kept = all(each.is_within(figure.tolerance) for each in numbers)
-    return Verdict(numbers, page if kept else written)
+        numbers += [Number(old, float(new)) for old, new in pairs]
+    unchanged = all(each.is_within(figure.tolerance) for each in numbers)
+    return Verdict(numbers, page if unchanged else written)
 
 
 @dataclass(frozen=True)
 class FiguresOptions:
-    """Options of this command."""
-
     only: tuple[str, ...] = ()
     """Figures to make, by name; all unless given."""
     fast: bool = False
-    """Make only the fast ones."""
+    """Make only the fast figures."""
     write: bool = False
     """Correct the pages where a number has left its tolerance."""
     jobs: int | None = None
@@ -272,10 +258,8 @@ def make(figure: Figure, page: Path, folder: Path, flags: Flags) -> Verdict:
     """Make a figure, and compare it with its page.
 
     Args:
-        figure: what is made.
-        page: file of its page, which is read after the flights.
-        folder: where flights are kept; figures of the same flights share them.
-        flags: workers.
+        page: file of the page, which is read after the flights.
+        folder: folder for finished flights; figures of the same flights share them.
 
     Raises:
         CommandError: interrupted.

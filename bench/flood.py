@@ -2,10 +2,10 @@
 
 Five vehicles of `demo-committed` fly on a sealed link, 100 observations a second; the network is
 not impaired, so every loss is due to the flood. An attacker on the path has recorded packets, and
-floods the server's port: either with forged packets, half of them with the header, length and
-channel of a vehicle's, half random bytes; or with HELLOs, half of them random bytes under a valid
-header, half repetitions of real ones, each from its own port. Meanwhile one more vehicle starts.
-The same flight without a flood is measured for comparison.
+floods the server's port. Of forged packets, half have the header, length and channel of a vehicle's
+packet, and half are random bytes. Of HELLOs, half are random bytes under a valid header, and half
+are repetitions of real ones, each from its own port. During the flood another vehicle starts. The
+same flight without a flood is measured for comparison.
 
 The flood is sent by absolute deadlines, one batch per millisecond.
 """
@@ -51,13 +51,11 @@ PORTS_MAX = 500
 """Number of sockets that a sender of HELLOs keeps open, so that answers reach no other process."""
 NONE, FORGED, HELLOS = KINDS = ("none", "forged packets", "HELLOs")
 HANDLED, SESSION_S, GROWTH_BYTES = 0.999, 3.0, 5_000_000
-"""Targets: share of valid packets handled, time to a session, growth of memory."""
+"""Targets: share of valid packets handled, time to a session [s], growth of memory [B]."""
 
 
 @dataclass(frozen=True)
 class FloodCounts:
-    """Size of the benchmark."""
-
     seconds: int
     forged: int
     """Number of forged packets a second."""
@@ -72,8 +70,6 @@ FULL, QUICK = FloodCounts(30, 100_000, 10_000), FloodCounts(3, 20_000, 2000)
 
 @dataclass(frozen=True)
 class Flood:
-    """Figures of one flight."""
-
     kind: str
     sent: float
     """Flood packets sent per second."""
@@ -84,13 +80,12 @@ class Flood:
     unread: float
     """Datagrams per second that the kernel dropped for lack of room."""
     good: int
-    """Number of observations sent."""
     lost: int
-    """Number of the sent observations that the server never handled."""
+    """Number of sent observations that the server never handled."""
     share: float
     """Share of the observations sent during the flood that the server handled."""
     missed: int
-    """Number of ticks that the server missed during the flood."""
+    """Number of ticks missed during the flood."""
     rmse_m: float
     """RMSE of the vehicles during the flood [m]."""
     session_s: float
@@ -114,29 +109,25 @@ class Tap(Proxy):
     def __init__(self, scenario: Scenario, server: tuple[str, int]) -> None:
         super().__init__(scenario, server=server)
         self.recorded: dict[int, bytes] = {}
-        """Newest packets to the server, by type."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if datagram.socket == 0:
             self.recorded[channel.kind(datagram.payload)] = datagram.payload
         super().receive(datagram, now_ns=now_ns)
 
 
 def tap(pipe: Connection, port: int) -> None:
-    """Forward packets to the server's port; reports its own port, and on request the kept
-    packets.
-    """
+    """Forward packets to the server's port; sends its own port, and on request the kept packets."""
     endpoint = Tap(derive("demo", network={"uplink": "", "downlink": ""}), (HOST, port))
     shell = driver.Shell(endpoint, (HOST, 0), [(HOST, port)])
     pipe.send(shell.address[1])
 
-    def tell() -> None:
+    def answer_request() -> None:
         if pipe.poll():
             pipe.recv()
             pipe.send(endpoint.recorded)
 
-    driver.run([shell], on_second=tell)
+    driver.run([shell], on_second=answer_request)
 
 
 # -- packets of the flood --------------------------------------------------------------------------
@@ -155,7 +146,7 @@ def forgeries(good: bytes) -> list[bytes]:
             packets.append(rng.bytes(len(good)))
             continue
         vehicle, used = channel.address(good)
-        # Counters ahead of the newest: an old one would be refused for its age.
+        # Counters ahead of the newest packet's: an old one would be refused for its age.
         counter = 10_000 + int(rng.integers(100_000))
         header = channel.HEADER.pack(channel.VERSION, channel.DATA, vehicle, used, counter)
         packets.append(header + rng.bytes(len(good) - len(header)))
@@ -217,7 +208,7 @@ def _batches(pipe: Connection, rate: int, seconds: int) -> Iterator[int]:
 
 
 def measure(counts: FloodCounts) -> dict[str, Any]:
-    """Figures of a flight without a flood, and with each."""
+    """Figures of a flight without a flood, and with each flood."""
     lateness = WakeLateness()
     floods = [_fly(kind, counts, lateness) for kind in progress(KINDS, "floods")]
     return {
@@ -229,8 +220,6 @@ def measure(counts: FloodCounts) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _State:
-    """Counters of the server at a moment."""
-
     time_ns: int
     dropped: int
     """Number of datagrams that the server has dropped."""
@@ -245,7 +234,6 @@ class _State:
 
     @classmethod
     def of(cls, server: ChildProcess) -> "_State":
-        """State of a server now."""
         resident, figures = server.resident_bytes(), server.figures()
         return cls(
             time.monotonic_ns(),
@@ -258,9 +246,8 @@ class _State:
 
 
 def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
-    """One flight, with one kind of flood or none."""
     duration_s = counts.lead_s + counts.seconds + AFTER_S
-    # A report at every step: a missing one was lost.
+    # A report at every step: a missing report was lost.
     flown = derive("demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"})
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
@@ -329,7 +316,6 @@ def is_admitted(packet: bytes) -> bool:
 
 
 def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
-    """Packets of a flood, made from recorded ones."""
     if kind == FORGED:
         return forgeries(recorded[channel.DATA])
     return hellos(recorded[handshake.INITIATION]) if kind == HELLOS else []
@@ -338,7 +324,6 @@ def _packets(kind: str, recorded: Mapping[int, bytes]) -> list[bytes]:
 def _sender(
     stack: ExitStack, kind: str, counts: FloodCounts, port: int, packets: list[bytes]
 ) -> Connection | None:
-    """Attacking process, started and waiting; None for a run without a flood."""
     match kind:
         case "forged packets":
             sender = start(stack, flood, port, packets, counts.forged, counts.seconds)
@@ -351,12 +336,10 @@ def _sender(
 
 
 def floods_of(result: Mapping[str, Any]) -> list[Flood]:
-    """Names of the floods in the figures of `measure`."""
     return [Flood(**each) for each in result["floods"]]
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table with a column for each kind of flood."""
     floods = floods_of(result)
     rows = {
         "packets of the flood sent [1/s]": [f"{each.sent:.0f}" for each in floods],

@@ -36,7 +36,6 @@ Step = TypeVar("Step")
 
 
 def sleep_until(due_ns: int) -> None:
-    """Sleep until an absolute time; return at once if it has passed."""
     time.sleep(max(0, due_ns - time.monotonic_ns()) / SECOND_NS)
 
 
@@ -52,13 +51,11 @@ class WakeLateness:
     late_ns: list[int] = field(default_factory=list)
 
     def sleep(self, pause_s: float) -> None:
-        """Pause, and record the lateness of the wake."""
         due_ns = time.monotonic_ns() + round(pause_s * SECOND_NS)
         sleep_until(due_ns)
         self.late_ns.append(time.monotonic_ns() - due_ns)
 
     def figures(self) -> dict[str, float]:
-        """Quantiles of the lateness [ms], by name."""
         shares = {"p50_ms": 0.5, "p99_ms": 0.99, "max_ms": 1.0}
         return {name: quantile_ms(self.late_ns, share) for name, share in shares.items()}
 
@@ -70,11 +67,11 @@ class Pace:
     turn: int
     """Number of consecutive problems of a turn; the first of several is a warm-up."""
     pause_s: float
-    """Sleep before every turn [s]."""
+    """Pause before every turn [s]."""
 
 
 HOT = Pace(turn=50, pause_s=0.001)
-"""Pace of problems back to back, with everything in the caches."""
+"""Pace of problems back to back, with all data in the caches."""
 PACED = Pace(turn=1, pause_s=0.05)
 """Pace of a controller with the paper's step of 50 ms: in every pause others take the caches."""
 
@@ -90,14 +87,10 @@ def interleave(
 ) -> dict[str, Durations]:
     """CPU time of each contestant for each of the problems 0 … count - 1.
 
-    The order of contestants is random in each turn, as it affects what is left in the caches.
+    The order of contestants is random in each turn, as it affects the content of the caches.
 
     Args:
         contestants: function that solves a problem by its number, by name.
-        count: number of problems.
-        pace: hot or paced.
-        lateness: records the lateness of the pauses.
-        title: title of the progress bar.
         prepare: preparation of a contestant before each problem, which is not measured.
     """
     order, rng = list(contestants.items()), np.random.default_rng(1)
@@ -120,7 +113,6 @@ def interleave(
 
 @contextmanager
 def without_gc() -> Iterator[None]:
-    """Context without garbage collection."""
     gc.collect()
     gc.disable()
     try:
@@ -146,12 +138,10 @@ def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict
 
 
 def ratios(theirs: Mapping[str, float], ours: Mapping[str, float]) -> dict[str, float]:
-    """Ratios of another contestant's figures of `figures_us` to ours."""
     return {name: theirs[f"{name}_us"] / ours[f"{name}_us"] for name in ("p50", "p99")}
 
 
 def machine() -> dict[str, Any]:
-    """Machine, packages and commit of the measurement."""
     return {
         "cpu": processor(),
         "cores": len(os.sched_getaffinity(0))
@@ -180,18 +170,16 @@ class TextTable:
     rows: list[list[str]]
 
     def markdown(self) -> str:
-        """Table as Markdown."""
         rule = ["---", *["---:"] * (len(self.headings) - 1)]
         lines = [[" ".join(heading.split()) for heading in self.headings], rule, *self.rows]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def show(self, title: str) -> None:
-        """Print the table on the console."""
         tables.show(title, self.headings, self.rows)
 
 
 def place_of(name: str) -> re.Pattern[str]:
-    """Place of a table in a document, between `<!-- table: name -->` and `<!-- end -->`."""
+    """Pattern of a table in a document, between `<!-- table: name -->` and `<!-- end -->`."""
     begin = f"<!-- table: {re.escape(name)} -->\n"
     return re.compile(rf"(?<={begin}).*?(?=<!-- end -->)", re.DOTALL)
 
@@ -211,16 +199,13 @@ def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
 
 
 def us(value: float) -> str:
-    """Number of microseconds as text, with three digits."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def times(ratio: float, target: float | None = None) -> str:
-    """Ratio as text, with its target in brackets."""
     text = f"{ratio:.0f} x" if ratio >= 100 else f"{ratio:.1f} x"
     return text if target is None else f"{text} (≥ {target:g})"
 
 
 def median(values: Iterable[float]) -> float:
-    """Median of a few figures."""
     return float(statistics.median(values))

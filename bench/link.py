@@ -3,7 +3,7 @@
 Packets are sealed, opened and refused by the two ends themselves (`server.secure`, `client.secure`)
 without a network, with H = 50 and two axes. The cost of a handshake is all work of one end: a HELLO
 without a cookie, the challenge, the HELLO with the cookie and the WELCOME. The server's work is
-that of a fleet in virtual time, each vehicle with its own key, alternately encrypted and in
+measured with a fleet in virtual time, each vehicle with its own key, alternately encrypted and in
 plaintext.
 """
 
@@ -42,16 +42,13 @@ LARGER = 1.01
 
 @dataclass(frozen=True)
 class LinkCounts:
-    """Size of the benchmark."""
-
     packets: int = 20_000
     handshakes: int = 2000
     vehicles: int = 100
-    """Number of vehicles of the fleet."""
     seconds: float = 10.0
-    """Duration of each of its flights [s]."""
+    """Duration of each flight of the fleet [s]."""
     turns: int = 5
-    """Number of its flights, of each kind."""
+    """Number of flights of the fleet, of each kind."""
     seeds: int = 20
     """Number of flights of the demonstration, of each kind."""
 
@@ -61,15 +58,11 @@ QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=
 
 
 class Ends:
-    """Both ends of one vehicle's link, after a handshake unless `hello` and `welcome` say
-    otherwise.
+    """Both ends of one vehicle's link.
 
     Args:
-        gate: the server's end.
-        keyring: keys of all vehicles.
-        vehicle: number of the vehicle.
-        hello: its first message.
-        welcome: the answer to it.
+        hello: first message of the vehicle.
+        welcome: the server's answer.
     """
 
     def __init__(
@@ -83,23 +76,20 @@ class Ends:
         self.begin()
 
     def begin(self) -> None:
-        """Create a new link for the vehicle, with the same random numbers as the previous one."""
         entropy = stream(1, "link", self._vehicle).bytes
         self.link = client.SecureLink(self._key, entropy=entropy)
 
     def challenge(self) -> None:
         """Exchange HELLO and challenge; keep both, and the HELLO with the cookie."""
-        first = self.link.hello(self._hello, now_ns=NOW_NS)
-        assert self._gate.open(Datagram(first, PEER), now_ns=NOW_NS) is None
+        hello = self.link.hello(self._hello, now_ns=NOW_NS)
+        assert self._gate.open(Datagram(hello, PEER), now_ns=NOW_NS) is None
         (answer,) = self._gate.outbox()
-        self.first, self.challenged = first, answer.payload
+        self.first, self.challenged = hello, answer.payload
         assert self.link.open(answer.payload, now_ns=NOW_NS) is None
         self.second = self.link.hello(self._hello, now_ns=NOW_NS)
 
     def welcome(self) -> GateCall:
-        """Exchange the HELLO with the cookie and the WELCOME; keep the WELCOME. Returns the HELLO's
-        call.
-        """
+        """Exchange the HELLO with the cookie and the WELCOME; keep the WELCOME."""
         call = self._gate.open(Datagram(self.second, PEER), now_ns=NOW_NS)
         assert call is not None
         self.response = call.line.seal(self._welcome)
@@ -107,18 +97,15 @@ class Ends:
         return call
 
     def adopt(self) -> None:
-        """Let the vehicle adopt the channel of the WELCOME."""
         self.link.open(self.response, now_ns=NOW_NS)
         self.link.adopt(now_ns=NOW_NS)
 
     def as_server(self) -> None:
-        """Server's part of a handshake."""
         self._gate.open(Datagram(self.first, PEER), now_ns=NOW_NS)
         self._gate.outbox()
         self.welcome()
 
     def as_client(self) -> None:
-        """Vehicle's part of a handshake."""
         self.begin()
         self.link.hello(self._hello, now_ns=NOW_NS)
         self.link.open(self.challenged, now_ns=NOW_NS)
@@ -127,7 +114,6 @@ class Ends:
 
 
 def measure(counts: LinkCounts) -> dict[str, Any]:
-    """Figures of packets, handshakes, a fleet and the demonstration."""
     lateness = WakeLateness()
     return {
         **_packets(counts, lateness),
@@ -141,18 +127,20 @@ def measure(counts: LinkCounts) -> dict[str, Any]:
 def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
     """Sizes of the messages, and the cost of a packet to either end."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
-    known = {type(message).__name__.upper(): encode(message) for message in messages(terms)}
-    hello, welcome = known["HELLO"], known["WELCOME"]
+    encoded = {type(message).__name__.upper(): encode(message) for message in messages(terms)}
+    hello, welcome = encoded["HELLO"], encoded["WELCOME"]
     gate, keyring = _gate(1)
     ends = Ends(gate, keyring, 1, hello, welcome)
     ends.challenge()
     ends.welcome()
     ends.adopt()
-    sizes = {name: (len(payload), len(ends.link.seal(payload))) for name, payload in known.items()}
+    sizes = {
+        name: (len(payload), len(ends.link.seal(payload))) for name, payload in encoded.items()
+    }
     sizes["HELLO"] = len(hello), len(ends.second)
     sizes["WELCOME"] = len(welcome), len(ends.response)
 
-    observation, horizon = known["OBSERVATION"], known["HORIZON"]
+    observation, horizon = encoded["OBSERVATION"], encoded["HORIZON"]
     old = ends.link.seal(observation)
     call = gate.open(Datagram(old, PEER), now_ns=NOW_NS)
     assert call is not None
@@ -195,9 +183,7 @@ def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
 
 
 def _handshakes(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
-    """Cost of a handshake to either end; each is another vehicle's, because their rate is
-    limited.
-    """
+    """Cost of a handshake to either end; each is another vehicle's, since their rate is limited."""
     terms, count = load("demo").terms(), counts.handshakes
     hello = encode(Hello(1, 2**60, terms))
     welcome = encode(Welcome(1, 2**31, 2**60, 2**60, NOW_NS, 0, terms))
@@ -254,7 +240,6 @@ def _demo(counts: LinkCounts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Tables of the cost of a packet, of packet sizes, and of the link as a whole."""
     both = {**result["packet"], **{f"handshake, {k}": v for k, v in result["handshake"].items()}}
     nothing = both.pop(NOTHING)
     rows = [

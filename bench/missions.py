@@ -10,19 +10,20 @@ reach its goal. With --harsh every link is also cut repeatedly, often for so lon
 takes the vehicle as lost, and in half of the missions the server restarts without memory. With
 --space they fly with three axes, some zones end below or begin above the vehicles, and a vehicle
 without packets for 40 s lands. Every fault is printed with its seed: `--first 17 --flights 1` flies
-the mission again.
+the mission of seed 17 again.
 
 `swap`: vehicles swap places on a circle or a sphere, over several networks; with one of them the
 server is down three times a flight, for 0.5 to 20 s.
 
-`published`: tasks of published planners, with places, distances, bounds and noise of the authors'
-code. Skytether plans with the same distances, for vehicles with the paper's time constant, over a
-good network (20 ms, no loss) and over the paper's with 30 % loss.
+`published`: tasks of published planners, with positions, distances, bounds and noise of the
+authors' code. Skytether plans with the same distances, for vehicles with the paper's time constant,
+over a good network (20 ms, no loss) and over the paper's with 30 % loss.
 
 - Luis, Vukosavljev and Schoellig (RA-L, 2020), github.com/carlosluis/online_dmpc: `config.json`
-  (four cross), `sim_params.m` and `comp_dmpc_bvc.m` (random places), `run_algorithm.m` (a crash).
+  (four cross), `sim_params.m` and `comp_dmpc_bvc.m` (random positions), `run_algorithm.m` (a
+  crash).
 - Gräfe et al. (DMPC-Swarm, 2025), github.com/Data-Science-in-Mechanical-Engineering/DMPC-Swarm:
-  `setpoint_creator.py` (a circle of 1.5 m), `batch_simulation.yaml` (fifteen random places).
+  `setpoint_creator.py` (a circle of 1.5 m), `batch_simulation.yaml` (fifteen random positions).
 """
 
 import sys
@@ -67,19 +68,19 @@ C = TypeVar("C")
 GOAL_AT_S = 2.0
 """Time from which the goals of random and published missions hold [s]."""
 ARRIVED_M, PUBLISHED_ARRIVED_M = 0.3, 0.1
-"""Distance from its goal at which a vehicle has arrived; of `comp_dmpc_bvc.m` [m]."""
+"""Distances from the goal at which a vehicle has arrived [m]; the second: `comp_dmpc_bvc.m`."""
 ROOM_M2 = 12.0
 """Area for each vehicle and zone of a random mission [m²]."""
 UP_S, CUT_S = (20.0, 80.0), (2.0, 20.0)
 """Ranges of the mean time between two cuts of a link, and of the mean length of a cut [s]."""
 HIGH_M = 6.0
-"""Greatest height of a goal in space [m]; the least is a sixth of it."""
+"""Greatest height of a goal with --space [m]; the least is a sixth of it."""
 MORTAL_SHARE = 0.5
-"""Share of the harsh missions in which the server dies."""
+"""Share of the harsh missions in which the server restarts."""
 DEATHS, DOWN_S = 3, (0.5, 20.0)
-"""Number of times that the server dies, and shortest and longest time that it is down [s]."""
+"""Number of times that the server stops, and range of the times that it is down [s]."""
 MORTAL = "10 %, a server that dies"
-"""Network with which the server dies."""
+"""Network with which the server restarts."""
 SWAP_NETWORKS = {
     "no loss": "paper(0.4, 0.02, 2)",
     "10 % lost": "paper(0.4, 0.02, 2) & loss(0.1)",
@@ -89,22 +90,22 @@ SWAP_NETWORKS = {
     "10 %, all links cut for 5 s every 20 s": "paper(0.4, 0.02, 2) & loss(0.1) & outages(20, 5)",
     MORTAL: "paper(0.4, 0.02, 2) & loss(0.1)",
 }
-"""Networks, both ways alike."""
+"""Networks, the same in both directions."""
 TOLD_S = 20.0
-"""Length of a simulation of `sim_params.m` [s]."""
+"""Length of a simulation in `sim_params.m` [s]."""
 PUBLISHED_NETWORKS = {
     "20 ms": ("constant(0.02)", 0.5),
     "paper, 30 %": ("paper(0.4, 0.02, 2) & loss(0.3)", 1.0),
 }
-"""Network each way, and `link.join_s` [s]."""
+"""Network of both directions, and `link.join_s` [s]."""
 
 
 @dataclass(frozen=True)
 class Amount:
-    """Amount to fly."""
+    """Number of flights, processes and files."""
 
     flights: int = 10
-    """Flights of each row."""
+    """Number of flights of each row."""
     workers: int = 2
     """Number of processes."""
     out: Path | None = None
@@ -125,13 +126,13 @@ class RandomOptions(Amount):
 
     flights: int = 100
     first: int = 1
-    """Seed of the first."""
+    """Seed of the first mission."""
     duration: float = 120.0
     """Length of a flight [s]."""
     harsh: bool = False
-    """Whether links are cut and servers die."""
+    """Whether links are cut and servers restart."""
     space: bool = False
-    """Whether vehicles fly in space."""
+    """Whether vehicles fly with three axes."""
 
 
 @dataclass(frozen=True)
@@ -155,31 +156,27 @@ class PublishedOptions(Amount):
 
 
 class MissionFlight(NamedTuple):
-    """Result of a flight."""
-
     seed: int
     vehicles: int
     network: str
     least_m: float
-    """Smallest distance between two vehicles, heights scaled [m]."""
+    """Smallest distance between two vehicles, with scaled heights [m]."""
     clear_m: float | None
     """Smallest distance of a vehicle from a zone [m]; None without zones."""
     late: int
-    """Number of vehicles that have not arrived."""
     arrived_s: float | None
-    """Time from the goals to the last arrival for good [s]; None if a vehicle has not arrived."""
+    """Time from the start of the goals until all vehicles stay at them [s]; None if one has not
+    arrived."""
     left: int
-    """Observations of a vehicle outside its tube."""
+    """Number of observations of a vehicle outside its tube."""
     landed: int
-    """Number of vehicles that have landed."""
     packets: float
-    """Packets a second both ways, of a vehicle."""
+    """Packets a second, both directions together, per vehicle."""
     plan_ms: float
-    """Time that the server planned for a motion that it sent, on average [ms]."""
+    """Mean planning time of the server for each motion that it sent [ms]."""
 
     @property
     def was_in_zone(self) -> bool:
-        """Whether a vehicle was in a zone."""
         return self.clear_m is not None and self.clear_m < 0.0
 
 
@@ -194,8 +191,6 @@ def fly_mission(
     """Fly a scenario to its end, and evaluate the flight.
 
     Args:
-        scenario: mission to fly.
-        vehicles: number of vehicles.
         deaths: times at which the server stops and restarts [s], in order.
         goal_at_s: time from which on the goals hold, on each vehicle's clock [s]; with 0 the
             vehicles' clocks are aligned.
@@ -206,8 +201,8 @@ def fly_mission(
     goals, dt_s, client = scenario.make_reference(), scenario.control.dt, record.client
     assert isinstance(goals, Mission)
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
-    told = record.figures["client"]["by_vehicle"]
-    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each]
+    figures = record.figures["client"]["by_vehicle"]
+    began_s = [figures[str(rows["vehicle"][0])]["began_s"] for rows in each]
     least = least_separation(each, began_s, dt_s, scenario.mission.height_scale)
     assert least is not None
     arrived_s, clear_m, late = [], [], 0
@@ -240,7 +235,6 @@ def fly_mission(
 
 @contextmanager
 def timed() -> Iterator[list[float]]:
-    """Computing time of the planner in each tick within the block [s]."""
     real, spent = MissionPlanner.plan, list[float]()
 
     def plan(self: MissionPlanner, rows: Indices, step: Indices, foresight: Foresight) -> None:
@@ -261,8 +255,6 @@ def fly_with_deaths(
     """Flight in which the server restarts without memory, and all runs of the server.
 
     Args:
-        scenario: mission to fly.
-        vehicles: number of vehicles.
         deaths: times at which the server stops and restarts [s], in order.
     """
     lives: list[Server] = []
@@ -296,8 +288,6 @@ def mission_scenario(
 
     Args:
         name: name of the scenario that is changed.
-        seed: seed of the scenario.
-        duration: length of the flight [s].
         goals: starts and goals [m]; shape (2, vehicles, axes).
         folder: folder for the file of goals.
     """
@@ -316,7 +306,6 @@ def mission_scenario(
 
 
 def arrivals(flown: Sequence[MissionFlight]) -> str:
-    """Median and maximum of the last arrival, over flights in which all vehicles arrived."""
     done = [each.arrived_s for each in flown if each.arrived_s is not None]
     return f"{np.median(done):.1f}, {max(done):.1f}" if done else "-"
 
@@ -379,23 +368,23 @@ def _places(
 ) -> Array:
     """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
     room_m = 0.75 * apart_m  # from zones, so that others can pass a vehicle at its goal
-    routes, found = Routes(kept, room_m), list[Array]()
-    while len(found) < 2:
+    routes, chosen = Routes(kept, room_m), list[Array]()
+    while len(chosen) < 2:
         places = np.zeros((0, 2))
         for _ in range(20_000):
             place = rng.uniform(-half_m, half_m, (1, 2))
             near = np.linalg.norm(places - place, axis=1) < 1.6 * apart_m
             if near.any() or kept.clearance(place).min() < room_m + 0.05:
                 continue
-            if found and not routes.reaches(found[0][len(places)], place[0]):
+            if chosen and not routes.reaches(chosen[0][len(places)], place[0]):
                 continue
             places = np.concatenate([places, place])
             if len(places) == vehicles:
-                found.append(places)
+                chosen.append(places)
                 break
         else:
-            found.clear()  # too crowded: start again
-    return np.stack(found)
+            chosen.clear()  # too crowded: start again
+    return np.stack(chosen)
 
 
 def _network(rng: np.random.Generator) -> str:
@@ -475,7 +464,6 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
 
 
 def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
-    """A flight of a cell."""
     swap = reading.load(options.shape)
     way = SWAP_NETWORKS[network]
     reference = msgspec.structs.replace(
@@ -491,7 +479,6 @@ def swap_scenario(network: str, options: SwapOptions, seed: int) -> Scenario:
 
 
 def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
-    """Fly one cell: a seed and a network; called in a worker."""
     seed, network = cell
     when = deaths(seed, options.duration) if network == MORTAL else []
     scenario = swap_scenario(network, options, seed)
@@ -499,7 +486,6 @@ def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
 
 
 def swap_table(options: SwapOptions) -> TextTable:
-    """Fly every cell."""
     # Seeds in the outer loop, so that more flights only add cells at the end.
     cells = list(product(range(1, options.flights + 1), SWAP_NETWORKS))
     done = options.fly(partial(fly_swap, options), cells)
@@ -532,20 +518,18 @@ def swap_table(options: SwapOptions) -> TextTable:
 
 
 class Task(NamedTuple):
-    """A published task."""
-
     vehicles: int
     separation_m: float
     """Distance below which two vehicles count as crashed [m]."""
     tube_m: float
-    """Half of what the plans of the authors keep beyond that [m]."""
+    """Half of the additional distance that the authors' plans keep [m]."""
     stretch: float
     """Factor of the distance between vehicles that fly one above the other."""
     low_m: tuple[float, float, float]
     high_m: tuple[float, float, float]
-    """Corners of the box of random places [m]."""
+    """Corners of the box of random positions [m]."""
     circle_m: float = 0.0
-    """Radius of the circle on which vehicles swap places, in place of that [m]."""
+    """Radius of the circle on which vehicles swap places [m]; 0: random positions."""
 
 
 TASKS = {
@@ -571,15 +555,14 @@ def places(task: Task, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _spread(task: Task, rng: np.random.Generator, keep_m: float, scale: Array) -> Array:
-    """Random places in a box with a minimum distance; starts again if no more places fit."""
     while True:
-        found = np.zeros((0, 3))
+        chosen = np.zeros((0, 3))
         for _ in range(20_000):
             place = rng.uniform(task.low_m, task.high_m)
-            if (np.linalg.norm((found - place) * scale, axis=1) > keep_m + 1e-3).all():
-                found = np.append(found, place[None], axis=0)
-            if len(found) == task.vehicles:
-                return found
+            if (np.linalg.norm((chosen - place) * scale, axis=1) > keep_m + 1e-3).all():
+                chosen = np.append(chosen, place[None], axis=0)
+            if len(chosen) == task.vehicles:
+                return chosen
 
 
 def published_scenario(
@@ -591,10 +574,10 @@ def published_scenario(
     table["mission"] |= {
         "separation_m": task.separation_m,
         "height_m": task.separation_m * task.stretch,
-        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # which Skytether plans with besides
+        "tube_m": task.tube_m - 0.5 * MARGIN_M,  # Skytether's plans add MARGIN_M
         "acceleration_mps2": 1.0,
     }
-    # Places one above the other are no places to land from.
+    # A vehicle above another one must not land.
     table["vehicle"] |= {"wind": 0.0, "land_after_s": 0.0}
     table["sensor"] |= {"position_noise_m": 0.00228682, "velocity_noise_mps": 0.0109302}
     way, table["link"]["join_s"] = PUBLISHED_NETWORKS[network]
@@ -603,7 +586,6 @@ def published_scenario(
 
 
 def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) -> MissionFlight:
-    """Fly one cell: a seed, a task and a network; called in a worker."""
     seed, (name, network) = cell
     with tempfile.TemporaryDirectory() as folder:
         task = TASKS[name]
@@ -612,7 +594,6 @@ def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) 
 
 
 def published_table(options: PublishedOptions) -> TextTable:
-    """Fly every published task over every network; a table of the results."""
     kinds = list(product(TASKS, PUBLISHED_NETWORKS))
     cells = list(product(range(1, options.flights + 1), kinds))
     done = options.fly(partial(fly_published, options), cells)
@@ -650,7 +631,6 @@ Options = (
 
 
 def main(argv: Sequence[str]) -> None:
-    """Fly as the command line says, and print a table."""
     options = tyro.cli(cast(Any, Options), args=argv, description=__doc__)
     faults: list[MissionFlight] = []
     if isinstance(options, RandomOptions):

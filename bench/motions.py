@@ -1,8 +1,8 @@
 """Cost of planning missions, per tick, compared with OSQP.
 
 In each fleet a share of the vehicles flies near another: pairs that swap places repeatedly, 20 m
-from the next pair; the others fly to and fro alone. The planning of each tick (all of it, from the
-motions that may be flown to the one that is sent) is compared with OSQP on one QP for each vehicle
+from the next pair; the others fly to and fro alone. The whole planning of each tick, from the
+possible motions to the motion that is sent, is compared with OSQP on one QP for each vehicle
 planned for in that tick: the QP of its last iteration, with the constraints added so far. OSQP is
 set up once for each problem size and then updated, with tolerances of 1e-4, equivalent to about a
 millimetre, and without polishing. Both are CPU time.
@@ -35,28 +35,23 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 
 ROWS = 64
-"""OSQP's problems are padded to a multiple of this number of constraints with ones that always
-hold, so that OSQP is set up for a few sizes only."""
+"""OSQP's problems are padded to a multiple of this number with constraints that always hold, so
+that OSQP is set up for a few sizes only."""
 FLEETS = (16, 64, 200)
-"""Numbers of vehicles of the fleets."""
 SHARES = (0.0, 0.1, 0.5)
 """Shares of vehicles near others."""
 LEG_M, APART_M = 3.0, 20.0
-"""Length of a vehicle's way to and fro in these fleets, and distance to the next vehicle [m]."""
+"""Length of a vehicle's way to and fro, and distance to the next vehicle [m]."""
 LEG_S = 5.0
-"""Time from one goal to the next there [s]."""
+"""Time between successive goals [s]."""
 RIVALS = 60
-"""Number of ticks that OSQP solves the problems of."""
+"""Number of ticks whose problems OSQP solves."""
 
 
 @dataclass(frozen=True)
 class MotionsCounts:
-    """Fleets to measure the planning of."""
-
     fleets: tuple[int, ...] = FLEETS
-    """Numbers of vehicles."""
     shares: tuple[float, ...] = SHARES
-    """Shares of vehicles near others."""
     duration: float = 30.0
     """Length of a flight [s]."""
 
@@ -65,7 +60,7 @@ FULL, QUICK = MotionsCounts(), MotionsCounts((16,), (0.5,), 12.0)
 
 
 class MotionProblem(NamedTuple):
-    """A QP, as `DualActiveSet` takes it."""
+    """A QP in the form of `DualActiveSet`."""
 
     solver: DualActiveSet
     linear: Array
@@ -76,7 +71,6 @@ class MotionProblem(NamedTuple):
 
 @contextmanager
 def kept(problems: list[MotionProblem]) -> Iterator[None]:
-    """Record every QP that is solved within the block."""
     real = TrajectoryQP.solve
 
     def solve(
@@ -107,14 +101,11 @@ def filled_up(problem: MotionProblem) -> tuple[Any, Array]:
 
 
 class MotionOsqp:
-    """OSQP for problems with one Hessian."""
-
     def __init__(self, hessian: Array) -> None:
         self._hessian = sparse.csc_matrix(np.triu(hessian))
         self._made: dict[int, Any] = {}
 
     def solve(self, problem: MotionProblem) -> Array:
-        """Solution within OSQP's tolerance."""
         dense, least = filled_up(problem)
         rows, most = len(least), np.full(len(least), np.inf)
         most[: problem.equal] = least[: problem.equal]
@@ -135,8 +126,8 @@ class MotionOsqp:
             )
         else:
             solver.update(q=-problem.linear, l=least, u=most, Ax=dense.data)
-        found: Array = np.asarray(solver.solve(raise_error=False).x)
-        return found
+        solution: Array = np.asarray(solver.solve(raise_error=False).x)
+        return solution
 
 
 def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> Scenario:
@@ -144,7 +135,7 @@ def shared_space(vehicles: int, share: float, duration: float, folder: Path) -> 
     near = 2 * round(share * vehicles / 2)
     lines = ["vehicle,t,x,y"]
     for vehicle in range(1, vehicles + 1):
-        # Both of a pair fly along the same line, in opposite directions.
+        # Both vehicles of a pair fly along the same line, in opposite directions.
         place = (vehicle - 1) // 2 if vehicle <= near else vehicle
         side = 1.0 if vehicle > near or vehicle % 2 else -1.0
         for leg in range(math.ceil(duration / LEG_S) + 1):
@@ -220,7 +211,6 @@ def measure(counts: MotionsCounts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table of planning times and OSQP's."""
     rows = []
     for each in result["fleets"]:
         ours, theirs = (
@@ -249,7 +239,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 def _beside_osqp(
     spent: list[float], problems: list[list[MotionProblem]], planned: list[int]
 ) -> dict[str, Any]:
-    """Planning time of the ticks with planned vehicles, and OSQP's time."""
     root = problems[planned[0]][0].solver.root
     rival = MotionOsqp(np.linalg.inv(root.T @ root).astype(np.float64))
     looked_at = planned[:: max(1, len(planned) // RIVALS)]

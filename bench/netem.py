@@ -1,7 +1,7 @@
 """Timing error of netem: 20 000 packets/s through a real netem process on 127.0.0.1.
 
-A sender numbers and timestamps its packets; the kernel timestamps them at the receiver. The delay
-that netem drew for each is in netem's record. So the error of the added delay is
+A sender numbers and timestamps its packets; the kernel timestamps them at the receiver. netem's
+record contains the delay drawn for each packet. So the error of the added delay is
 
     (received - sent) - drawn
 
@@ -50,20 +50,14 @@ SPAWN = multiprocessing.get_context("spawn")
 
 @dataclass(frozen=True)
 class NetemBenchmarkOptions:
-    """Options of this benchmark."""
-
     runs: int = 5
-    """Number of runs."""
     seconds: int = 5
-    """Duration of each run [s]."""
     rate: int = 20_000
-    """Number of packets per second."""
     size: int = 600
-    """UDP payload of each [B]."""
+    """UDP payload of each packet [B]."""
 
     @property
     def packets(self) -> int:
-        """Number of packets in a run."""
         return self.rate * self.seconds
 
 
@@ -72,25 +66,21 @@ FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1)
 
 @dataclass(frozen=True)
 class NetemRun:
-    """Figures of one run."""
-
     sent: int
     received: int
     dropped_before: int
     """Number of packets dropped before netem read them, because its receive buffer was full."""
     dropped_within: int
-    """Number of packets dropped by netem, because its queue was full or the kernel refused to
-    send."""
+    """Number of packets dropped by netem: its queue was full, or the kernel refused to send."""
     dropped_after: int
     """Number of packets dropped after netem, because the receiver's buffer was full."""
     measured: int
-    """Number of packets whose drawn delay is known: those before the first that netem never
-    read."""
+    """Number of packets with a known drawn delay: those before the first that netem never read."""
     error_ms_p50: float
     error_ms_p99: float
     error_ms_max: float
     netem_ms_p99: float
-    """Error that netem itself reports [ms]: from the due time until handed to the driver."""
+    """Error reported by netem itself [ms]: from the due time until handed to the driver."""
     netem_cpu: float
     """Share of a core that netem used."""
     netem_waited: float
@@ -113,7 +103,7 @@ def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
 
 
 def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
-    """Number, timestamp and send packets by absolute deadlines; returns how many."""
+    """Number, timestamp and send packets by absolute deadlines; returns their number."""
     sock = open_blocking()
     sock.connect((HOST, port))
     packet, number = bytearray(options.size), 0
@@ -160,14 +150,13 @@ def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
 
 
 def open_blocking() -> socket.socket:
-    """Blocking socket on a free port, with large buffers."""
     sock = open_socket((HOST, 0))
     sock.setblocking(True)
     return sock
 
 
 def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
-    """One run with netem, sender, receiver and sleeper as processes, all ended with it."""
+    """Run once, with netem, sender, receiver and sleeper as processes that end with the run."""
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
@@ -190,14 +179,14 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
     counted = netem.all(Counted)[-1].event
     assert isinstance(counted, Counted)
     downlink = counted.figures["downlink"]
-    taken = downlink["packets"]
-    # A packet that netem never read has no row there, and shifts the numbers after it.
-    known = sent if taken == sent else first_missing(numbers)
-    error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < known]
+    read_packets = downlink["packets"]
+    # A packet that netem never read has no row in the record, and shifts the numbers after it.
+    counted_until = sent if read_packets == sent else first_missing(numbers)
+    error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < counted_until]
     return NetemRun(
         sent=sent,
         received=len(numbers),
-        dropped_before=sent - taken,
+        dropped_before=sent - read_packets,
         dropped_within=downlink["overflowed"] + counted.figures["send_errors"],
         dropped_after=dropped_after,
         measured=len(error_ns),
@@ -225,13 +214,12 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
 
 
 def start_netem(stack: ExitStack, server_port: int, seed: int, record: Path) -> ChildProcess:
-    """Run netem with the paper's delays and without loss."""
     at = f"--bind={HOST}:0", f"--server={HOST}:{server_port}", f"--record={record}"
     return ChildProcess(stack, "netem", "paper", f"--seed={seed}", *at, "--network.downlink.loss=0")
 
 
 def answer(pipe: Connection) -> Any:
-    """Result of a task's process, waited for."""
+    """Result of a task's process; waits for it."""
     if not pipe.poll(PATIENCE_S):
         raise TimeoutError("a process of the benchmark does not answer")
     return pipe.recv()
@@ -251,14 +239,13 @@ def drawn_delays_ns(record: Path, count: int) -> NDArray[np.int64]:
 
 
 def first_missing(numbers: NDArray[np.int64]) -> int:
-    """Lowest number that is missing."""
     present = np.zeros(numbers.max(initial=-1) + 2, bool)
     present[numbers] = True
     return int(present.argmin())
 
 
 def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
-    """Figures of all runs, and the median of each over them."""
+    """Figures of all runs, and the median of each over the runs."""
     seeds = range(1, options.runs + 1)
     runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
     return {
@@ -274,7 +261,6 @@ def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table with a row for every run."""
     headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
     headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99"]
     rows = [
@@ -297,10 +283,8 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 
 
 def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
-    """Runs in the figures of `measure`."""
     return [NetemRun(**run) for run in result["runs"]]
 
 
 def lost(run: NetemRun) -> int:
-    """Number of packets that never arrived; netem was configured to lose none."""
     return run.sent - run.received

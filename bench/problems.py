@@ -48,7 +48,7 @@ def gradients(
         previous: previous horizon, shifted to the present [m/s]; shape (n, axes, H).
         disturbance: disturbance that is added to every input [m/s]; shape (n, axes).
     """
-    mpc, which, found = problem.mpc, problem.which, np.empty(previous.shape)
+    mpc, which, result = problem.mpc, problem.which, np.empty(previous.shape)
     simd = simd_batch(simd_memory(previous.shape[2], 1))
     for at in np.ndindex(*previous.shape[:2]):
         (simd.p[0], simd.v[0]), simd.w[0], axis = x[at], disturbance[at], at[1]
@@ -56,8 +56,8 @@ def gradients(
         set_previous(previous[at], 0, which == FIRST, simd, 0)
         lead(mpc, axis, simd)
         gradient(mpc, axis, which, simd, simd.target_v)
-        found[at] = simd.gradient[:, 0]
-    return found
+        result[at] = simd.gradient[:, 0]
+    return result
 
 
 def saturated(inputs: Array, problem: Problem) -> float:
@@ -70,7 +70,6 @@ class RecordedProblems:
     """QPs of one vehicle's flight; two per tick, the generator's and the tracker's."""
 
     problem: Problem
-    """Common matrices of the QPs."""
     gradient: Array
     """Gradients of the QPs; shape (2, ticks, axes, H)."""
     guess: Array
@@ -78,11 +77,9 @@ class RecordedProblems:
 
     @property
     def ticks(self) -> int:
-        """Number of ticks."""
         return self.gradient.shape[1]
 
     def active(self) -> float:
-        """Share of the axis problems that have an input at its bound."""
         flat = self.gradient.reshape(-1, *self.gradient.shape[2:])
         inputs, _ = ExactSolver(self.problem).solve(flat, np.zeros_like(flat))
         return saturated(inputs, self.problem)
@@ -97,14 +94,12 @@ class ProblemRecorder:
         self._asked: list[tuple[Array, Array]] = []
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """Record the problems and solve them (see `Solver`)."""
         self._asked.append((gradient, guess))
         return self._solver.solve(gradient, guess)
 
     def recorded(self, turns: int = 0) -> tuple[Array, Array]:
-        """Recorded gradients and guesses, the last or all; each of shape (2, problems, axes, H).
-
-        The generator's come first, then the tracker's.
+        """Recorded gradients and guesses of the last `turns` ticks, or of all; each of shape (2,
+        problems, axes, H), the generator's problems first.
         """
         asked = self._asked[-2 * turns :]
         halves = [asked[half::2] for half in (GENERATOR, TRACKER)]
@@ -115,20 +110,16 @@ class ProblemRecorder:
         return gradient, guess
 
     def forget(self) -> None:
-        """Delete the recorded problems."""
         self._asked.clear()
 
 
 class ByTurns:
-    """Two solvers in turn, one for the generator and one for the tracker, each with a warm
-    start.
-    """
+    """Two solvers in turn, for the generator and for the tracker, each with a warm start."""
 
     def __init__(self, make: Callable[[Problem], Solver], problem: Problem) -> None:
         self._next, self._other = make(problem), make(problem)
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """Solve with the solver whose turn it is (see `Solver`)."""
         solver = self._next
         self._next, self._other = self._other, solver
         return solver.solve(gradient, guess)
@@ -162,7 +153,7 @@ def listening() -> Iterator[list[ProblemRecorder]]:
 
 
 def record(scenario: Scenario, ticks: int) -> RecordedProblems:
-    """Fly a scenario in virtual time and keep the QPs of its last ticks."""
+    """Fly a scenario in virtual time and return the QPs of its last ticks."""
     with listening() as listeners:
         flight = fly(scenario)
     assert len(flight.client), flight.failure

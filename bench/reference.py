@@ -1,7 +1,7 @@
 """Reference solutions of QPs, found by other solvers and then proved to be optimal.
 
 quadprog (or, if it is not installed, bounded least squares of scipy) finds the inputs that are at a
-bound. With these fixed, a dense Cholesky factorisation gives the others, and the optimality
+bound. With these fixed, a dense Cholesky factorisation gives the other inputs, and the optimality
 conditions are checked: every free input within the box, and no multiplier of the wrong sign.
 """
 
@@ -14,15 +14,15 @@ from scipy.optimize import lsq_linear
 from skytether.shared.law.model import Array
 
 AT_BOUND = 1e-7
-"""Distance from a bound within which an input is assumed to be at it, before the proof [m/s]."""
+"""Distance from a bound within which an input is assumed to be at the bound [m/s]."""
 ROUNDS_MAX = 10
-"""Most corrections of the assumed set of inputs at a bound."""
+"""Largest number of corrections of the assumed set of inputs at a bound."""
 ROUNDING = 1e-11
 """Rounding error of a multiplier relative to the gradient, and of an input to its bound."""
 
 
 class NoReference(Exception):
-    """Error: no solution was found that is proved optimal."""
+    """No solution was found that is proved optimal."""
 
 
 class Reference:
@@ -64,13 +64,13 @@ class Reference:
         if find_spec("quadprog"):
             import quadprog
 
-            given = (self._factor, -gradient, self._rows, self._limits, 0, True)
-            return quadprog.solve_qp(*given)[0]
+            arguments = (self._factor, -gradient, self._rows, self._limits, 0, True)
+            return quadprog.solve_qp(*arguments)[0]
         aim = -np.linalg.solve(self._root.T, gradient)
         return lsq_linear(self._root, aim, (-self._bound, self._bound), "bvls", tol=1e-15).x
 
     def _polish(self, side: Array, gradient: Array) -> Array:
-        """Optimal inputs with those at a side fixed to their bound; shape (H,)."""
+        """Optimal inputs with the inputs at a side fixed to their bound; shape (H,)."""
         inputs, free = side * self._bound, side == 0.0
         if free.any():
             toward = -gradient[free] - self._hessian[np.ix_(free, ~free)] @ inputs[~free]

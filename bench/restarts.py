@@ -14,11 +14,11 @@ that step and a = `vehicle.brake_mps2`,
     true        τ ds/dt = b(t) - s,   s(0) = the true speed at that step
 
 The vehicle follows its command with the lag τ, equal on each axis, so that its speed is at most the
-lagged commanded one; there is no wind. Without the lag in the curve no vehicle could stay below it.
-The curve applies until the first horizon that was made after the process was back; then the vehicle
-flies again. A vehicle whose own process was stopped brakes when the process wakes, and its times
-are counted from there. A vehicle whose process was killed starts again at rest, and must stay at
-rest until it flies.
+lagged commanded speed; there is no wind. Without the lag in the curve every vehicle would exceed
+it. The curve applies until the first horizon that was made after the process was back; then the
+vehicle flies again. A vehicle whose own process was stopped brakes when the process wakes, and its
+times are counted from there. A vehicle whose process was killed starts again at rest, and must stay
+at rest until it flies.
 """
 
 import math
@@ -62,16 +62,13 @@ KILLED, CLOSED, STOPPED = WAYS
 
 @dataclass(frozen=True)
 class RestartsCounts:
-    """Numbers of outages of each process."""
-
     kills: int
-    """Number of kills; after every other one the port stays closed for 3 s."""
+    """Number of kills; after every second kill the port stays closed for 3 s."""
     stops: int
     """Number of stops by SIGSTOP."""
     flight_s: float
-    """Least time of flight between two of them [s]."""
+    """Least time of flight between two outages [s]."""
     subjects: tuple[Subject, ...] = SUBJECTS
-    """Processes that are killed and stopped."""
 
 
 FULL, QUICK = (
@@ -81,14 +78,11 @@ FULL, QUICK = (
 
 
 class ProcessOutage(NamedTuple):
-    """Outage of a process."""
-
     subject: Subject
     way: Way
     began_ns: int
-    """Time of the kill or stop."""
     back_ns: int
-    """Time since which the process listened again."""
+    """Time since which the process has listened again."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +92,7 @@ class ProcessLife:
     time_ns: NDArray[np.int64]
     """Time at which each row's step begins; shape (n,)."""
     commanded: Array
-    """Commanded speed from there on [m/s]; shape (n,)."""
+    """Commanded speed from that time on [m/s]; shape (n,)."""
     speed: Array
     """True speed [m/s]; shape (n,)."""
     off_m: Array
@@ -106,7 +100,6 @@ class ProcessLife:
     in_force: NDArray[np.int64]
     """Step that the horizon in force was made for, -1 for none; shape (n,)."""
     mode: NDArray[np.uint8]
-    """Mode of the vehicle, a `Mode`; shape (n,)."""
 
     @classmethod
     def of(cls, rows: Rows, epoch_ns: int, scenario: Scenario) -> "ProcessLife":
@@ -125,7 +118,7 @@ class ProcessLife:
 
 @dataclass(frozen=True)
 class RestartVerdict:
-    """Vehicle's reaction to an outage; None for what does not apply."""
+    """Vehicle's reaction to an outage; None where a figure does not apply."""
 
     subject: Subject
     way: Way
@@ -140,11 +133,10 @@ class RestartVerdict:
     flies_s: float
     """Time from the return to flying again [s]; infinite for never."""
     on_path_s: float
-    """Time from the return until it was within half a metre of the reference [s]."""
+    """Time from the return until the vehicle was within half a metre of the reference [s]."""
 
     @property
     def is_inside(self) -> bool:
-        """Whether all targets are met."""
         over = (self.over_commanded_mps, self.over_true_mps)
         braked = self.brakes_s is None or self.brakes_s <= BRAKES_S
         return (
@@ -167,7 +159,6 @@ def scenario() -> Scenario:
 
 
 def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
-    """Sequence of outages: the processes take turns."""
     kills: list[tuple[Subject, Way]] = [
         (subject, CLOSED if number % 2 else KILLED)
         for number in range(counts.kills)
@@ -180,12 +171,7 @@ def schedule(counts: RestartsCounts) -> list[tuple[Subject, Way]]:
 
 
 class Processes:
-    """Server, netem and a vehicle, each of which can be killed or stopped.
-
-    Args:
-        stack: ends the processes.
-        folder: folder for their files.
-    """
+    """Server, netem and a vehicle, each of which can be killed or stopped."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self._lab = Lab(stack, folder, scenario())
@@ -201,7 +187,6 @@ class Processes:
         self.wait_for_flight()
 
     def _start(self, subject: str) -> ChildProcess:
-        """Start a process again, at the address that it had."""
         self._lives += 1
         addresses = self._addresses
         match subject:
@@ -216,7 +201,6 @@ class Processes:
         return child
 
     def suffer(self, subject: Subject, way: Way) -> ProcessOutage:
-        """Kill or stop a process, and bring it back."""
         child = self._children[subject]
         if way == STOPPED:
             return ProcessOutage(subject, way, *child.freeze(DOWN_S))
@@ -230,13 +214,13 @@ class Processes:
         """Wait until the vehicle reports that it flies a plan, unless it does already."""
         client = self._children["client"]
         while True:
-            told = [line.event for line in client.all(ModeChanged)]
-            if told and getattr(told[-1], "after", None) == str(Mode.TRACK):
+            modes = [line.event for line in client.all(ModeChanged)]
+            if modes and getattr(modes[-1], "after", None) == str(Mode.TRACK):
                 return
-            client.wait_for(ModeChanged, len(told) + 1)
+            client.wait_for(ModeChanged, len(modes) + 1)
 
     def end(self) -> list[ProcessLife]:
-        """All runs of the vehicle that flew, in order."""
+        """End the client; returns all runs of the vehicle that flew, in order."""
         self._children["client"].stop()
         flown = scenario()
         lives = []
@@ -252,12 +236,12 @@ def judge(
     """Reaction to an outage, from the record."""
     life = _life(outage, lives)
     died = outage.subject == "client" and outage.way != STOPPED
-    # A vehicle whose process was stopped can brake only when it wakes.
+    # A vehicle whose process was stopped can brake only when the process wakes.
     zero_ns = outage.back_ns if outage.subject == "client" else outage.began_ns
     time_s = (life.time_ns - zero_ns) / SECOND_NS
-    known = life.in_force[life.time_ns < outage.back_ns].max(initial=-1)
+    newest_before = life.in_force[life.time_ns < outage.back_ns].max(initial=-1)
     after = life.time_ns >= outage.back_ns
-    resumed = _first(after & (life.mode == Mode.TRACK) & (life.in_force > known))
+    resumed = _first(after & (life.mode == Mode.TRACK) & (life.in_force > newest_before))
     on_path = _first(np.arange(len(after)) >= resumed) if resumed < len(after) else resumed
     on_path += _first(life.off_m[on_path:] < 0.5)
     braking = _first((time_s >= 0.0) & (life.mode == Mode.BRAKE)) if not died else len(after)
@@ -278,7 +262,6 @@ def judge(
 
 
 def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
-    """Run of the vehicle that continues or starts after an outage."""
     for life in lives:
         if life.time_ns[-1] > outage.back_ns:
             return life
@@ -286,7 +269,6 @@ def _life(outage: ProcessOutage, lives: Sequence[ProcessLife]) -> ProcessLife:
 
 
 def _first(which: NDArray[np.bool_]) -> int:
-    """Index of the first true value; the length if there is none."""
     return int(which.argmax()) if which.any() else len(which)
 
 
@@ -322,7 +304,6 @@ def curves(
 
 
 def measure(counts: RestartsCounts) -> dict[str, Any]:
-    """Reactions to all outages, and the speed around each."""
     lateness, rng, outages = WakeLateness(), np.random.default_rng(1), []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-"))
@@ -330,7 +311,7 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
         for subject, way in progress(schedule(counts), "restarts"):
             lateness.sleep(counts.flight_s + float(rng.random()))
             outages.append(flight.suffer(subject, way))
-            # after a short outage, the vehicle may not have missed the process yet
+            # After a short outage the vehicle may still be flying: wait until it must have braked.
             lateness.sleep(BRAKES_S)
             flight.wait_for_flight()
         lateness.sleep(counts.flight_s)
@@ -343,12 +324,10 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
 
 
 def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
-    """Verdicts as objects, from the result of `measure`."""
     return [RestartVerdict(**each) for each in result["verdicts"]]
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table with a row for each process and kind of outage."""
     headings = ["process", "times", "gone\n[s]", f"brakes [s]\n(≤ {BRAKES_S:g})", "\nworst"]
     headings += ["over curve\n[m/s]", "\ntrue", f"flies [s]\n(≤ {RETURNS_S:g})", "\nworst"]
     headings += ["within\n0.5 m [s]", "\nworst", "out-\nside"]
@@ -378,11 +357,10 @@ def _row(those: Sequence[RestartVerdict]) -> list[str]:
 
 
 def _both(values: Iterable[float | None]) -> list[str]:
-    """Median and largest of the known values."""
-    known = [each for each in values if each is not None]
-    return [f"{np.median(known):.2f}", f"{max(known):.2f}"] if known else ["–", "–"]
+    present = [each for each in values if each is not None]
+    return [f"{np.median(present):.2f}", f"{max(present):.2f}"] if present else ["–", "–"]
 
 
 def _worst(values: Iterable[float | None], spec: str) -> str:
-    known = [each for each in values if each is not None]
-    return format(max(known), spec) if known else "–"
+    present = [each for each in values if each is not None]
+    return format(max(present), spec) if present else "–"

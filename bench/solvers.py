@@ -32,8 +32,6 @@ PACES = {"hot": HOT, "paced": PACED}
 
 @dataclass(frozen=True)
 class SolversCounts:
-    """Size of the benchmark."""
-
     hot: int = 1000
     paced: int = 200
     tuning: int = 100
@@ -54,7 +52,6 @@ def flights() -> dict[str, Scenario]:
 
 
 def measure(counts: SolversCounts) -> dict[str, Any]:
-    """Figures of all contestants on both flights."""
     lateness = WakeLateness()
     result: dict[str, Any] = {
         name: _measure_flight(name, scenario, counts, lateness)
@@ -85,7 +82,8 @@ def _measure_flight(
     spent = compete("hot", *factories)
     for key in factories:
         figures[key]["hot"] = spent[key] | {"ratio": ratios(spent[key], spent[OURS])}
-    # A real server has one solver, so each runs against ours alone: more would empty the caches.
+    # A real server has one solver, so each solver runs against ours alone: more would empty the
+    # caches.
     for key in factories.keys() - {OURS}:
         pair = compete("paced", OURS, key)
         figures[key]["paced"] = pair[key] | {"ratio": ratios(pair[key], pair[OURS])}
@@ -114,7 +112,6 @@ class SolverEntry:
         self._answers: dict[int, tuple[tuple[Array, Flags], tuple[Array, Flags]]] = {}
 
     def tick(self, i: int) -> None:
-        """Solve both problems of tick i."""
         generator, tracker = self._problems[i]
         self._answers[i] = (self._generator.solve(*generator), self._tracker.solve(*tracker))
 
@@ -124,14 +121,13 @@ class SolverEntry:
         return np.array([[inputs[0] for inputs, _ in both] for both in answers]).swapaxes(0, 1)
 
     def unsolved(self) -> int:
-        """Number of problems without a solution so far."""
         return sum(not solved[0] for both in self._answers.values() for _, solved in both)
 
 
 def tune(
     recorded: RecordedProblems, count: int, lateness: WakeLateness
 ) -> tuple[Tuning, dict[str, dict[str, float]]]:
-    """Tuning of OSQP with the smallest median time, and the best of each form [µs]."""
+    """Tuning of OSQP with the smallest median time, and the best tuning of each form [µs]."""
     entries = {str(tuning): SolverEntry(tuning.make, recorded) for tuning in TUNINGS}
     runs = {name: entry.tick for name, entry in entries.items()}
     spent = interleave(runs, count, HOT, lateness, "tuning OSQP")
@@ -153,7 +149,6 @@ def _references(recorded: RecordedProblems) -> Array:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Tables of each flight, of OSQP's tunings and of the targets."""
     headings = ["[µs]"]
     for pace in PACES:
         headings += [f"{pace}\np50", "\np99", "\nratio", "\nof p99"]

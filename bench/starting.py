@@ -2,7 +2,7 @@
 
 A command that ends is measured until its end, with its peak memory; a server until it reports that
 it listens, and a client until its first packet arrives. *Warm* starts find bytecode and the machine
-code of kernels on disk; *cold* ones find neither, as after an installation. The commands take
+code of kernels on disk; *cold* starts find neither, as after an installation. The commands take
 turns. CPU time is reported besides elapsed time, because it depends less on other load.
 """
 
@@ -33,14 +33,12 @@ POLL_S = 0.01
 
 
 class Start(NamedTuple):
-    """Command to start, and its targets."""
-
     command: str
-    """Words of the command line."""
+    """Arguments of the command line."""
     warm_s: float | None = None
     """Target of a warm start [s]."""
     memory_mb: float | None = None
-    """Target of its memory [MB]."""
+    """Target of the memory [MB]."""
     cold_s: float | None = None
     """Target of a cold start [s]."""
 
@@ -58,8 +56,6 @@ STARTS = {
 
 @dataclass(frozen=True)
 class StartingCounts:
-    """Number of starts of each command."""
-
     warm: int = 9
     cold: int = 1
 
@@ -69,38 +65,38 @@ QUICK = StartingCounts(2, 0)
 
 
 class StartCost(NamedTuple):
-    """Time and memory of one start."""
-
     wall_s: float
-    """Time that passed [s]."""
+    """Elapsed time [s]."""
     cpu_s: float
-    """CPU time of all its threads [s]."""
+    """CPU time of all threads [s]."""
     memory_bytes: float
     """Resident memory [B]: at the end of the measurement, or the peak of a command that ended."""
 
 
 def measure(counts: StartingCounts) -> dict[str, Any]:
-    """Costs of each start, medians of warm and of cold ones."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    found: dict[tuple[str, str], list[StartCost]] = {}
+    """Costs of each start, as medians of the warm starts and of the cold starts."""
+    inherited = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
+    costs_of: dict[tuple[str, str], list[StartCost]] = {}
     # The first warm start fills the caches on disk, and is not measured.
     turns = [("warm", turn) for turn in range(counts.warm + 1)]
     turns += [("cold", turn + 1) for turn in range(counts.cold)]
     for (kind, turn), name in progress([*product(turns, STARTS)], "starting"):
         with tempfile.TemporaryDirectory() as folder:
             nothing = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": folder}
-            environment = kept | (nothing if kind == "cold" else {})
+            environment = inherited | (nothing if kind == "cold" else {})
             cost = started(STARTS[name].command, environment)
         if turn:
-            found.setdefault((name, kind), []).append(cost)
+            costs_of.setdefault((name, kind), []).append(cost)
     costs: dict[str, dict[str, Any]] = {name: {} for name in STARTS}
-    for (name, kind), each in found.items():
-        costs[name][kind] = StartCost(*map(median, zip(*each, strict=True)))._asdict()
+    for (name, kind), kind_costs in costs_of.items():
+        costs[name][kind] = StartCost(*map(median, zip(*kind_costs, strict=True)))._asdict()
     return {"starts": costs}
 
 
 def started(command: str, environment: Mapping[str, str]) -> StartCost:
-    """Cost of one start.
+    """Start a command, and measure its cost.
 
     Raises:
         TimeoutError: the process is not ready in time.
@@ -144,9 +140,9 @@ def started(command: str, environment: Mapping[str, str]) -> StartCost:
         wall_s = (time.monotonic_ns() - began_ns) / SECOND_NS
         if ends:
             return StartCost(wall_s, used.ru_utime + used.ru_stime, memory_bytes)
-        there = Path(f"/proc/{process.pid}")
-        spent_ns = sum(int(each.read_text().split()[0]) for each in there.glob("task/*/schedstat"))
-        pages = int((there / "statm").read_text().split()[1])
+        proc = Path(f"/proc/{process.pid}")
+        spent_ns = sum(int(each.read_text().split()[0]) for each in proc.glob("task/*/schedstat"))
+        pages = int((proc / "statm").read_text().split()[1])
         return StartCost(wall_s, spent_ns / SECOND_NS, pages * os.sysconf("SC_PAGE_SIZE"))
 
 
@@ -160,14 +156,13 @@ def _peak_bytes(process: subprocess.Popen[bytes]) -> float:
     output, status, most_kb = process.stdout.fileno(), Path(f"/proc/{process.pid}/status"), 0
     while True:
         ready, _, _ = select.select([output], [], [], POLL_S)
-        told = dict(line.split(":", 1) for line in status.read_text().splitlines())
-        most_kb = max(most_kb, int(told.get("VmHWM", "0 kB").split()[0]))
+        fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        most_kb = max(most_kb, int(fields.get("VmHWM", "0 kB").split()[0]))
         if ready and not os.read(output, 1 << 16):
             return 1024.0 * most_kb
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table of the starts, with the targets in brackets."""
     rows = []
     for name, costs in result["starts"].items():
         start, warm, cold = STARTS[name], costs["warm"], costs.get("cold")

@@ -40,18 +40,16 @@ PERIOD_MS = 20.0
 TARGETS_TICK = {"hot": {"p50": 12.0, "p99": 5.0}, "paced": {"p50": 6.0, "p99": 5.0}}
 """Targets of one vehicle's tick: tuned OSQP's time over ours, by pace and quantile."""
 TARGET_FLEET, TARGET_P99_MS = 150.0, 10.0
-"""Targets of many vehicles: OSQP's time over that of a batch, and the p99 of STAGES [ms]."""
+"""Targets for fleets: OSQP's time over that of a batch, and the p99 of STAGES [ms]."""
 FIGURE = Path(__file__).parents[1] / "docs" / "scaling.png"
 SETTLE = 50
-"""Number of ticks before any counts: vehicles start on the reference, where they do not stay."""
+"""Number of ticks before the measurement, in which vehicles leave the reference."""
 STAGES = ("estimate", "plan", "trigger")
-"""Laps of the stopwatch that the target is about."""
+"""Laps of the stopwatch to which TARGET_P99_MS applies."""
 
 
 @dataclass(frozen=True)
 class TickCounts:
-    """Amount to measure."""
-
     hot: int = 1000
     paced: int = 300
     tuning: int = 60
@@ -59,7 +57,7 @@ class TickCounts:
     """Number of vehicles planned for at once."""
     fleet_ticks: int = 100
     fleet_sample: int = 20
-    """Number of these that OSQP plans for."""
+    """Number of vehicles of the fleet that OSQP plans for."""
     crowd: int = 2500
     crowd_ticks: int = 400
     scale: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -84,7 +82,6 @@ def mixes() -> dict[str, Scenario]:
 
 
 def measure(counts: TickCounts) -> dict[str, Any]:
-    """All figures of this section."""
     lateness = WakeLateness()
     tunings = tune(counts, lateness)
     single = {
@@ -105,7 +102,6 @@ def measure(counts: TickCounts) -> dict[str, Any]:
 
 
 def tune(counts: TickCounts, lateness: WakeLateness) -> dict[str, Tuning]:
-    """The fastest tuning of OSQP for each flight of `solvers.flights`."""
     return {
         name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
         for name, scenario in solvers.flights().items()
@@ -123,9 +119,7 @@ def fleets(counts: TickCounts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 def _single(
     name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: WakeLateness
 ) -> dict[str, Any]:
-    """CPU time from a decoded observation to a packed horizon of one vehicle; two servers in
-    turn.
-    """
+    """CPU time from a decoded observation to a packed horizon of one vehicle, on two servers."""
     ours = Airspace(scenario, 1)
     with solving(lambda problem: ByTurns(tuned.make, problem)):
         theirs = Airspace(scenario, 1)
@@ -157,7 +151,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
     """
     fleet = PlannedFleet(scenario, counts.fleet)
     with listening() as listeners:
-        heard = PlannedFleet(scenario, counts.fleet)
+        second = PlannedFleet(scenario, counts.fleet)
     _, later = listeners
     exact, sample = (
         ExactSolver(later.problem),
@@ -171,9 +165,9 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
             start_ns = time.process_time_ns()
             fleet.plan()
             planned_ns = time.process_time_ns() - start_ns
-            heard.plan()
+            second.plan()
             fleet.fly()
-            heard.fly()
+            second.fly()
             if tick >= SETTLE:
                 gradient, guess = later.recorded()
                 start_ns = time.process_time_ns()
@@ -181,8 +175,10 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
                 solve_ns.append(time.process_time_ns() - start_ns)
                 single_ns = []
                 for row, pair in zip(sample, others, strict=True):
-                    one = slice(row, row + 1)
-                    problems = [(gradient[half, one], guess[half, one]) for half in range(2)]
+                    vehicle = slice(row, row + 1)
+                    problems = [
+                        (gradient[half, vehicle], guess[half, vehicle]) for half in range(2)
+                    ]
                     start_ns = time.process_time_ns()
                     for solver, problem in zip(pair, problems, strict=True):
                         solver.solve(*problem)
@@ -240,7 +236,6 @@ def _crowd(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> di
 
 
 def waker(space: Airspace) -> Callable[[int], None]:
-    """Contestant for which each problem is a tick of these vehicles."""
     return lambda _: space.wake()
 
 
@@ -259,7 +254,6 @@ def _scaling(scenario: Scenario, counts: TickCounts, lateness: WakeLateness) -> 
 
 
 def _bytes_per_vehicle(scenario: Scenario) -> float:
-    """Memory that each further vehicle in session takes up in a server [B]."""
     few, many = (_server_bytes(scenario, count) for count in (100, 300))
     return (many - few) / 200
 
@@ -303,7 +297,6 @@ def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Tables of one vehicle, the fleets, the crowd, the scaling and the memory."""
     shown = {
         "tick-single": _single_table(result["single"]),
         "tick-fleet": fleet_table(result["fleets"]),
@@ -331,7 +324,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
 
 
 def fleet_table(fleets: Mapping[str, Any]) -> TextTable:
-    """Table of planning in one batch against OSQP one by one, with the target."""
     rows = []
     for name, figures in fleets.items():
         row = [f"{name} ({figures['active']:.0%})"]

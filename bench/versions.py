@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 WORKERS = tuple(
     f"{folder}/versions_worker.py" for folder in ("bench", "skytether/lab/benchmarks", "benchmarks")
 )
-"""Paths of a checkout's worker: of today, and of older commits, newest first."""
+"""Paths of a checkout's worker: the present path, and those of older commits, newest first."""
 RUN = """
 import importlib, runpy, sys
 worker, harness, pause_s = sys.argv[1:]
@@ -66,8 +66,6 @@ class Contest:
 
 @dataclass(frozen=True)
 class VersionsCounts:
-    """Amount to measure."""
-
     hot: int = 150
     """Number of turns of 50 hot ticks of one vehicle."""
     paced: int = 40
@@ -83,9 +81,8 @@ class VersionsCounts:
     flights: int = 20
     """Number of flights in virtual time, or of batches of them, of each scenario."""
     seconds: float = 3.0
-    """Duration of these flights [s]."""
+    """Duration of each flight [s]."""
     osqp: tick.TickCounts = tick.FULL
-    """Counts of the comparison with OSQP."""
 
 
 FULL = VersionsCounts()
@@ -94,8 +91,6 @@ QUICK = VersionsCounts(20, 6, (200, 1000), 4, 2500, 3, 2, 2.0, tick.QUICK)
 
 @dataclass(frozen=True)
 class VersionsBenchmarkOptions:
-    """Options of a comparison."""
-
     other: Annotated[str, tyro.conf.Positional]
     """Commit to compare with, or the folder of another checkout."""
     quick: bool = False
@@ -105,7 +100,6 @@ class VersionsBenchmarkOptions:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Compare as the command line says, and return the exit code."""
     options = tyro.cli(VersionsBenchmarkOptions, args=argv, description=__doc__)
     try:
         result = measure(options.other, QUICK if options.quick else FULL)
@@ -120,29 +114,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def contests(counts: VersionsCounts) -> list[Contest]:
-    """Contests of a comparison, in the order of the table."""
-    found = []
+    rows = []
     for name in ("smooth", "saturated"):
         title = f"one vehicle's tick, {name}"
         hot: tuple[Any, ...] = ("ticks", name, 1, HOT.turn, False)
         paced: tuple[Any, ...] = ("ticks", name, 1, 10, True)
-        found += [
+        rows += [
             Contest(f"{title}, hot [µs]", hot, counts.hot, 1e3, target_ratio="≤ 0.5"),
             Contest(f"{title}, paced [µs]", paced, counts.paced, 1e3, target_ratio="≤ 0.5"),
         ]
     for vehicles in counts.fleets:
         title = f"tick of {vehicles} vehicles, per vehicle [µs]"
         turn: tuple[Any, ...] = ("ticks", "half", vehicles, 11, False)
-        found.append(Contest(title, turn, counts.fleet, 1e3, target_ratio="≤ 0.7"))
+        rows.append(Contest(title, turn, counts.fleet, 1e3, target_ratio="≤ 0.7"))
     title = f"{counts.crowd} vehicles, estimate + trigger + plan + solve [ms]"
     turn = ("planning", "half", counts.crowd, 10)
     target_p99 = f"< {tick.TARGET_P99_MS:g}"
-    found.append(Contest(title, turn, counts.planning, 1e6, target_p99=target_p99))
+    rows.append(Contest(title, turn, counts.planning, 1e6, target_p99=target_p99))
     for name, vehicles, seeds in (("fleet", 20, 1), ("paper", 1, 25), ("demo", 1, 25)):
         title = f"{name}, vehicle-steps per core-second"
         turn = ("flight", name, counts.seconds, vehicles, seeds)
-        found.append(Contest(title, turn, counts.flights, target_ratio="≥ 1.2"))
-    return found
+        rows.append(Contest(title, turn, counts.flights, target_ratio="≥ 1.2"))
+    return rows
 
 
 @contextmanager
@@ -208,7 +201,6 @@ def _start(folder: Path) -> subprocess.Popen[str]:
 
 
 def _ask(worker: subprocess.Popen[str], *turn: Any) -> Any:
-    """Let a worker do one turn, and wait for its answer."""
     assert worker.stdin is not None
     assert worker.stdout is not None
     worker.stdin.write(json.dumps(turn) + "\n")
@@ -246,7 +238,6 @@ def _compete(
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Tables of both checkouts side by side, and of planning against OSQP."""
     commits = " against ".join(f"{result[side]['commit']} ({side})" for side in SIDES[::-1])
     headings = ["", "before p50", "p99", "after p50", "p99", "after / before p50", "p99"]
     rows = [_row(title, figures) for title, figures in result["contests"].items()]

@@ -28,7 +28,6 @@ PLANNING = {"estimate", "trigger", "plan", "solve"}
 
 
 def where() -> dict[str, Any]:
-    """Folder that this process imports from, and the result of `harness.machine`."""
     return {"folder": str(Path(tick.__file__).parents[1]), **machine()}
 
 
@@ -79,7 +78,7 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
 
 @cache
 def _space(name: str, vehicles: int, *, timed: bool) -> Airspace:
-    """Vehicles after enough ticks to have left the reference, where they start."""
+    """Vehicles after SETTLE ticks, so that they have left the reference where they start."""
     stopwatch = Stopwatch(time.process_time_ns) if timed else None
     space = Airspace(_scenarios()[name], vehicles, stopwatch)
     for _ in range(tick.SETTLE):
@@ -101,7 +100,6 @@ def _pause(pause_s: float) -> None:
 TURNS: dict[str, Callable[..., Any]] = {
     turn.__name__: turn for turn in (where, ticks, planning, flight)
 }
-"""Functions of the turns, by name."""
 
 
 def main() -> None:

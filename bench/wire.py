@@ -28,8 +28,6 @@ NOTHING = "nothing"
 
 @dataclass(frozen=True)
 class WireCounts:
-    """Size of the benchmark."""
-
     each: int = 20_000
 
 
@@ -43,18 +41,17 @@ def messages(terms: Terms) -> list[Message]:
     inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
     state = rng.normal(0.0, 1.0, (terms.axes, 2))
     session, step = 2**31, 5000
-    told = step - 20, step - 10, stamp_us(now_ns), 100, Mode.TRACK, 1, state, np.zeros(terms.axes)
+    report = step - 20, step - 10, stamp_us(now_ns), 100, Mode.TRACK, 1, state, np.zeros(terms.axes)
     return [
         Hello(1, 2**60, terms),
         Welcome(1, session, 2**60, 2**60, now_ns, 0, terms),
-        Observation(1, session, step, *told),
+        Observation(1, session, step, *report),
         Horizon(1, session, step, stamp_us(now_ns), 9, inputs),
         Heartbeat(1, session, stamp_us(now_ns), Idle.PLANS, 0),
     ]
 
 
 def measure(counts: WireCounts) -> dict[str, Any]:
-    """Figures of all types, both ways."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
     lateness = WakeLateness()
     result: dict[str, dict[str, Any]] = {}
@@ -73,7 +70,6 @@ def measure(counts: WireCounts) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    """Table with a row for each message."""
     rows = []
     for name, figures in result["messages"].items():
         row = [name, str(figures["bytes"])]

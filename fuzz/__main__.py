@@ -22,14 +22,12 @@ except ImportError:
 LOOK_EVERY = 100
 """Number of inputs between two checks of the time."""
 GUIDED_SHARE = 0.5
-"""Share of inputs that are mutated by the target, which knows the format; atheris mutates the
-rest."""
+"""Share of inputs mutated by the target, which knows the format; atheris mutates the rest."""
 SHM = Path("/dev/shm")
 """Folder in memory for files that are rewritten often."""
 
 
 def memory_mb() -> float:
-    """Peak memory of this process [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -37,10 +35,7 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
     """Feed random inputs to a target; returns the result, as a sentence.
 
     Args:
-        name: name of the target.
-        folder: folder for its files.
-        seed: seed of the inputs.
-        count: most inputs.
+        count: largest number of inputs.
         seconds: longest time [s].
     """
     target, rng = TARGETS[name](folder), Random(seed)
@@ -60,7 +55,6 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
 
 
 def rate(name: str, done: int, took_s: float) -> str:
-    """Number of inputs of a target and their rate, in words."""
     return f"{name}: {done} inputs in {took_s:.0f} s, {done / took_s:.0f} per s"
 
 
@@ -69,7 +63,7 @@ def guided(name: str, folder: Path, seconds: float) -> str:
     sentence.
 
     Raises:
-        SystemExit: with 1, if it has found a fault.
+        SystemExit: with 1, if a fault was found.
     """
     done = multiprocessing.RawValue(c_longlong, 0)
     child = multiprocessing.get_context("fork").Process(
@@ -78,15 +72,14 @@ def guided(name: str, folder: Path, seconds: float) -> str:
     begin_s = time.monotonic()
     child.start()
     child.join()
-    said = rate(name, int(done.value), time.monotonic() - begin_s)
+    result = rate(name, int(done.value), time.monotonic() - begin_s)
     if child.exitcode:
-        print(f"{said}, guided, until a fault was found", file=sys.stderr)
+        print(f"{result}, guided, until a fault was found", file=sys.stderr)
         raise SystemExit(1)
-    return f"{said}, guided, no fault"
+    return f"{result}, guided, no fault"
 
 
 def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
-    """Let atheris search; ends the process."""
     target = TARGETS[name](folder)
     for function in (each for space in target.code for each in functions(space)):
         atheris.instrument_func(function)
@@ -119,23 +112,23 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="number of random inputs of each target")
     parser.add_argument("--jobs", type=int, default=1, help="processes, for --count")
     parser.add_argument("--seed", type=int, default=1, help="seed of the first process")
-    given = parser.parse_args()
-    names = [given.target] if given.target else list(TARGETS)
-    each_s = (given.seconds or (30.0 if given.count is None else float("inf"))) / len(names)
-    each = sys.maxsize if given.count is None else -(-given.count // given.jobs)
+    options = parser.parse_args()
+    names = [options.target] if options.target else list(TARGETS)
+    each_s = (options.seconds or (30.0 if options.count is None else float("inf"))) / len(names)
+    each = sys.maxsize if options.count is None else -(-options.count // options.jobs)
     with tempfile.TemporaryDirectory(dir=SHM if os.access(SHM, os.W_OK) else None) as folder:
         for name in names:
-            if given.count is None and atheris:
+            if options.count is None and atheris:
                 print(guided(name, Path(folder), each_s), flush=True)
                 continue
             jobs = []
-            for seed in range(given.seed, given.seed + given.jobs):
+            for seed in range(options.seed, options.seed + options.jobs):
                 own = Path(folder) / f"{name} {seed}"
                 own.mkdir()
                 jobs.append((name, own, seed, each, each_s))
-            with multiprocessing.get_context("fork").Pool(given.jobs) as pool:
-                for said in pool.starmap(attack, jobs):
-                    print(said, flush=True)
+            with multiprocessing.get_context("fork").Pool(options.jobs) as pool:
+                for result in pool.starmap(attack, jobs):
+                    print(result, flush=True)
 
 
 if __name__ == "__main__":

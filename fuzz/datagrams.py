@@ -1,6 +1,4 @@
-"""Targets for datagrams: the decoder, and a server and a client in flight, with and without
-keys.
-"""
+"""Targets for datagrams: the decoder, and server and client in flight, with and without keys."""
 
 from collections.abc import Hashable, Sequence
 from math import isfinite
@@ -46,28 +44,22 @@ KNOWN = (*corpus().values(), *(seed for each in SCENARIOS for seed in seeds(each
 """Odd payloads, and one message of each type."""
 
 STEP_NS = MILLISECOND_NS
-"""Time that passes in a flight between two payloads [ns]."""
+"""Time in a flight between two payloads [ns]."""
 LIFE = 10_000
 """Number of payloads after which a flight starts again."""
 
 
 class Datagrams(Target):
-    """Target that takes datagrams, or the content of encrypted ones."""
-
     def seeds(self) -> Sequence[bytes]:
-        """Messages of each type, and odd payloads."""
         return KNOWN
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Payload with a changed field, or with changed bytes."""
         change = fields_changed if rng.random() < 0.5 else bytes_changed
         return change(rng, payload)
 
 
 class Decoder(Datagrams):
-    """Decoder with the terms of a scenario: it rejects a payload, or returns a message that
-    re-encodes.
-    """
+    """Decoder of a scenario's messages: it rejects a payload, or its message encodes again."""
 
     code = (protocol,)
 
@@ -75,7 +67,6 @@ class Decoder(Datagrams):
         self._terms = scenario.terms()
 
     def __call__(self, payload: bytes) -> None:
-        """Decode a payload."""
         try:
             message = decode(payload, self._terms)
         except ProtocolError:
@@ -88,9 +79,8 @@ class EndpointInFlight(Datagrams):
     """Server and client in flight, which each receive a payload besides their own messages.
 
     Args:
-        scenario: scenario to fly.
         sealed: whether they have keys; then each payload is encrypted by the other end, as by a
-            faulty peer, and so passes all checks against strangers.
+            faulty peer, and so passes all checks against senders without a key.
     """
 
     code: Sequence[ModuleType] = (
@@ -105,7 +95,7 @@ class EndpointInFlight(Datagrams):
     def __init__(self, scenario: Scenario, *, sealed: bool = False) -> None:
         self._scenario = scenario
         self._keyring = make_keys(1, 2) if sealed else None
-        # Continues from flight to flight, so that no flight has the keys of an earlier one.
+        # Continues from flight to flight, so that no flight has the keys of an earlier flight.
         self._entropy = stream(1, "entropy").bytes
         self._begin()
 
@@ -113,9 +103,8 @@ class EndpointInFlight(Datagrams):
         scenario = self._scenario
         self._now_ns = SECOND_NS
         self.heard = 0
-        """Number of payloads received since the flight began."""
+        """Number of payloads in the present flight."""
         self.newest: dict[Hashable, bytes] = {}
-        """Newest datagram of each kind that the two ends have sent."""
         self._vehicle = simulated(scenario, 1)
         entropy, keyring = self._entropy, self._keyring
         link = client_secure.SecureLink(keyring.of(1), entropy=entropy) if keyring else None
@@ -128,7 +117,6 @@ class EndpointInFlight(Datagrams):
             self._pass()
 
     def _pass(self) -> None:
-        """Advance time by a step; datagrams arrive at once."""
         self._now_ns += STEP_NS
         ends = ((self.client, self.server, "client"), (self.server, self.client, "server"))
         for sender, receiver, name in ends:
@@ -137,12 +125,11 @@ class EndpointInFlight(Datagrams):
                 sender.wake(now_ns=self._now_ns)
             for datagram in sender.outbox():
                 self._note(name, datagram.payload)
-                told = Datagram(datagram.payload, (name, 0))
-                receiver.receive(told, now_ns=self._now_ns)
+                arriving = Datagram(datagram.payload, (name, 0))
+                receiver.receive(arriving, now_ns=self._now_ns)
             assert len(sender.events()) <= EVENTS_MAX + 20
 
     def __call__(self, payload: bytes) -> None:
-        """Let both ends receive a payload."""
         if self.heard == LIFE or self.client.finished:
             self._begin()
         self.heard += 1
@@ -150,9 +137,7 @@ class EndpointInFlight(Datagrams):
         self._pass()
 
     def seeds(self) -> Sequence[bytes]:
-        """Messages of each type, odd payloads, and, twice as often, the newest that both ends have
-        sent.
-        """
+        """Messages of each type, odd payloads, and, twice as often, both ends' newest datagrams."""
         newest = list(self.newest.values())
         return (*KNOWN, *newest * (2 * len(KNOWN) // max(1, len(newest))))
 
@@ -165,9 +150,7 @@ class EndpointInFlight(Datagrams):
             self.newest[kind_of(payload)] = payload
 
     def _seal(self, end: Endpoint, payload: bytes) -> bytes:
-        """Datagram that carries a payload to an end, encrypted by the other one if they have
-        keys.
-        """
+        """Datagram that carries a payload to an end; with keys, encrypted by the other end."""
         session = next(iter(self.server.sessions), None)
         if self._keyring is None or session is None:
             return payload

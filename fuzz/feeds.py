@@ -22,17 +22,13 @@ PIECES = 3
 EACH = 12
 """Number of frames of each process and kind among the seeds."""
 LIFE = 300
-"""Number of feeds after which a page starts again."""
+"""Number of feeds after which the page starts again."""
 ABOUT = About(scenario="demo", seed=1, version="1", began="", offset_ns=0, secure=False)
-"""Facts about the recording that the target writes."""
 POINTS = 50
-"""Number of points of a drawn curve."""
 
 
 class FeedTarget(Text):
-    """Target for a process's feed, in pieces: it raises `FeedError`, or decodes to frames that
-    re-encode.
-    """
+    """Target for a process's feed in pieces: it raises `FeedError`, or its frames encode again."""
 
     code: Sequence[ModuleType] = (feed,)
 
@@ -58,7 +54,6 @@ class FeedTarget(Text):
         return changed
 
     def __call__(self, payload: bytes) -> None:
-        """Decode the feed, at once and in pieces."""
         whole, size = read(payload), len(payload) // PIECES + 1
         pieces = [payload[size * i : size * (i + 1)] for i in range(PIECES)]
         # Compared as texts, because figures may be NaN, which is not equal to itself.
@@ -71,7 +66,7 @@ class FeedTarget(Text):
 
 
 class PageTarget(FeedTarget):
-    """Target for page and recording: frames of a feed are refused, or shown and written."""
+    """Target for page and recording: frames of a feed are refused, or shown and recorded."""
 
     code = (recording, rows, state)
 
@@ -80,7 +75,7 @@ class PageTarget(FeedTarget):
         self._heard = LIFE
 
     def __call__(self, payload: bytes) -> None:
-        """Take a feed's frames, as from any process; show the state, and record it."""
+        """Process a feed's frames, as if from each process; show the state, and record it."""
         if self._heard == LIFE:
             self._begin()
         self._heard += 1

@@ -1,8 +1,8 @@
 """Targets for the handshake: strangers without a key, and a faulty peer with one.
 
-No sender without a key is accepted, whatever it sends to a server, to a client that waits for its
-first session, or to one that flies. A holder of a vehicle's key is accepted only as this vehicle.
-The state kept for either is bounded, and no answer is longer than its request.
+No sender without a key is accepted by a server, by a client that waits for its first session, or by
+a client in flight. A holder of a vehicle's key is accepted only as this vehicle. The state kept for
+either is bounded, and no answer is longer than its request.
 """
 
 from collections.abc import Sequence
@@ -29,22 +29,20 @@ SERVER: Address = ("server", 0)
 CLIENT: Address = ("client", 0)
 STRANGER: Address = ("stranger", 6)
 NEWCOMER = 2
-"""Vehicle that has a key, and no session yet."""
+"""Number of a vehicle that has a key, and no session yet."""
 NEWCOMER_BOOT_ID = 2**51
 FIRST_BYTES = noise_nnpsk0.MESSAGE_BYTES + handshake.HELLO_BYTES_MAX + 1
 """Size of the first message of a handshake, with a HELLO and its padding [B]."""
 CHANNEL = 9
 """Number of the channels that a key's holder opens."""
 HOLDER_STEP_NS = 250 * MILLISECOND_NS
-"""Time between two packets of a key's holder [ns], so long that the rate limit never applies."""
+"""Time between two packets of a key's holder [ns]; so long that the rate limit never applies."""
 HOLDER_LIFE = 500
-"""Number of payloads after which a key's holder meets new ends."""
+"""Number of payloads after which server and client of a key's holder are replaced by new ones."""
 
 
 class Strangers(EndpointInFlight):
-    """Target for raw datagrams to both ends of an encrypted flight, and to a vehicle that no server
-    answers.
-    """
+    """Target for raw datagrams to both ends of an encrypted flight, and to a client alone."""
 
     code = CODE
 
@@ -66,11 +64,9 @@ class Strangers(EndpointInFlight):
         assert self._session is not None
 
     def seeds(self) -> Sequence[bytes]:
-        """Packets of each type that the three ends have sent."""
         return list(self.newest.values())
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Packet with another header or other bytes, or sometimes unchanged."""
         draw, head = rng.random(), channel.HEADER.size
         if draw < 0.1:
             return payload
@@ -101,8 +97,8 @@ class Strangers(EndpointInFlight):
         assert self.newcomer._session.number is None, payload.hex()
 
     def _unheard(self, end: Server | Client, payload: bytes, peer: Address) -> None:
-        """Let an end receive a datagram that its peer has not sealed: it is dropped, or answered by
-        a cookie.
+        """Send an end a datagram that no peer has sealed: it must be dropped, or answered by a
+        cookie.
         """
         dropped = end.dropped.total()
         end.receive(Datagram(payload, peer), now_ns=self._now_ns)
@@ -116,7 +112,7 @@ class Holder(Datagrams):
 
     The first byte of a payload chooses the packet: an INITIATION, a CHALLENGE, or a RESPONSE. The
     rest of the payload is the handshake message of the INITIATION or RESPONSE, or is carried in a
-    valid one.
+    valid handshake message.
     """
 
     code = (*CODE, protocol)
@@ -152,12 +148,10 @@ class Holder(Datagrams):
         return (b"\0" + hello, b"\1" + hello, b"\2" + bytes(16), b"\3" + welcome, b"\4" + welcome)
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Payload of the same kind, or another kind, with changed content."""
         kind = payload[:1] if rng.random() < 0.9 else rng.randbytes(1)
         return kind + super().mutated(rng, payload[1:])
 
     def __call__(self, payload: bytes) -> None:
-        """Send the packet to the end that it is meant for."""
         if self._heard == HOLDER_LIFE or self.client.finished:
             self._begin()
         self._heard += 1
@@ -180,14 +174,14 @@ class Holder(Datagrams):
         assert len(end.events()) <= EVENTS_MAX + 20
         assert {each.vehicle for each in self.server.sessions} <= {NEWCOMER}, packet.hex()
         assert {*self.server.sessions.welcomed_vehicles} <= {NEWCOMER}, packet.hex()
-        known = self._gate._vehicles
-        assert {*known} <= {NEWCOMER}
-        assert all(len(each.pending) <= server_secure.PENDING_MAX for each in known.values())
+        vehicles = self._gate._vehicles
+        assert {*vehicles} <= {NEWCOMER}
+        assert all(len(each.pending) <= server_secure.PENDING_MAX for each in vehicles.values())
         attempt = self._link._attempt
         assert attempt is None or len(attempt.tried_ns) <= client_secure.COOKIES_MAX
 
     def _initiation(self, rest: bytes, *, carried: bool) -> bytes:
-        """INITIATION with a valid cookie, whose message is the given content, or carries it."""
+        """INITIATION with a valid cookie; `rest` is its message, or is carried in a valid one."""
         key = self._key
         cookie = self._gate._cookie(CLIENT, self._now_ns // server_secure.COOKIE_NS)
         message = rest[:FIRST_BYTES].ljust(FIRST_BYTES)

@@ -1,4 +1,4 @@
-"""Mutations: valid messages, odd ones, and both with changes."""
+"""Mutations of inputs: valid messages and odd payloads, with changes."""
 
 import re
 from collections.abc import Sequence
@@ -40,7 +40,6 @@ WORDS = (
     *(b"\n", b"\xff", b"\0", b"` - at `$.model"),
     *(b"[" * DEEP, b'{"a":' * DEEP, b"9" * 5000, b'"' + b"x" * 5000 + b'"', b"a." * 2000 + b"a"),
 )
-"""Words that are invalid in most places."""
 
 NUMBERS = (
     -1,
@@ -64,7 +63,6 @@ NUMBERS = (
 
 
 def corpus() -> dict[str, bytes]:
-    """Odd payloads, by name."""
     lines = CORPUS.read_text().splitlines()
     return {name: bytes.fromhex(code) for name, _, code in (line.partition(" ") for line in lines)}
 
@@ -119,7 +117,6 @@ def fields_changed(rng: Random, payload: bytes) -> bytes:
 
 
 def _floats(rng: Random, packed: bytes) -> bytes:
-    """Other numbers in an array of a message."""
     changed = bytearray(packed)
     odd = (np.nan, np.inf, -np.inf, 1e308, -1e9, 1e-310, -0.0, 0.1)
     value = rng.choice(odd)
@@ -131,7 +128,7 @@ def _floats(rng: Random, packed: bytes) -> bytes:
 
 
 def bytes_changed(rng: Random, payload: bytes, most: int = 2000) -> bytes:
-    """Payload with bytes changed, removed, inserted or repeated; at most `most` of them."""
+    """Payload with bytes changed, removed, inserted or repeated, cut to `most` bytes."""
     changed = bytearray(payload)
     for _ in range(rng.randrange(1, 4)):
         at = rng.randrange(len(changed) + 1)
@@ -151,8 +148,6 @@ def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
     """Text with a few tokens replaced, removed, repeated or swapped, or with changed bytes.
 
     Args:
-        rng: random generator.
-        text: the text.
         words: replacements for tokens, besides WORDS.
     """
     if rng.random() < 0.15:
@@ -175,6 +170,5 @@ def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
 
 
 def words_of(texts: Sequence[bytes]) -> list[bytes]:
-    """Words and strings that occur in texts."""
     found = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
     return sorted(token for token in found if not token.isspace())

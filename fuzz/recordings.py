@@ -1,7 +1,7 @@
 """Target for recordings: altered files are read, exported, joined and reported.
 
-A file is accepted, or refused with `RecordingError`; and reading takes little memory, whatever
-sizes the file claims.
+A file is accepted, or refused with `RecordingError`; reading takes little memory, whatever sizes
+the file claims.
 """
 
 import io
@@ -37,7 +37,7 @@ from skytether.view.recording import BEGUN, FEED
 from skytether.view.report import page
 
 REPORTED = 50
-"""Rate at which readable recordings are also drawn, one in this number, because drawing is slow."""
+"""One readable recording in this number is also drawn, because drawing is slow."""
 MEMORY_MAX_MB = 300
 """Memory that reading may take above the process's earlier peak [MB]."""
 ODD: tuple[Any, ...] = (
@@ -63,7 +63,6 @@ ODD: tuple[Any, ...] = (
 BITS = (0, 1, 2**63 - 1, 2**63, 2**64 - 1, 0x7FF0 << 48, 0xFFF8 << 48, 0x7FE0 << 48, 600_000_000)
 """Bits of numbers that are rarely valid in a column."""
 DEEP = 100_000
-"""Depth of nested lists."""
 COLUMNS = (
     *(
         "[]",
@@ -91,7 +90,7 @@ def records(content: bytes) -> list[Any]:
 
 
 def written(found: list[Any]) -> bytes:
-    """Complete file of such records, with valid checksums."""
+    """File of these records, with valid checksums."""
     file = io.BytesIO()
     writer = Writer(file, chunk_size=64 * 1024)
     writer.start()
@@ -123,23 +122,20 @@ def of_topic(found: list[Any], topic: str) -> list[int]:
 
 
 def frames_of(found: list[Any], kind: str) -> dict[int, dict[str, Any]]:
-    """Frames of a kind, by their positions."""
     frames = {i: msgspec.msgpack.decode(found[i].data) for i in of_topic(found, FEED)}
     return {i: frame for i, frame in frames.items() if frame["type"] == kind}
 
 
 def put(found: list[Any], at: int, content: Any) -> None:
-    """Replace the content of a message."""
     found[at] = replace(found[at], data=msgspec.msgpack.encode(content))
 
 
 def deep(rng: Random) -> bytes:
-    """Nested lists or objects."""
     return rng.choice([b"\x91" * DEEP, b"\x81\xa1a" * DEEP, b"\x91" * DEEP + b"\x90"])
 
 
 def changed_value(rng: Random, found: list[Any]) -> None:
-    """Frame, or the first message, with another value, without one, or deeply nested."""
+    """Replace or delete a value of a frame or of the first message, or nest it deeply."""
     at = rng.choice(of_topic(found, rng.choice([FEED, FEED, BEGUN])))
     if rng.random() < 0.1:
         found[at] = replace(found[at], data=deep(rng))
@@ -160,7 +156,7 @@ def changed_value(rng: Random, found: list[Any]) -> None:
 
 
 def changed_column(rng: Random, found: list[Any]) -> None:
-    """One value in a column of every row, or of one."""
+    """Replace a value in a column of every row, or of one row."""
     part = rng.choice([each["part"] for each in frames_of(found, "Rows").values()])
     parts = [each["parts"] for each in frames_of(found, "Opened").values()]
     columns = next(feed.columns_of(each[part]) for each in parts if part in each)
@@ -173,7 +169,6 @@ def changed_column(rng: Random, found: list[Any]) -> None:
 
 
 def changed_columns(rng: Random, found: list[Any]) -> None:
-    """Process with other columns, or other parts."""
     at, opened = rng.choice(list(frames_of(found, "Opened").items()))
     part = rng.choice([*opened["parts"], "client", "netem", "plan", ""])
     parts = {**opened["parts"], part: rng.choice([*COLUMNS, *opened["parts"].values()])}
@@ -181,7 +176,6 @@ def changed_columns(rng: Random, found: list[Any]) -> None:
 
 
 def changed_channel(rng: Random, found: list[Any]) -> None:
-    """Change the topic or the encoding of a channel, in place."""
     at = rng.choice([i for i, each in enumerate(found) if isinstance(each, Channel)])
     if rng.random() < 0.5:
         topics = [e.topic for e in found if isinstance(e, Channel)]
@@ -191,7 +185,6 @@ def changed_channel(rng: Random, found: list[Any]) -> None:
 
 
 def changed_words(rng: Random, found: list[Any]) -> None:
-    """Changed scenario of a recording, or of a process in it."""
     (begun,) = of_topic(found, BEGUN)
     at = rng.choice([begun, *frames_of(found, "Opened")])
     message = msgspec.msgpack.decode(found[at].data)
@@ -211,7 +204,6 @@ def changed_words(rng: Random, found: list[Any]) -> None:
 
 
 def changed_times(rng: Random, found: list[Any]) -> None:
-    """Frame with another time."""
     at = rng.choice(of_topic(found, FEED))
     frame = msgspec.msgpack.decode(found[at].data)
     time_ns = rng.choice([0, 1, 2**31, 2**50, 2**61, 2**62, 2**63, 2**64 - 1, -1, -(2**63)])
@@ -219,13 +211,12 @@ def changed_times(rng: Random, found: list[Any]) -> None:
 
 
 def repeated(rng: Random, found: list[Any]) -> None:
-    """Message repeated many times."""
     message = rng.choice([each for each in found if isinstance(each, Message)])
     found += [message] * rng.choice([100, 2000])
 
 
 def of_columns_alone(rng: Random, found: list[Any]) -> None:
-    """Empty rows of a part with huge rows."""
+    """Add empty rows of a part whose columns are huge."""
     at, opened = rng.choice(list(frames_of(found, "Opened").items()))
     part = rng.choice(list(opened["parts"]))
     columns = msgspec.json.decode(opened["parts"][part])
@@ -238,9 +229,9 @@ def of_columns_alone(rng: Random, found: list[Any]) -> None:
 
 
 def bomb(rng: Random, content: bytes) -> bytes:
-    """Chunk that decompresses to far more, with the scenario before it and an index after it."""
-    with_it = records(content)
-    channel = rng.choice([each for each in with_it if isinstance(each, Channel)])
+    """Insert a chunk that decompresses to far more than its size."""
+    recorded_items = records(content)
+    channel = rng.choice([each for each in recorded_items if isinstance(each, Channel)])
     builder = RecordBuilder()
     Message(channel.id, 0, rng.choice([b"{}", b"[" * 200, b" " * 4000]), 0, 0).write(builder)
     inside = builder.end()
@@ -255,8 +246,8 @@ def bomb(rng: Random, content: bytes) -> bytes:
             + struct.pack("<Q", rng.choice([2**33, 2**40, 2**62]))
             + data[9:]
         )
-    made = Chunk("zstd", data, 10**9, 0, rng.choice([0, crc32(inside)]), size)
-    made.write(builder)
+    chunk = Chunk("zstd", data, 10**9, 0, rng.choice([0, crc32(inside)]), size)
+    chunk.write(builder)
     record = builder.end() * rng.choice([1, 1, 30])
     reader = make_reader(io.BytesIO(content))
     summary = reader.get_summary()
@@ -268,7 +259,7 @@ def bomb(rng: Random, content: bytes) -> bytes:
 
 
 def misled(rng: Random, content: bytes) -> bytes:
-    """Index that points to missing or repeated positions, or headers with false sizes."""
+    """Make the index point to missing or repeated positions, or headers claim false sizes."""
     changed = bytearray(content)
     start = struct.unpack_from("<Q", content, len(content) - 28)[0]
     match rng.randrange(4):
@@ -292,7 +283,6 @@ def misled(rng: Random, content: bytes) -> bytes:
 
 
 def scattered(rng: Random, content: bytes) -> bytes:
-    """Bytes changed, or cut off."""
     changed = bytearray(content)
     for _ in range(rng.randrange(1, 5)):
         changed[rng.randrange(len(changed))] = rng.randrange(256)
@@ -305,18 +295,16 @@ INSIDE = (
     *(changed_value, changed_value, changed_column, changed_column, changed_columns),
     *(changed_channel, changed_words, changed_times, repeated, of_columns_alone),
 )
-"""Changes of records, which are written as a valid file again."""
+"""Mutations of records, which are then written as a valid file."""
 OUTSIDE = (bomb, misled, scattered)
-"""Changes of bytes."""
+"""Mutations of bytes."""
 
 
 def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
     """Mutated recording, and the name of the mutation.
 
     Args:
-        rng: random generator.
-        content: a recording.
-        known: its records.
+        known: records of the recording.
     """
     if rng.random() < 0.6:
         how, found = rng.choice(INSIDE), list(known)
@@ -342,17 +330,14 @@ class RecordingFile(Target):
         self._records = records(self._content)
 
     def seeds(self) -> Sequence[bytes]:
-        """A recording."""
         return (self._content,)
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Recording with changed records, written as a valid file, or with changed bytes."""
         if payload != self._content:
             return scattered(rng, payload or b"\0")
         return hostile(rng, payload, self._records)[1]
 
     def __call__(self, payload: bytes) -> None:
-        """Read the recording, and make another, tables and sometimes a report of it."""
         self._path.write_bytes(payload)
         with suppress(RecordingError):
             known = read(self._path)
@@ -365,5 +350,4 @@ class RecordingFile(Target):
 
 
 def peak_mb() -> float:
-    """Peak memory of this process [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

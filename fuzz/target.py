@@ -15,12 +15,10 @@ from skytether.shared.telemetry.record import Record
 from skytether.sim.flight import fly
 
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
-"""Scenario that is flown."""
 
 
 @cache
 def flown() -> Record:
-    """Record of the flight."""
     return fly(SCENARIO)
 
 
@@ -28,12 +26,12 @@ class Target:
     """Target that takes bytes, and raises if a guarantee is broken."""
 
     code: Sequence[ModuleType] = ()
-    """Modules whose branches guide atheris; kernels are compiled, and are not among them."""
+    """Modules whose branches guide atheris; compiled kernels are not among them."""
     largest = 1300
     """Size of the largest input [B]."""
 
     def __call__(self, payload: bytes) -> None:
-        """Take an input.
+        """Check an input.
 
         Raises:
             Exception: a guarantee is broken.
@@ -45,18 +43,16 @@ class Target:
         raise NotImplementedError
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Mutation of an input."""
         return bytes_changed(rng, payload)
 
     def next(self, rng: Random) -> bytes:
-        """Input: random bytes, or a mutated seed."""
         if rng.random() < 0.1:
             return rng.randbytes(rng.randrange(1500))
         return self.mutated(rng, rng.choice(self.seeds()))
 
 
 def functions(space: Any) -> list[FunctionType]:
-    """Functions and methods of a module or class."""
+    """Functions and methods defined in a module or class."""
     found = []
     for each in vars(space).values():
         if getattr(each, "__module__", None) != getattr(space, "__module__", space.__name__):

@@ -14,23 +14,20 @@ from fuzz.texts import ControlTarget, LogLines, NamedFiles, ScenarioFile
 
 
 class Both(Target):
-    """Pair of targets, one in the plane and one in 3-D, which take the same inputs."""
+    """Several targets that take the same inputs, such as flights in the plane and in 3-D."""
 
     def __init__(self, *targets: Target) -> None:
         self._targets = targets
         self.code = targets[0].code
 
     def __call__(self, payload: bytes) -> None:
-        """Give an input to each."""
         for target in self._targets:
             target(payload)
 
     def seeds(self) -> Sequence[bytes]:
-        """Seeds of the first."""
         return self._targets[0].seeds()
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Mutation of an input by the first."""
         return self._targets[0].mutated(rng, payload)
 
 
@@ -50,4 +47,3 @@ TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
         "log": lambda _: LogLines(),
     }
 )
-"""Constructors of all targets, by name."""

@@ -42,7 +42,6 @@ LIVE = reading.check(
 )
 """Scenario in which as many keys as possible can be changed in flight."""
 POLICIES = [name.encode() for name in (*TRIGGERS, *REFERENCES)] + b"( ) & | ! ,".split()
-"""Fragments of policies."""
 
 
 class Text(Target):
@@ -60,18 +59,14 @@ class Text(Target):
         self._words = [*words_of(known), *words]
 
     def seeds(self) -> Sequence[bytes]:
-        """Valid texts."""
         return self._known
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
-        """Text with changed words."""
         return text_changed(rng, payload, self._words)
 
 
 class ScenarioFile(Text):
-    """Target for a scenario file: it raises `ConfigError`, or gives a scenario that can be
-    flown.
-    """
+    """Target for a scenario file: it is refused by `ConfigError`, or can be flown."""
 
     code = (
         reading,
@@ -91,7 +86,6 @@ class ScenarioFile(Text):
         super().__init__([*files, *whole, *made], [*words, *POLICIES])
 
     def __call__(self, payload: bytes) -> None:
-        """Read the scenario."""
         self._path.write_bytes(payload)
         try:
             scenario = reading.load(str(self._path))
@@ -110,7 +104,7 @@ class ScenarioFile(Text):
 
 
 def capture(later_s: int) -> bytes:
-    """Capture of four packets of a flow each way, with times that are so much later."""
+    """Capture of four packets of a flow each way, with times shifted by up to `later_s`."""
     parts = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101)]
     for number in range(8):
         udp = struct.pack(">HHHH", 5 + number % 2, 6 - number % 2, 16, 0) + b"packet %d" % number
@@ -168,7 +162,6 @@ class NamedFiles(Text):
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
 
     def __call__(self, payload: bytes) -> None:
-        """Read the file."""
         self._path.write_bytes(payload[1:])
         with suppress(ConfigError, GrammarError, ValueError):
             match (payload or b"\0")[0] % 7:
@@ -180,9 +173,9 @@ class NamedFiles(Text):
                     file = File("it", payload[1:])
                     zones.parse("geojson(it)", 2, (file,)).clearance(np.zeros((2, 2)))
                 case 3:
-                    found = recorded.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
-                    assert np.isfinite(found.delay_s).all()
-                    assert (np.diff(found.time_s) > 0.0).all()
+                    parsed = recorded.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
+                    assert np.isfinite(parsed.delay_s).all()
+                    assert (np.diff(parsed.time_s) > 0.0).all()
                 case 4:
                     times_s = traces.deliveries_in.__wrapped__(File("it", payload[1:]))
                     assert np.isfinite(times_s).all()
@@ -222,9 +215,9 @@ class ControlTarget(Text, EndpointInFlight):
             before = running.scenario
             answer = running.answer(payload[: REQUEST_BYTES_MAX + 1], now_ns=self._now_ns)
             assert len(answer) <= ANSWER_BYTES_MAX, payload.hex()
-            said = answer_of(answer)
-            assert bool(said.changed) == (running.scenario != before), payload.hex()
-            assert not (said.refused and said.changed), payload.hex()
+            parsed = answer_of(answer)
+            assert bool(parsed.changed) == (running.scenario != before), payload.hex()
+            assert not (parsed.refused and parsed.changed), payload.hex()
             reading.check(reading.to_table(running.scenario), known=running.scenario)
         running._endpoint.events()  # nobody else empties netem's events
 
@@ -242,7 +235,6 @@ class LogLines(Text):
         super().__init__([msgspec.json.encode(each) for each in (*lines, *answers)])
 
     def __call__(self, payload: bytes) -> None:
-        """Read the bytes as both."""
         line = line_of(payload)
         assert line is None or str(line.event).splitlines(), payload.hex()
         with suppress(ControlError):

@@ -24,7 +24,7 @@ from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
-"""Number of new objects after which garbage is collected: queued packets are no garbage, and the
+"""Number of new objects after which garbage is collected. Queued packets are no garbage, and the
 default of 700 would scan all of them many times a second."""
 
 
@@ -79,34 +79,34 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     """Options with the network that --to-client and --to-server describe.
 
     Raises:
-        ConfigError: there is no such network.
+        ConfigError: the network is invalid.
     """
     table = reading.to_table(options.config)
-    given = {"uplink": options.to_client, "downlink": options.to_server}
-    table["network"] |= {key: text for key, text in given.items() if text is not None}
+    directions = {"uplink": options.to_client, "downlink": options.to_server}
+    table["network"] |= {key: text for key, text in directions.items() if text is not None}
     source = f"{options.scenario} and the command line"
     return replace(options, config=reading.check(table, source, any_network=True))
 
 
 def _check_server(server: Address, bind: Address) -> None:
-    """Refuse netem itself as the server.
+    """Refuse netem itself as the server, since packets would circulate.
 
     Raises:
-        CommandError: packets would circulate.
+        CommandError: the server's address leads back to netem.
     """
     with suppress(OSError):  # an unknown host is reported when it is used
         if leads_back(server, bind):
             at = address_text(*server)
-            said = f"--server: got {at}, which is netem itself; expected the address of a server"
-            raise command.CommandError(said, command.CONFIGURATION)
+            message = f"--server: got {at}, which is netem itself; expected the address of a server"
+            raise command.CommandError(message, command.CONFIGURATION)
 
 
 def _flows(requested: int | None) -> int:
-    """Largest number of clients at once; if the system allows fewer than FLOWS_MAX, this is
-    printed.
+    """Largest number of clients at once; a warning is printed if the system allows fewer than
+    FLOWS_MAX.
 
     Raises:
-        CommandError: the system does not allow the given number.
+        CommandError: the system does not allow the requested number.
     """
     flows = max(1, min(FLOWS_MAX, sockets_max())) if requested is None else requested
     command.check_count("--flows", flows, 65_536)

@@ -1,7 +1,7 @@
 """Bottleneck: packets of all flows pass a finite rate one after another, and queue for it.
 
-It serves one packet at a time: a packet that enters is served at once if it is idle, otherwise it
-waits in a queue of limited bytes. Sizes include the headers of IP and UDP.
+An idle bottleneck serves a packet at once; otherwise the packet waits in a queue of limited bytes.
+Sizes include the headers of IP and UDP.
 """
 
 from bisect import bisect_left
@@ -26,8 +26,6 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Waiting(Generic[T]):
-    """Packet in the queue."""
-
     item: T
     size: int
     """Bytes including headers [B]."""
@@ -37,12 +35,10 @@ class Waiting(Generic[T]):
 
 @dataclass(slots=True)
 class Codel:
-    """Controlled delay, RFC 8289: drops packets that waited too long, increasingly often, until
-    waits fall.
-    """
+    """Controlled delay (RFC 8289): drops packets ever more often until queueing times fall."""
 
     above_ns: int = 0
-    """Time at which waits will have been too long for INTERVAL_NS; 0 while they are not."""
+    """Time at which waits will have been too long for INTERVAL_NS; 0 while they are short."""
     drop_ns: int = 0
     """Time of the next drop."""
     count: int = 0
@@ -53,8 +49,7 @@ class Codel:
         """Whether to drop the packet at the front.
 
         Args:
-            now_ns: time now.
-            is_fine: whether it has not waited too long, or hardly anything waits behind it.
+            is_fine: whether it waited briefly, or the queue behind it is nearly empty.
         """
         late = False
         if is_fine:
@@ -73,7 +68,7 @@ class Codel:
             self.drop_ns += round(INTERVAL_NS / sqrt(self.count))
             return True
         self.dropping = True
-        # Shortly after the last drops it continues at about the drop rate reached there (RFC 8289).
+        # Shortly after the last drops the drop rate continues about where it was (RFC 8289).
         recent = now_ns - self.drop_ns < 16 * INTERVAL_NS
         self.count = max(1, self.count - self.last_count) if recent else 1
         self.last_count = self.count
@@ -88,17 +83,11 @@ class FlowQueue(Generic[T]):
     packets: "deque[Waiting[T]]" = field(default_factory=deque)
     bytes: int = 0
     credit: int = 0
-    """Bytes that it may still send in its turn."""
+    """Bytes that the queue may still send in its turn."""
     codel: Codel = field(default_factory=Codel)
 
 
 class Bottleneck(Generic[T]):
-    """Serves packets at a finite rate.
-
-    Args:
-        queue: rate, capacity and discipline.
-    """
-
     def __init__(self, queue: Queued) -> None:
         self._queue = queue
         self._is_fair = queue.serve == "fair"
@@ -106,10 +95,9 @@ class Bottleneck(Generic[T]):
         """Queues with waiting packets, the next to be served first."""
         self._served: Waiting[T] | None = None
         self._done_ns = 0
-        """Time at which the packet being served has passed."""
         self._largest = 0
         self.waiting = 0
-        """Number of waiting packets, without the one being served."""
+        """Number of waiting packets, without the packet being served."""
         self.waiting_bytes = 0
         """Size of the waiting packets, headers included [B]."""
         self.dropped: list[T] = []
@@ -122,10 +110,7 @@ class Bottleneck(Generic[T]):
         """Add a packet; call `release` for the packets that passed before it first.
 
         Args:
-            item: the packet.
-            size: its bytes including headers [B].
-            flow: number of its flow.
-            now_ns: time now.
+            size: bytes including headers [B].
         """
         packet = Waiting(item, size, flow, now_ns)
         self._largest = max(self._largest, size)
@@ -146,7 +131,7 @@ class Bottleneck(Generic[T]):
             self.dropped.append(last.item)
 
     def release(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
-        """Packets that have passed by now, each with the time at which it did [ns]."""
+        """Packets that have passed by now, each with the time at which it passed [ns]."""
         while self._served is not None and self._done_ns <= now_ns:
             item, at_ns = self._served.item, self._done_ns
             self._served = None
@@ -156,7 +141,6 @@ class Bottleneck(Generic[T]):
             yield item, at_ns
 
     def next_due_ns(self) -> int | None:
-        """Time at which the next packet has passed, or None."""
         return None if self._served is None else self._done_ns
 
     def drain(self) -> Iterator[Waiting[T]]:
@@ -172,7 +156,6 @@ class Bottleneck(Generic[T]):
         self._done_ns = self._pace.done_ns(now_ns, packet.size)
 
     def _next(self, now_ns: int) -> Waiting[T] | None:
-        """Next packet to be served, after those that CoDel drops."""
         while self.waiting:
             key, queue = next(iter(self._lines.items()))
             # Deficit round robin: a queue that has used up its credit goes to the end with a new
@@ -190,7 +173,6 @@ class Bottleneck(Generic[T]):
         return None
 
     def _is_late(self, queue: FlowQueue[T], packet: Waiting[T], now_ns: int) -> bool:
-        """Whether CoDel drops the packet at the front of a queue."""
         waited_ns = now_ns - packet.entered_ns
         # At a low rate a single packet takes longer than 5 ms, and would be dropped for it.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
@@ -204,19 +186,17 @@ class Bottleneck(Generic[T]):
         queue.bytes += one * packet.size
         self.waiting_bytes += one * packet.size
         self.waiting += one
-        # Its credit is lost: a silent flow cannot save up turns.
+        # The credit of an empty queue is lost: a silent flow cannot save up turns.
         if self._is_fair and not queue.packets:
             del self._lines[key]
 
 
 class _Rate:
-    """Constant rate [B/s]."""
-
     def __init__(self, bytes_per_s: float) -> None:
         self._bytes_per_s = bytes_per_s
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet has passed whose service starts now."""
+        """Time at which a packet of this size has passed, if its service starts now."""
         return now_ns + round(size / self._bytes_per_s * SECOND_NS)
 
 
@@ -233,7 +213,6 @@ class _Deliveries:
         """Bytes of the deliveries so far that were used or lost."""
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet has passed whose service starts now."""
         if self._began_ns is None:
             self._began_ns = now_ns
         times_ns = self._times_ns

@@ -4,11 +4,11 @@ Each direction has a list of impairments (`shared.scenario.air`), which modify t
 one after another. A fate depends on the seed, the direction, the flow and the time slot in which
 the packet enters, but not on earlier packets: so two controllers meet the same network, however
 often each of them sends. Packets that enter in the same slot have different fates, by their rank in
-it: three CLOSEs sent at once are not all lost together. Control traffic is so sparse that nearly
-every packet is the first of its slot.
+the slot: otherwise three CLOSEs sent at once would all be lost together. Control traffic is so
+sparse that nearly every packet is the first of its slot.
 
-An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect: an
-error in it ends no flight.
+An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect, so
+that its errors end no flight.
 """
 
 import traceback
@@ -28,15 +28,6 @@ COPIES_MAX = 100
 
 
 class Fates:
-    """Fates of the packets of one flow in one direction.
-
-    Args:
-        direction: its impairments.
-        seed: seed of the scenario.
-        name: name of the direction.
-        flow: number of the flow.
-    """
-
     def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
         at = seed, name, flow
         packets = Stream(*at, "packets")
@@ -50,7 +41,7 @@ class Fates:
             kinds[each.kind] += 1
             names[name_] += 1
             # The first delay and the first loss use fixed streams, so that their numbers do not
-            # change when others are added or changed.
+            # change when other impairments are added or changed.
             if each.kind != "other" and kinds[each.kind] == 1:
                 moments = "moments" if each.kind == "loss" else "moments of the delay"
                 draws = Draws(packets, int(each.kind == "loss"), (*at, moments))
@@ -64,11 +55,12 @@ class Fates:
         """Fate of a packet.
 
         Args:
-            slot: time slot in which it enters.
+            slot: time slot in which the packet enters.
             rank: number of packets of the flow that entered in that slot before it.
         """
         fate = Fate(slot, rank)
-        # Our own are trusted: guarding against a plug-in takes a copy per impairment and packet.
+        # Built-in impairments are trusted: guarding against a plug-in takes a copy per impairment
+        # and packet.
         if self._guarded:
             return self._guarded_fate(fate)
         for impairment, draws in self._impairments:
@@ -76,7 +68,6 @@ class Fates:
         return fate
 
     def _guarded_fate(self, fate: Fate) -> Fate:
-        """Fate with the effects of faulty plug-ins left out."""
         for impairment, draws in self._impairments:
             # On a copy: a plug-in that fails half-way must have no effect.
             tried = replace(fate)
@@ -89,10 +80,10 @@ class Fates:
 
 
 def _possible(fate: Fate) -> Fate:
-    """Check a fate after a plug-in.
+    """Fate after a plug-in, with its numbers converted to integers.
 
     Raises:
-        ValueError, TypeError: it contains an impossible value.
+        ValueError, TypeError: the fate contains an impossible value.
     """
     if not 0 <= fate.delay_ns <= DELAY_MAX_NS:
         raise ValueError(f"got delay_ns = {fate.delay_ns}, expected 0 to {DELAY_MAX_NS}")

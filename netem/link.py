@@ -17,11 +17,11 @@ from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
 
 QUEUE_MAX = 65536
-"""Largest number of packets queued in one direction; further ones are dropped, and not counted as
-lost."""
+"""Largest number of packets queued in one direction; further ones are dropped, not counted as lost.
+"""
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
-"""Largest UDP payload queued in one direction, whatever `network.mtu` allows [B]: with both
-directions full, and Python's overhead, netem stays below 256 MiB."""
+"""Largest UDP payload queued in one direction, with any `network.mtu` [B]: with both directions
+full, and Python's overhead, netem stays below 256 MiB."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Bin width of the histogram of delays [ns]: the grid of the paper's delay."""
@@ -32,8 +32,8 @@ ERROR_BIN_NS = MILLISECOND_NS // 50
 QUEUEING_BIN_NS = MILLISECOND_NS
 """Bin width of the histogram of queueing times [ns]."""
 SLICE_BITS = 17
-"""Length of a slice of the queue as a power of two [ns]: 0.13 ms, in which 13 of 100 000 packets a
-second are due."""
+"""Length of a slice of the queue as a power of two [ns]: 0.13 ms, in which 13 packets are due at
+100 000 packets a second."""
 
 
 @dataclass(slots=True)
@@ -41,20 +41,18 @@ class Lane:
     """State of one flow in one direction."""
 
     flow: int
-    """Number of the flow, from 0."""
     fates: Fates
     began_ns: int
-    """Time at which the flow began [ns]."""
     slot: int = -1
-    """Time slot of its newest packet, counted from `began_ns`."""
+    """Time slot of the newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Rank of that packet in its slot."""
+    """Rank of the newest packet in its slot."""
     taken: int = 0
-    """Number of packets so far, lost ones included."""
+    """Number of packets so far, lost packets included."""
     newest_out: int = -1
     """Highest number of a packet that has left, or -1."""
     latest_ns: int = 0
-    """Due time of the last of its packets."""
+    """Due time of the last packet."""
 
 
 class Entered(NamedTuple):
@@ -63,19 +61,16 @@ class Entered(NamedTuple):
     datagram: Datagram
     lane: Lane
     number: int
-    """Number of the packet in its lane."""
     fate: Fate
     entered_ns: int
 
 
 @dataclass(slots=True)
 class Counts:
-    """Statistics of one direction."""
-
     packets: int = 0
     """Packets that entered."""
     bytes: int = 0
-    """UDP payload of these [B]."""
+    """UDP payload of the packets that entered [B]."""
     forwarded: int = 0
     """Packets that have left."""
     undelivered: int = 0
@@ -83,7 +78,7 @@ class Counts:
     lost: int = 0
     """Packets lost by impairments."""
     reordered: int = 0
-    """Packets overtaken by a later one of their flow."""
+    """Packets overtaken by a later packet of their flow."""
     oversized: int = 0
     """Packets dropped because they were longer than `network.mtu`."""
     overflowed: int = 0
@@ -122,16 +117,12 @@ class Queue:
         self.front: list[QueuedPacket] = []
         """Heap of the first packets; empty only if the queue is empty."""
         self._slice = 0
-        """Number of the first slice; packets of earlier ones are in `front` as well."""
+        """Number of the first slice; packets of earlier slices are in `front` as well."""
         self._later: dict[int, list[QueuedPacket]] = {}
-        """Packets of later slices by number."""
         self._slices: list[int] = []
-        """Heap of the numbers of later slices."""
         self.size = 0
-        """Number of queued packets."""
 
     def push(self, queued: QueuedPacket) -> None:
-        """Queue a packet."""
         self.size += 1
         number = queued[0] >> SLICE_BITS
         if number <= self._slice and self.front:
@@ -146,7 +137,6 @@ class Queue:
             heappush(self._slices, number)
 
     def take_due(self, now_ns: int) -> list[QueuedPacket]:
-        """Remove and return the due packets, in order."""
         due: list[QueuedPacket] = []
         front = self.front
         while front and front[0][0] <= now_ns:
@@ -170,8 +160,7 @@ class Link:
     Args:
         direction: UPLINK or DOWNLINK, for the record.
         mtu: longest UDP payload that passes [B].
-        recorder: receives one row per packet; may be None.
-        path: impairments, order and finite rate of the direction.
+        recorder: receives one row per packet.
     """
 
     def __init__(
@@ -190,7 +179,7 @@ class Link:
         self.counts = Counts()
 
     def change(self, path: Path, *, now_ns: int) -> None:
-        """Change order and rate; packets waiting at the bottleneck are queued again if they fit."""
+        """Change order and rate; packets at the bottleneck are queued again if they fit."""
         self._pass(now_ns)
         previous, self._path, self._is_ordered = self._path, path, path.is_ordered
         if path.queue is previous.queue:
@@ -200,11 +189,7 @@ class Link:
             self._wait(waiting.item, now_ns)
 
     def accept(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> bool:
-        """Accept a packet, addressed to its destination.
-
-        Returns:
-            whether something may be due because of it: most packets are delayed.
-        """
+        """Accept a packet, addressed to its destination; True if a packet may be due now."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
         # Packets in the same slot have a rank; otherwise they would all have the same fate.
@@ -225,7 +210,6 @@ class Link:
         return True
 
     def _wait(self, entered: Entered, now_ns: int) -> None:
-        """Put a packet into the bottleneck, or delay it at once if there is none."""
         bottleneck, size = self._bottleneck, len(entered.datagram.payload)
         if bottleneck is None:
             self._delay(*entered, now_ns)
@@ -237,7 +221,6 @@ class Link:
             self._count_dropped(bottleneck)
 
     def _pass(self, now_ns: int) -> None:
-        """Delay the packets that have passed the bottleneck by now."""
         bottleneck = self._bottleneck
         if bottleneck is None:
             return
@@ -261,7 +244,7 @@ class Link:
         entered_ns: int,
         now_ns: int,
     ) -> None:
-        """Lose a packet, or queue it until it is due; it has passed the bottleneck by now."""
+        """Lose a packet that has passed the bottleneck, or queue it until it is due."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
         # After the bottleneck: a packet that is lost has used the rate nevertheless.
         if fate.lost:
@@ -269,7 +252,7 @@ class Link:
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
-            # In order: a packet that would overtake waits for the one before it.
+            # In order: a packet that would overtake waits for the earlier packet.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -290,7 +273,6 @@ class Link:
             is_copy = True
 
     def _is_full(self, size: int) -> bool:
-        """Whether a packet of this size does not fit any more."""
         if self._bottleneck is None:
             return self._queue.size >= QUEUE_MAX or self._bytes + size > QUEUE_BYTES_MAX
         return self.depth() >= QUEUE_MAX or self.depth_bytes() + size > QUEUE_BYTES_MAX
@@ -304,7 +286,6 @@ class Link:
             )
 
     def release(self, *, now_ns: int) -> list[Datagram]:
-        """Remove and return the packets that are due."""
         self._pass(now_ns)
         queue, counts, recorder = self._queue, self.counts, self._recorder
         out: list[Datagram] = []
@@ -328,7 +309,7 @@ class Link:
                     pack(direction, flow, number, size, entered_ns, delay_ns, False, overtaken)
                 )
             out.append(datagram)
-        # At once: a call per packet would take longer than its work.
+        # All packets in one call: a call per packet would take longer than the work itself.
         counts.forwarded += len(out)
         counts.delay.add_all(delays_ns)
         counts.error.add_all(errors_ns)
@@ -337,12 +318,11 @@ class Link:
         return out
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether a packet is due, or has passed the bottleneck."""
         due_ns = self.next_due_ns()
         return due_ns is not None and due_ns <= now_ns
 
     def next_due_ns(self) -> int | None:
-        """Time at which the next packet is due, or passes the bottleneck, or None."""
+        """Time at which the next packet is due, or passes the bottleneck; None without packets."""
         front = self._queue.front
         due_ns = front[0][0] if front else None
         if self._bottleneck is None:
@@ -358,11 +338,10 @@ class Link:
         return self._queue.size + waiting
 
     def depth_bytes(self) -> int:
-        """UDP payload in queue and bottleneck, with headers in the latter [B]."""
+        """UDP payload in queue and bottleneck, plus headers in the bottleneck [B]."""
         return self._bytes + (self._bottleneck.waiting_bytes if self._bottleneck else 0)
 
     def figures(self) -> dict[str, Any]:
-        """Statistics by name, see `Endpoint.figures`."""
         counts = self.counts
         return {
             "packets": counts.packets,

@@ -1,10 +1,9 @@
-"""Places of netem: the flows that have one, and the order in which they are replaced by new
-clients.
+"""Places of netem: the flows that have a place, and the order in which new clients replace them.
 
 netem reads no payload, so it cannot tell a vehicle from somebody who repeats a vehicle's packets.
 But it can count. An exchange is a packet of the client followed by one of the server, and EXCHANGES
 of them earn a flow its place for EARNED_NS. A single answer earns nothing, because anybody can
-provoke it. If no place is free, the first of these is replaced by a new client:
+provoke it. If no place is free, a new client replaces the first of these:
 
     1. the oldest unearned flow, if it is unused for IDLE_NS
     2. the oldest unearned flow of the new client's own host, if that has more than HOST_FLOWS
@@ -13,8 +12,8 @@ provoke it. If no place is free, the first of these is replaced by a new client:
     4. the oldest unearned flow of a host with more than HOST_FLOWS such flows
     5. the oldest unearned flow
 
-So to keep a place one must exchange packets at the rate of a slow vehicle in each flow, and a
-single host can keep at most HOST_FLOWS from others.
+So a flow keeps its place only by exchanging packets at the rate of a slow vehicle, and a single
+host can keep at most HOST_FLOWS places from others.
 """
 
 from collections import OrderedDict
@@ -30,18 +29,15 @@ EXCHANGES = 8
 EARNED_NS = 10 * SECOND_NS
 """Time for which a place is earned [ns]."""
 IDLE_NS = 5 * SECOND_NS
-"""Time without a packet after which a flow is replaced before those of a crowded host [ns]."""
+"""Time without a packet after which a flow is replaced before the flows of a crowded host [ns]."""
 HOST_FLOWS = 64
-"""Number of flows of a host above which they are replaced before those of other hosts."""
+"""Number of flows of a host above which they are replaced before the flows of other hosts."""
 TRIALS = 8
-"""Share of the places, as a divisor, that a host with more than HOST_FLOWS cannot keep from new
-clients."""
+"""One place in TRIALS is left to new clients by hosts with more than HOST_FLOWS flows."""
 
 
 @dataclass(slots=True)
 class Flow:
-    """State of one client address."""
-
     client: Address
     socket: int
     """Number of its socket towards the server, from 1."""
@@ -52,15 +48,15 @@ class Flow:
     host: str
     """Host of the client, see `shared.core.endpoint.host_of`."""
     order: "Order"
-    """Flows among which it is ordered: earned ones, or the others."""
+    """Flows among which this flow is ordered: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of other addresses from which its first packet had come before."""
+    """Number of other addresses that had sent the flow's first packet before, see `Proxy._laps`."""
     asks: bool = False
     """Whether a packet of the client has come since the newest exchange."""
     exchanges: int = 0
-    """Number of exchanges since it last earned its place."""
+    """Number of exchanges since the flow last earned its place."""
     earned_ns: int = 0
-    """Time at which it last earned its place."""
+    """Time at which the flow last earned its place."""
 
 
 class Order:
@@ -68,21 +64,17 @@ class Order:
 
     def __init__(self) -> None:
         self.flows: OrderedDict[Address, Flow] = OrderedDict()
-        """All flows by client."""
         self._hosts: dict[str, OrderedDict[Address, Flow]] = {}
-        """Flows of each host by client."""
         self._crowded: dict[str, None] = {}
         """Hosts with more than HOST_FLOWS flows."""
 
     def append(self, flow: Flow) -> None:
-        """Add a flow as the newest."""
         of_host = self._hosts.setdefault(flow.host, OrderedDict())
         self.flows[flow.client] = of_host[flow.client] = flow
         if len(of_host) > HOST_FLOWS:
             self._crowded[flow.host] = None
 
     def remove(self, flow: Flow) -> None:
-        """Remove a flow."""
         of_host = self._hosts[flow.host]
         del self.flows[flow.client], of_host[flow.client]
         if len(of_host) <= HOST_FLOWS:
@@ -91,12 +83,10 @@ class Order:
             del self._hosts[flow.host]
 
     def renew(self, flow: Flow) -> None:
-        """Make a flow the newest."""
         self.flows.move_to_end(flow.client)
         self._hosts[flow.host].move_to_end(flow.client)
 
     def count(self, host: str) -> int:
-        """Number of flows of a host."""
         return len(self._hosts.get(host, ()))
 
     def oldest(self, host: str = "") -> Flow | None:
@@ -105,21 +95,11 @@ class Order:
         return next(iter(flows.values())) if flows else None
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
-        """Oldest flow of a host with more than HOST_FLOWS; None if there is none.
-
-        Args:
-            but: host that is left out.
-        """
+        """Oldest flow of a host with more than HOST_FLOWS, except the host `but`, or None."""
         return next((self.oldest(host) for host in self._crowded if host != but), None)
 
 
 class Places:
-    """Flows that have a place.
-
-    Args:
-        count: number of places.
-    """
-
     def __init__(self, count: int) -> None:
         self._trials = count // TRIALS
         """Number of places that a host with more than HOST_FLOWS cannot keep from others."""
@@ -129,17 +109,10 @@ class Places:
         """All other flows, by the time of their last packets."""
 
     def find(self, client: Address) -> Flow | None:
-        """Flow of a client, or None."""
         return self._earned.flows.get(client) or self.others.flows.get(client)
 
     def hear(self, flow: Flow, now_ns: int, *, is_answer: bool) -> None:
-        """Note a packet of a flow.
-
-        Args:
-            flow: the flow.
-            now_ns: time now.
-            is_answer: whether the server sent it, not the client.
-        """
+        """Note a packet of a flow, sent by the server if `is_answer`, otherwise by the client."""
         flow.used_ns = now_ns
         if is_answer and flow.asks:
             flow.exchanges += 1
@@ -151,9 +124,7 @@ class Places:
             flow.order.renew(flow)
 
     def replace(self, host: str, now_ns: int) -> Flow | None:
-        """Remove and return the flow that a new client of a host replaces; None if there is
-        none.
-        """
+        """Remove and return the flow that a new client of a host replaces, or None."""
         earned, others = self._earned, self.others
         while (last := earned.oldest()) and now_ns - last.earned_ns >= EARNED_NS:
             self._put(last, others)
@@ -165,7 +136,7 @@ class Places:
         return flow
 
     def _crowding(self, host: str) -> Flow | None:
-        """Flow of a host with more than HOST_FLOWS that a new client of a host replaces."""
+        """Flow of a host with more than HOST_FLOWS that a new client of `host` replaces."""
         earned, others = self._earned, self.others
         if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
             return others.oldest(host)

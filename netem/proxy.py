@@ -4,7 +4,7 @@ Clients send to netem's bound socket. Each client address is a flow with a socke
 the server, so that the server's answers are sent back to the right client. As in the paper, uplink
 is server to client, downlink is client to server.
 
-If no place is free for a new client, `places` says which flow it replaces. A server address that
+If no place is free for a new client, it replaces a flow chosen by `places`. A server address that
 leads back to netem is detected: until the server has sent its first packet, a packet that has come
 from LAPS_MAX new addresses, one after another, opens no further flow. The first packet that is too
 long, and the first that does not reach the server, are reported.
@@ -32,10 +32,9 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
 
 FLOWS_MAX = 512
-"""Default largest number of clients at once; packets of others are dropped and counted."""
+"""Default largest number of clients at once; packets of further clients are dropped and counted."""
 LAPS_MAX = 16
-"""Largest number of flows that one packet opens, each from another address, while the server has
-never answered."""
+"""Largest number of flows, each from another address, that one packet opens before an answer."""
 
 
 class Proxy(Endpoint):
@@ -43,7 +42,6 @@ class Proxy(Endpoint):
 
     Args:
         scenario: uses `network` and `seed`.
-        server: address of the server.
         flows: largest number of clients at once, a socket each.
         recorder: receives one row per packet.
     """
@@ -74,20 +72,19 @@ class Proxy(Endpoint):
         self._is_looped = False
         """Whether a loop of packets was reported."""
         self._is_too_long = False
-        """Whether a packet was too long."""
+        """Whether a packet that is too long was reported."""
         self._is_unreachable = False
-        """Whether packets to the server have failed since it last answered."""
+        """Whether packets to the server have failed since its last answer."""
         self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
-        """Until the server answers: laps of each of the newest packets, and its latest client, by
-        digest of the packet."""
+        """Until the server answers: laps of each of the newest packets, and the latest client that
+        sent it, by digest of the packet."""
         self._faults: set[str] = set()
         """Tracebacks of plug-ins' errors that were reported."""
         self.refused = 0
-        """Number of packets from clients without a flow, and from others than the server at a
-        flow's socket."""
+        """Number of packets from clients without a flow, and to a flow's socket not from the
+        server."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Process a packet that enters the network."""
         payload, peer, socket = datagram
         if len(payload) > self._mtu and not self._is_too_long:
             self._is_too_long = True
@@ -126,7 +123,7 @@ class Proxy(Endpoint):
                 self._events.append(Fault(traceback=lane.fates.fault))
 
     def undelivered(self, socket: int, reason: str) -> None:
-        """See `Endpoint`; of clients, which come and go, it is counted only."""
+        """See `Endpoint`; undelivered packets to clients, which come and go, are only counted."""
         counts = self.downlink.counts if socket else self.uplink.counts
         counts.forwarded -= 1
         counts.undelivered += 1
@@ -136,7 +133,6 @@ class Proxy(Endpoint):
             self._events.append(Unreachable(host=host, port=port, reason=reason))
 
     def wake(self, *, now_ns: int) -> None:
-        """Send the packets that are due."""
         self._forward(now_ns)
 
     def _forward(self, now_ns: int) -> None:
@@ -145,21 +141,20 @@ class Proxy(Endpoint):
                 self._out += link.release(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which the next packet is due."""
         up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
         if up_ns is None or (down_ns is not None and down_ns < up_ns):
             return down_ns
         return up_ns
 
     def _open(self, datagram: Datagram, now_ns: int) -> Flow | None:
-        """Open a flow for the sender of a packet; None if there is no place."""
         client = host, port = datagram.peer
         laps = self._laps(datagram)
         if laps > LAPS_MAX:
             return None
         socket = len(self._by_socket) + 1
         if socket > self._flows_max:
-            # Sockets are never closed: a new flow takes over the one of the flow that it replaces.
+            # Sockets are never closed: a new flow takes over the socket of the flow that it
+            # replaces.
             replaced = self._places.replace(host_of(client), now_ns)
             if replaced is None:
                 return None
@@ -185,7 +180,7 @@ class Proxy(Endpoint):
         """Number of flows, each from another address, through which a packet has passed one after
         another.
 
-        If no server answers, such a packet is one of our own that has come back.
+        If no server answers, such a packet is one that netem itself has sent.
         """
         passed = self._passed.get(_digest(datagram.payload)) if not self._is_answered else None
         if passed is None:
@@ -197,7 +192,6 @@ class Proxy(Endpoint):
         return laps
 
     def _note(self, payload: bytes, flow: Flow) -> None:
-        """Note that a packet passes through a flow."""
         digest = _digest(payload)
         laps, client = self._passed.pop(digest, (0, flow.client))
         self._passed[digest] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)
@@ -224,7 +218,6 @@ class Proxy(Endpoint):
             flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "flows": len(self._by_socket),
             "refused": self.refused,
@@ -234,5 +227,4 @@ class Proxy(Endpoint):
 
 
 def _digest(payload: bytes) -> bytes:
-    """Digest that identifies a packet."""
     return hashlib.blake2s(payload, digest_size=16).digest()

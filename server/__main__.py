@@ -89,17 +89,13 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the compiled planner before it is needed, and before workers are forked, so that they
-    share its memory.
-    """
+    """Load the compiled planner now; before workers are forked, so that they share its memory."""
     others = other_schemes(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)
 
 
 def _numbered(options: ServerOptions, number: int) -> ServerOptions:
-    """Options of worker `number`, with files and a metrics address of its own."""
-
     def own(path: Path | None) -> Path | None:
         if path and path.suffix == RECORDING:
             return path.with_name(f"{path.stem}.{number}{RECORDING}")
@@ -122,8 +118,6 @@ def _numbered(options: ServerOptions, number: int) -> ServerOptions:
 def _work(
     options: ServerOptions, keyring: Keyring | None, bind: Address | socket, number: int = 0
 ) -> None:
-    """Run the server, or one of several workers."""
-    # Each worker has sessions of its own.
     gate: Gate = PlainGate()
     forms: tuple[Form, ...] = ()
     if keyring:

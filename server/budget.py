@@ -1,12 +1,11 @@
-"""Byte budget shared by all vehicles of a server, spent where the old plan is expected to cost
-most.
+"""Byte budget shared by all vehicles of a server, spent where the old plan costs most.
 
-The trigger decides for each vehicle whether it asks for a packet at all. The budget grants as many
-requests as it has bytes for, in this order:
+The trigger decides whether a vehicle asks for a packet. The budget grants as many requests as it
+has bytes for, in this order:
 
-1. urgent packets: one that replaces a heartbeat, and the first of a vehicle that has no plan. They
-are always granted, as heartbeats are, at the expense of the others.
-2. vehicles that were sent nothing for WAIT_S, longest first, so that none is starved;
+1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
+   always granted, as heartbeats are, at the expense of the others.
+2. vehicles without a packet for WAIT_S, longest first, so that none is starved;
 3. all others by the figure that their trigger compares, per byte.
 
 It is a token bucket: b ← b + r Δt, within ± r BURST_S, minus the bytes sent, headers included;
@@ -14,8 +13,8 @@ urgent packets may make it negative. So a window of T seconds has at most r (T +
 beside the urgent ones. The rate r is `control.shared_bytes_per_s`, or follows the queueing delay
 (`server.rate`).
 
-A vehicle that has to wait asks again at the next step. Vehicles of other blocks are ranked by their
-latest request, one step old at most, so that blocks decided one after another share one ranking.
+A refused vehicle asks again at the next step. The ranking covers all blocks of vehicles, with the
+latest request of each vehicle, at most one step old.
 """
 
 from typing import Any, Literal
@@ -34,7 +33,7 @@ WAIT_S = 1.0
 NEVER = -2
 """Tick of a vehicle that has not asked: earlier than any tick."""
 GUESS_BYTES = 100
-"""Size of a packet, with headers, before the first was sent [B]."""
+"""Assumed size of a packet, with headers, until the first is sent [B]."""
 
 
 class SharedBudget:
@@ -53,36 +52,26 @@ class SharedBudget:
         self._tokens = self.bytes_per_s * BURST_S
         self._filled_ns: int | None = None
         self._spent = 0
-        """Bytes sent since the bucket was last filled [B]."""
         self._bytes = np.full(capacity, GUESS_BYTES, dtype=np.int64)
         """Size of the newest packet to each vehicle, with headers [B]; shape (capacity,)."""
         self._tick = 0
         self._asked = np.full(capacity, NEVER)
         """Tick of each vehicle's latest refused request; shape (capacity,)."""
         self._gain = np.zeros(capacity)
-        """Figure that the trigger compared then, per byte of the packet; shape (capacity,)."""
+        """Figure that the trigger compared at the refused request, per byte; shape (capacity,)."""
         self._waited_s = np.zeros(capacity)
-        """Time since its last packet if that is WAIT_S or more, otherwise 0 [s]; shape
-        (capacity,)."""
+        """Time since the last packet if WAIT_S or more, otherwise 0 [s]; shape (capacity,)."""
         self.deferred = 0
-        """Number of times that a vehicle had to wait for another step."""
+        """Number of refused requests."""
 
     @property
     def bytes_per_s(self) -> float:
-        """Present rate [B/s]."""
         return self._control.bytes_per_s if self._fixed is None else self._fixed
 
     def forget(self, row: int) -> None:
-        """Reset the row for another vehicle."""
         self._bytes[row], self._asked[row] = GUESS_BYTES, NEVER
 
     def fill(self, rows: Indices, now_ns: int) -> None:
-        """Begin a tick: subtract what was sent, and fill the bucket.
-
-        Args:
-            rows: vehicles in session; shape (n,).
-            now_ns: time now.
-        """
         passed_s = 0.0 if self._filled_ns is None else (now_ns - self._filled_ns) / SECOND_NS
         self._filled_ns = now_ns
         if self._fixed is None:
@@ -96,14 +85,14 @@ class SharedBudget:
     def choose(
         self, rows: Indices, event: Flags, urgent: Flags, worth: Array, since_s: Array
     ) -> Flags:
-        """Flags of the vehicles whose requests are granted.
+        """Flags of the vehicles whose requests are granted; all arrays have shape (n,).
 
         Args:
-            rows: the vehicles; shape (n,).
-            event: which vehicles ask; shape (n,).
-            urgent: which requests cannot wait; shape (n,).
-            worth: figure that the trigger compares; shape (n,).
-            since_s: time since the last packet to each [s]; shape (n,).
+            rows: the vehicles.
+            event: which vehicles ask.
+            urgent: which requests are always granted.
+            worth: figure that the trigger compares.
+            since_s: time since the last packet to each [s].
         """
         asks = event & ~urgent
         self._asked[rows] = np.where(asks, self._tick, NEVER)
@@ -126,19 +115,17 @@ class SharedBudget:
         return chosen
 
     def charge(self, row: int, size: int, *, is_plan: bool) -> None:
-        """Note a packet sent to a vehicle.
+        """Subtract a packet from the budget.
 
         Args:
-            row: row of the vehicle.
             size: bytes of its payloads with one header each [B].
-            is_plan: whether it is a plan granted by `choose`, not a heartbeat.
+            is_plan: True for a plan granted by `choose`, False for a heartbeat.
         """
         self._spent += size
         if is_plan:
             self._bytes[row] = size
 
     def figures(self) -> dict[str, Any]:
-        """Rate [B/s], queueing delay, and how often vehicles had to wait, for the statistics."""
         return {
             "bytes_per_s": self.bytes_per_s,
             "queueing_ms": self._control.queueing_s * 1e3,

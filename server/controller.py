@@ -3,9 +3,9 @@
     observations → x̂(k), x̂(k+d) (`schemes`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`mpc.hierarchical`) → event? (`trigger`) → plans are sent and remembered.
 
-The schemes "predictive" and "none" have d = 0. With "trajectory" `schemes.trajectory` plans the
-motion to be followed, or on a mission `missions.mission_planner`. Every vehicle is
-planned for at every step, since planning is a small part of the cost of a step.
+The schemes "predictive" and "none" have d = 0. With "trajectory", `schemes.trajectory` plans the
+spline to be followed; on a mission, `missions.mission_planner`. Plans are made for every vehicle at
+every step, since planning is a small part of the cost of a step.
 """
 
 from collections import Counter
@@ -40,7 +40,6 @@ from skytether.shared.scenario.triggers import Situation, SituationArrays, Verdi
 from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
-"""Members of `Idle` as plain numbers, for kernels."""
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -61,28 +60,26 @@ def _mission(fleet: Fleet) -> Scheme:
 
 
 MISSION_KERNELS = (missions, splines)
-"""Modules and packages whose kernels are called where vehicles keep apart."""
+"""Modules and packages whose kernels are called on missions only."""
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
-    """Names of the modules whose kernels are not called where a scenario is flown."""
+    """Modules whose kernels are not called in a scenario."""
     own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
     every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
-    names = tuple(f"{each.__name__}." for each in every.difference(own))
+    names = tuple(f"{module.__name__}." for module in every.difference(own))
     return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
 class Decisions(NamedTuple):
-    """Decisions on n vehicles at a step; valid until the next decisions are made."""
+    """Plans and decisions for n vehicles at a step; valid until the next decisions are made."""
 
     batch: Batch
     """The vehicles, their predictions, and which of them are sent a plan."""
     figures: Figures
-    """Costs of the plans; shape (n,)."""
     planned: Array
     """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
     verdict: Verdict
-    """Result of the trigger."""
     event: Flags
     """Whether each vehicle is sent its plan; shape (n,)."""
     solve_ns: int
@@ -93,11 +90,7 @@ class Controller:
     """The paper's algorithms on the server, for up to `capacity` vehicles.
 
     Args:
-        scenario: scenario of the flight.
-        terms: its terms.
-        capacity: largest number of vehicles.
-        clock: clock map, which knows the delays of each vehicle.
-        stopwatch: measures the parts; the core has no clock of its own.
+        stopwatch: measures the parts of a step; the core has no clock of its own.
         references: see `Desired`.
     """
 
@@ -117,13 +110,12 @@ class Controller:
         self._clock = clock
         most = committed_max(terms)
         self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
-        """Longest uplink delay with which a horizon can still be flown [ns]."""
+        """Longest uplink delay at which a horizon can still be flown [ns]."""
         if not terms.indexed:
-            self._uplink_max_ns = UNSEEN  # its first input is flown whenever it arrives
+            self._uplink_max_ns = UNSEEN  # the first input is flown whenever the horizon arrives
         self.desired = Desired(scenario, terms, capacity, block, references)
-        """Desired trajectories."""
         self.faults: list[str] = []
-        """Tracebacks of errors in plug-ins, one for the scheme and each policy, to be reported."""
+        """Tracebacks of the first error of each plug-in, to be reported."""
         fleet = Fleet(
             scenario,
             terms,
@@ -137,19 +129,16 @@ class Controller:
         )
         is_mission = scenario.is_mission and references is not None
         self.scheme = _mission(fleet) if is_mission else table.make(fleet)
-        """Scheme, which predicts, plans and encodes."""
         self.columns = control.properties.figures
-        """Figures of plans that are recorded."""
+        """Names of the recorded figures of plans."""
         self._terms, self._capacity, self._block = terms, capacity, block
         self._sent_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest horizon sent to each vehicle, or -1; shape (capacity,)."""
         self._heartbeat_due: Flags = np.zeros(capacity, dtype=np.bool_)
-        """Whether each vehicle is due a heartbeat at this tick unless a plan is sent; shape
-        (capacity,)."""
+        """Whether a heartbeat to each vehicle is due at this tick; shape (capacity,)."""
         self._heartbeats = False
-        """Whether any of them is due one."""
         self._able = np.zeros(capacity, dtype=np.bool_)
-        """Scratch array: which of the given vehicles are decided on; shape (capacity,)."""
+        """Scratch array for `able`; shape (capacity,)."""
         self._all, self._none = np.arange(block), np.arange(0)
         self.change_trigger(control)
         self._stopwatch = stopwatch
@@ -158,21 +147,19 @@ class Controller:
         self.observed_step = self.scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
-        """Why each vehicle got no plan, one of `Idle`; shape (capacity,)."""
+        """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
         self._takes = np.ones(capacity, dtype=np.bool_)
-        """Whether each vehicle accepts horizons, as it last reported; shape (capacity,)."""
+        """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
         self.budget = SharedBudget(shared, clock, capacity) if shared else None
-        """Byte budget of all vehicles; None if there is none."""
 
     @property
     def counts(self) -> Counter[str]:
-        """Events counted so far, by name."""
         return Counter({**self._counts, **self.scheme.counts})
 
     def change_trigger(self, control: ControlConfig) -> None:
-        """Use another trigger from the next step on; it has no memory of what was sent."""
+        """Use another trigger from the next step on; it starts without a memory of sent plans."""
         terms = self._terms
         self._trigger = make_trigger(control, self._capacity, self.faults.append)
         doubts = LOSS_CASES if self._trigger.doubts else 0
@@ -197,7 +184,6 @@ class Controller:
         )
 
     def forget(self, row: int) -> None:
-        """Reset the row for another vehicle, or for another run of its client."""
         self.last_step[row] = self._sent_step[row] = -1
         self.idle[row] = Idle.PLANS
         self._takes[row] = True
@@ -207,23 +193,21 @@ class Controller:
             self.budget.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """Keep an observation unless a newer one is known (E11); returns whether it was kept."""
+        """Store an observation unless a newer one is stored (E11); True if stored."""
         kept = self.scheme.observe(row, observation)
         if kept:
             self._takes[row] = bool(observation.takes)
         return kept
 
     def note_heartbeats(self, rows: list[int]) -> None:
-        """Set the vehicles that are due a heartbeat at this tick unless a plan is sent."""
+        """Set the vehicles to which a heartbeat is due at this tick unless a plan is sent."""
         if rows or self._heartbeats:
             self._heartbeat_due[:] = False
             self._heartbeat_due[rows] = True
             self._heartbeats = bool(rows)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
-        """Vehicles to decide on, and their steps: those with a new step and no reason to be
-        idle.
-        """
+        """Vehicles with a new step and no reason to be idle, and their steps."""
         n, able = len(rows), self._able
         if n == _able(
             rows,
@@ -244,7 +228,6 @@ class Controller:
 
         Args:
             rows: vehicles returned by `able`, no more than BLOCK; shape (n,).
-            step: step k of each; shape (n,).
 
         Source: algorithms 1, 2.
         """
@@ -308,7 +291,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `able`, and `idle` of vehicles whose step is new; returns how many are able."""
+    """Fill in `able`, and `idle` of vehicles with a new step; returns the number of the able."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
@@ -319,7 +302,7 @@ def _able(
         if step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # Its horizon would be over, or refused as too late, on arrival.
+            # The horizon would have ended, or would be refused as too late, on arrival.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]
@@ -341,8 +324,8 @@ def _withhold(
 ) -> tuple[int, int]:
     """Cancel events whose plan cannot be used, with the reason in `idle`, and set `last_step`.
 
-    A plan is not sent if it would begin when its observation is too old, or if its vehicle had not
-    yet said that it accepts horizons.
+    A plan is not sent if it would begin when its observation is too old, or if its vehicle does not
+    accept horizons.
 
     Returns:
         number of vehicles without a solution, and of remaining events.
@@ -365,7 +348,6 @@ def _withhold(
 
 @kernel
 def _note_sent(rows: I1, steps: I1, event: B1, sent_step: I1) -> None:
-    """Set the step at which vehicles were last sent a horizon."""
     for i in range(len(rows)):
         if event[i]:
             sent_step[rows[i]] = steps[i]

@@ -39,24 +39,17 @@ TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
 TRIGGER = keys_of(InFlight.TRIGGER)
-"""Keys of the trigger."""
 ZONES = keys_of(InFlight.ZONES)
-"""Keys of forbidden zones on a mission."""
 GOALS = keys_of(InFlight.GOALS)
-"""Keys of a mission's goals."""
 POINT = keys_of(InFlight.POINT)
-"""Keys of a point that an operator moves."""
 
 
 class Server(Endpoint):
     """Plans for every vehicle that asks.
 
     Args:
-        scenario: scenario of the flights.
         boot_id: number unique to this run of the server.
         entropy: returns this many random bytes.
-        gate: authenticates senders.
-        capacity: largest number of vehicles at once.
         recorder: receives one row per tick and vehicle.
         plans: receives one row per horizon sent, see `shared.telemetry.record.plan_columns`.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
@@ -109,7 +102,6 @@ class Server(Endpoint):
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
             keeps_rows=scenario.is_mission,
         )
-        """Sessions of the vehicles that fly."""
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
@@ -138,15 +130,13 @@ class Server(Endpoint):
         """Time of the next search for silent vehicles."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Reception.hear`."""
         self._reception.hear(datagram, now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time of the next tick, while there is a vehicle to plan for."""
+        """Time of the next tick; None without a vehicle in session."""
         return self._grid.due_ns
 
     def wake(self, *, now_ns: int) -> None:
-        """Run the tick that is due; missed ticks are only counted."""
         tick_ns = self._grid.next_tick(now_ns)
         if tick_ns is None:
             return
@@ -162,15 +152,12 @@ class Server(Endpoint):
             self._grid.rest()
 
     def close(self, *, now_ns: int) -> None:  # noqa: ARG002 - see `Endpoint`
-        """Tell every vehicle that the server ends."""
         for _ in range(CLOSES):
             for session in self.sessions:
                 self._out += session.sealed(encode(Close(session.vehicle, session.number)))
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; it improves the clock offsets of vehicles that also report the time of
-        day.
-        """
+        """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
         self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
@@ -194,23 +181,17 @@ class Server(Endpoint):
 
     @property
     def missed(self) -> int:
-        """Number of missed ticks."""
         return self._grid.missed
 
     @property
     def dropped(self) -> Counter[Drop]:
-        """Number of dropped datagrams by reason."""
         return self._reception.dropped
 
     @property
     def refused(self) -> Counter[Refusal]:
-        """Number of refused HELLOs by reason."""
         return self._reception.refused
 
     def _of_vehicle(self, row: int) -> dict[str, Any]:
-        """Figures of one vehicle; on a mission also what it waits for, and the effect of its
-        clock error.
-        """
         bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
         vehicle_figures = {
             "step": int(self.controller.last_step[row]),
@@ -224,7 +205,6 @@ class Server(Endpoint):
         }
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         ticks = self._ticker.durations
         shown = self.sessions.first(VEHICLES_TOLD_MAX)
         vehicle_figures = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}

@@ -1,4 +1,4 @@
-"""The server's side of the link: who sent a datagram, and how to answer.
+"""The server's side of the link: authenticates the sender of a datagram, and encodes answers.
 
 `PlainGate` accepts everybody. `server.secure` decrypts packets with the vehicles' keys.
 """
@@ -19,14 +19,12 @@ class GateCall(NamedTuple):
     """A message and its sender."""
 
     payload: bytes
-    """The message."""
     vehicle: int | None
     """Number of the vehicle whose key encrypted it; None without keys."""
     line: ReplyPath
-    """Encoder of the answers to it."""
+    """Encoder of the answers to the sender."""
     moves: bool
-    """Whether it is the newest packet of the vehicle, which may then change the vehicle's
-    address."""
+    """Whether this is the vehicle's newest packet, which sets the vehicle's address."""
 
 
 class Gate(Protocol):
@@ -43,34 +41,27 @@ class Gate(Protocol):
         """
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
-        """Accept the vehicle whose HELLO is in this call: its further packets are opened."""
+        """Accept the sender of this HELLO: its further packets are opened."""
 
     def outbox(self) -> list[Datagram]:
         """Datagrams of the gate itself; each is returned once."""
 
 
 class PlainGate:
-    """Gate without keys: accepts everybody."""
-
     secure = False
 
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - as of any `Gate`
-        """See `Gate`."""
         return GateCall(datagram.payload, None, _PLAIN_REPLY, moves=True)
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
         """See `Gate`."""
 
     def outbox(self) -> list[Datagram]:
-        """See `Gate`."""
         return []
 
 
 class _PlainReply:
-    """Encoder without encryption."""
-
     def seal(self, payload: bytes) -> bytes:
-        """See `ReplyPath`."""
         return payload
 
 

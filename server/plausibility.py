@@ -1,4 +1,4 @@
-"""Plausibility check of observations: a well-formed one in an open session may still be impossible.
+"""Plausibility check of observations: rejects well-formed observations that cannot be true.
 
 Each is compared with the vehicle's last accepted observation:
 
@@ -6,9 +6,9 @@ Each is compared with the vehicle's last accepted observation:
     horizon   the horizon in force, and since when, must advance with time and not beyond it
     jump      position and velocity have changed by no more than a vehicle can fly
 
-An observation that fails is dropped and counted. The earlier ones may be wrong instead: REPEATS
-observations in a row that are consistent with each other are accepted, and the vehicle's data are
-reset.
+An observation that fails is dropped and counted. If the last accepted observation was the wrong
+one, REPEATS observations in a row that are consistent with each other are accepted, and the
+vehicle's data are reset.
 """
 
 from enum import IntEnum
@@ -25,7 +25,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import NO_HORIZON, Observation
 
 REPEATS = 3
-"""Number of consistent observations in a row that are accepted against the earlier ones."""
+"""Number of consistent rejected observations in a row that replace the accepted observation."""
 SLACK_NS = 50 * MILLISECOND_NS
 """Time by which drifting clocks may shorten a measured round trip [ns]."""
 
@@ -34,18 +34,16 @@ class Statement:
     """Numpy record: an observation without its state."""
 
     step: int
-    """Step of the observation, or -1 if there is none."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
-    """First step flown with that horizon."""
+    """First step flown with the horizon in force."""
     forward: int
     """F of `server.common.clock` [ns]."""
     backward: int
     """G of `server.common.clock` [ns]."""
     count: int
-    """Number of rejected observations in a row that are consistent, including this one; 0 for an
-    accepted one."""
+    """Number of consistent rejected observations in a row, this one included; 0 if accepted."""
 
 
 STATEMENT = record(Statement)
@@ -53,8 +51,6 @@ position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.veloci
 
 
 class Belief(IntEnum):
-    """Result of the check of an observation."""
-
     ANEW = -1
     """Accepted, and the earlier observations are discarded."""
     BELIEVED = 0
@@ -64,22 +60,17 @@ class Belief(IntEnum):
 
 
 LAST, DOUBTED, NEW = 0, 1, 2
-"""Index of a vehicle's observations: last accepted, last rejected, and the one to be judged."""
+"""Index of a vehicle's observations: last accepted, last rejected, and new."""
 
 
 class HeardNumbers(NamedTuple):
-    """Newest observations of the vehicles."""
-
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
-    """Last accepted, last rejected and new observation of each vehicle, at the indices LAST,
-    DOUBTED and NEW; shape (3, capacity)."""
+    """Last accepted, last rejected and new observation of each vehicle; shape (3, capacity)."""
     states: F4
     """Positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
 
 
 class Plausibility:
-    """Checks the observations of up to `capacity` vehicles."""
-
     def __init__(self, terms: Terms, capacity: int) -> None:
         self._observed = HeardNumbers(
             numbers=np.zeros((3, capacity), dtype=STATEMENT),
@@ -92,19 +83,13 @@ class Plausibility:
             self.forget(row)
 
     def forget(self, row: int) -> None:
-        """Reset the row for another vehicle, or for another run of its client."""
         self._observed.numbers["step"][:, row] = -1
 
     def judge(self, row: int, observation: Observation, F: int, G: int) -> int:
-        """Result of the check of an observation.
+        """Check an observation; returns a `Belief`.
 
         Args:
-            row: row of the vehicle.
-            observation: the observation.
             F, G: of the observation and its echo, see `server.common.clock` [ns].
-
-        Returns:
-            a `Belief`.
         """
         message = observation
         return _judge(
@@ -123,7 +108,6 @@ class Plausibility:
 
 
 ANEW, BELIEVED, CLOCK, HORIZON, JUMP = map(int, Belief)
-"""Members of `Belief` as plain numbers, for kernels."""
 
 
 @part
@@ -151,11 +135,9 @@ def _against(
 
 @part
 def _jumps(observed: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
-    """Whether no vehicle can get from the state of another observation to the new one in time.
+    """Whether no vehicle can get from the state of another observation to the new state in time.
 
     Args:
-        observed: observations of the vehicles.
-        row: row of the vehicle.
         which: index of the other observation.
         time: time between the two [s].
         noise_m: change of position that noise may cause [m].
@@ -183,7 +165,6 @@ def _judge(
     dt: float,
     noise_m: float,
 ) -> int:
-    """Judge a new observation and store it with those of its vehicle."""
     numbers, place = observed.numbers, LAST
     new = numbers[NEW, row]
     new.step, new.in_force, new.since = step, in_force, since

@@ -1,9 +1,9 @@
 """Rate control: the rate at which the server sends, from the queueing delay of its packets.
 
-A shared radio channel carries so many bytes a second; what is more has to queue. Every echo reports
-the delay G of a packet; its excess over the vehicle's smallest G in 20 s (`server.common.clock`) is
-jitter and queue. A standing queue delays all packets, jitter only some. With the low quantile Q and
-the median M of this excess over an epoch,
+A shared radio channel carries a limited number of bytes a second; further bytes have to queue.
+Every echo reports the delay G of a packet; its excess over the vehicle's smallest G in 20 s
+(`server.common.clock`) is jitter and queue. A standing queue delays all packets, jitter only some.
+With the low quantile Q and the median M of this excess over an epoch,
 
     q = Q - min Q of the last BASE epochs        queueing delay
     s = TARGET_S + M - Q                         largest delay not certainly due to a queue
@@ -11,13 +11,13 @@ the median M of this excess over an epoch,
 and with the rate r, and b bytes a second sent in the epoch,
 
     r ← CUT p,  p = b / (1 + Δq / Δt)     if q > s, and q does not fall by itself
-    r ← p (1 + (1 - CUT) (t / K - 1)³)    if q ≤ LOW s, something had to wait, b > USED r
+    r ← p (1 + (1 - CUT) (t / K - 1)³)    if q ≤ LOW s, a packet had to wait, b > USED r
 
-If a queue grows by Δq in an epoch of Δt, correspondingly less passes than is sent: p, with the b of
-the previous epoch, whose packets the echoes report. After a cut, r returns to p after the time K,
-is flattest there, and then rises ever faster (the window of CUBIC, RFC 9438); t is the time for
-which it has risen. Until q first exceeds s, r ← r FIRST_GAIN. While rising, r never falls below b.
-The epochs just after a cut concern packets sent before it and change nothing.
+If a queue grows by Δq in an epoch of Δt, the channel passes correspondingly less than is sent: p,
+with the b of the previous epoch, whose packets the echoes report. After a cut, r returns to p after
+the time K, is flattest there, and then rises ever faster (the window of CUBIC, RFC 9438); t is the
+time for which it has risen. Until q first exceeds s, r ← r FIRST_GAIN. While rising, r never falls
+below b. The epochs just after a cut concern packets sent before it and change nothing.
 
 Losses are not used. If they are random, a lower rate loses the same share and delivers less; if a
 queue overflows, the delay has grown before. A queue too short to delay by TARGET_S is not detected.
@@ -34,38 +34,30 @@ from skytether.shared.law.model import Array, Indices
 START, LEAST, MOST = 2_000.0, 500.0, 1e9
 """First, smallest and largest rate [B/s]."""
 EPOCH_NS, PATIENCE_NS = SECOND_NS // 2, 5 * SECOND_NS
-"""Shortest epoch, which also lasts at least a round trip, and time after which fewer echoes suffice
-[ns]."""
+"""Shortest epoch (at least a round trip), and time after which fewer echoes suffice [ns]."""
 SAMPLES = 5
 """Number of echoes needed for q."""
 QUANTILE = 0.2
 """Quantile of the echoes for Q: some may come from vehicles that never saw an empty queue."""
 BASE = 32
-"""Number of epochs over which the queue is assumed to have been empty once."""
+"""Number of epochs in which the queue is assumed to have been empty at least once."""
 TARGET_S, LOW = 0.05, 0.6
 """Accepted queueing delay [s], and the share of it up to which r rises."""
 FALLS = 0.7
 """If q has fallen to this share of the previous q, it counts as falling by itself."""
 USED = 0.8
-"""Share of r that must have been sent for r to rise: unused rate says nothing about the channel."""
+"""Share of r that must have been sent for r to rise: from unused rate no delay can be measured."""
 FIRST_GAIN = 1.25
 """Factor of a rise before the first cut."""
 K_S = 8.0
-"""Time for which r rises from a cut to the rate that was too large [s]."""
+"""Time in which r rises from a cut to the rate that was too large [s]."""
 IGNORED_EPOCHS = 2
-"""Number of epochs after a cut that still concern packets sent before it, reports included."""
+"""Number of epochs after a cut whose echoes still concern packets sent before it."""
 CUT = 0.85
-"""Share of the passing rate that is sent after a cut, so that the queue empties."""
+"""Share of p to which r is cut, so that the queue empties."""
 
 
 class RateControl:
-    """Rate that follows the queueing delay.
-
-    Args:
-        clock: has the echoes of up to `capacity` vehicles.
-        capacity: largest number of vehicles.
-    """
-
     def __init__(self, clock: ClockMap, capacity: int) -> None:
         self._seen = clock.seen
         self._echoes_used = np.zeros(capacity, dtype=np.int64)
@@ -75,18 +67,17 @@ class RateControl:
         self._began_ns: int | None = None
         self._spent = 0.0
         self._passes: float | None = None
-        """Rate that passed at the last cut, p [B/s]; None before the first."""
+        """Rate p that passed at the last cut [B/s]; None before the first cut."""
         self._risen_s, self._ignored_epochs = 0.0, 0
-        """Time t for which r has risen since then [s], and number of epochs still to be ignored."""
+        """Time t since which r has risen [s], and number of epochs still to be ignored."""
         self._low_s: deque[float] = deque(maxlen=BASE)
         """Q of the newest epochs [s]."""
         self._sent = 0.0
         """Rate sent in the previous epoch [B/s]."""
         self._trip_ns = 0
         self.needed = False
-        """Whether the rate made something wait in this epoch."""
+        """Whether a packet had to wait for the rate in this epoch."""
         self.bytes_per_s = START
-        """Present rate [B/s]."""
         self.queueing_s = 0.0
         """Queueing delay of the newest epoch [s]."""
 
@@ -95,8 +86,7 @@ class RateControl:
 
         Args:
             rows: vehicles in session; shape (n,).
-            spent_bytes: bytes sent since then [B].
-            now_ns: time now.
+            spent_bytes: bytes sent since the last update [B].
         """
         self._listen(rows)
         self._spent += spent_bytes
@@ -112,7 +102,6 @@ class RateControl:
         self._delays_s.clear()
 
     def _listen(self, rows: Indices) -> None:
-        """Collect the newest echo of each vehicle that has a new one."""
         heard = self._seen.vehicles["echoes"][rows]
         new = rows[heard != self._echoes_used[rows]]
         self._echoes_used[rows] = heard
@@ -125,9 +114,6 @@ class RateControl:
         self._trip_ns = int(np.median(least.sum(axis=1)))
 
     def _end(self, delays_s: Array, sent: float, passed_ns: int) -> None:
-        """End an epoch of length `passed_ns` [ns] in which `sent` bytes a second were sent
-        [B/s].
-        """
         low, middle = np.quantile(delays_s, (QUANTILE, 0.5)).tolist()
         self._low_s.append(low)
         before, q, most = self.queueing_s, low - min(self._low_s), TARGET_S + middle - low
@@ -146,7 +132,6 @@ class RateControl:
             self.bytes_per_s = min(max(self.bytes_per_s, sent, self._risen()), MOST)
 
     def _risen(self) -> float:
-        """Rate after a rise [B/s]."""
         if self._passes is None:
             return self.bytes_per_s * FIRST_GAIN
         return self._passes * (1.0 + (1.0 - CUT) * (self._risen_s / K_S - 1.0) ** 3)

@@ -1,7 +1,7 @@
 """The server's side of the conversation: receives messages, checks and answers them.
 
 HELLO is answered by a WELCOME or a refusal, OBSERVATION is checked and passed to the controller,
-CLOSE ends a session, and TIME says what a vehicle's time of day is. Everything else is dropped and
+CLOSE ends a session, and TIME reports a vehicle's time of day. Other messages are dropped and
 counted by reason.
 """
 
@@ -47,7 +47,7 @@ from skytether.shared.wire.protocol import (
 )
 
 REFUSALS_REPORTED = 64
-"""Number of newest refusals remembered, so that repeated HELLOs are not reported again."""
+"""Number of stored refusals; a repeated HELLO is not reported again."""
 REPORT_NS = 10 * SECOND_NS
 """Interval between reports of unauthenticated datagrams [ns]."""
 IMPLAUSIBLE: dict[int, Drop] = {
@@ -55,28 +55,21 @@ IMPLAUSIBLE: dict[int, Drop] = {
     Belief.HORIZON: Drop.IMPLAUSIBLE_HORIZON,
     Belief.JUMP: Drop.IMPLAUSIBLE_JUMP,
 }
-"""Why an implausible observation is dropped."""
 
 CONTRADICTED = {
-    Contradiction.CLOCK: "a clock was set, or runs wrong: it is measured anew",
-    Contradiction.ASYMMETRY: "link.asymmetry_s does not hold: not believed any more",
-    Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: all times count that may be",
+    Contradiction.CLOCK: "a clock was set, or runs wrong: the offset is estimated anew",
+    Contradiction.ASYMMETRY: "delays each way differ by more than link.asymmetry_s: it is ignored",
+    Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: it is not relied on any more",
 }
-"""Contradictions in what is known of a vehicle's clock, in words."""
+"""Contradictions of the clock estimate, in words for the operator."""
 
 
 class Reception:
     """Receives messages of vehicles.
 
     Args:
-        terms: terms agreed with every vehicle.
         boot_id: number unique to this run of the server.
-        gate: authenticates senders.
-        sessions: sessions of the vehicles.
-        clock: clock map, updated by observations.
-        controller: receives the accepted observations.
         grid: ticks, started by an observation.
-        stopwatch: measures the parts of the work.
         out: list to which answers are appended.
         events: list to which events for the operator are appended.
     """
@@ -109,24 +102,16 @@ class Reception:
         self.observations = 0
         """Number of accepted observations, in any order of arrival."""
         self.dropped: Counter[Drop] = Counter()
-        """Number of dropped datagrams by reason."""
         self.refused: Counter[Refusal] = Counter()
-        """Number of refused HELLOs by reason."""
         self.time: TimeOfDay | None = None
         """Time of day; None if the host does not know it."""
         self._reported: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_REPORTED)
         """Vehicle, boot id and refusal of the newest reported refusals."""
         self._unauthenticated = 0
-        """Number of datagrams refused by the gate."""
         self._report_ns = 0
-        """Time from which these may be reported again."""
+        """Earliest time of the next report of unauthenticated datagrams."""
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
-        """Process a datagram: HELLO opens a session, OBSERVATION feeds it, CLOSE ends it.
-
-        Returns:
-            Why it was dropped; None if it was not.
-        """
         self._stopwatch.start()
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
@@ -154,7 +139,7 @@ class Reception:
         """Process one message.
 
         Raises:
-            ProtocolError: it is not a vehicle's message, or claims another vehicle's number.
+            ProtocolError: it is not a vehicle's message, or contains another vehicle's number.
         """
         message = decode(call.payload, self._terms)
         self._stopwatch.lap("decode")
@@ -195,7 +180,7 @@ class Reception:
             self._gate.admit(call, now_ns=now_ns)
 
     def _refusal(self, hello: Hello, address: Address, now_ns: int) -> Refusal:
-        """Why a HELLO is refused, or ACCEPTED; reported once per run of the client and reason."""
+        """Reason why a HELLO is refused, or ACCEPTED; reported once per boot id and reason."""
         vehicle, (host, port) = hello.vehicle, address
         event: Event
         if hello.terms != self._terms:
@@ -257,17 +242,14 @@ class Reception:
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:
-        """Narrow the bounds of a vehicle's clock offset by the time of day that it has sent.
-
-        Needs a time of day on this host as well.
-        """
+        """Narrow the bounds of a clock offset by the vehicle's time of day, if known here too."""
         session = self._sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return
-        # The stamp is ambiguous: choose the time closest to what the delays suggest. The clocks
+        # The stamp is ambiguous: choose the time closest to the estimate from delays. The clocks
         # have drifted apart since it was sent.
         offset_ns, bound_ns = self._clock.middle_ns(session.row, now_ns)
         ahead_ns = self.time.ahead_ns
@@ -278,16 +260,14 @@ class Reception:
         self._report_clock(session.vehicle, found)
 
     def _report_clock(self, vehicle: int, found: Contradiction) -> None:
-        """Report what a message contradicts of a vehicle's known clock offset."""
         if found is not Contradiction.NOTHING:
             what = CONTRADICTED[found]
             self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
     def _anew(self, row: int, life: tuple[int, int] | None) -> None:
-        """Forget everything known of a vehicle except its session.
+        """Forget everything about a vehicle except its session.
 
         Args:
-            row: row of the vehicle.
             life: its number and boot id, if its clock may be the same as before.
         """
         self._clock.forget(row, life)
@@ -295,7 +275,6 @@ class Reception:
         self._sessions.idle[row] = Idle.PLANS
 
     def _begin(self, observation: Observation, call: GateCall, now_ns: int) -> Session:
-        """Open the session of a first observation."""
         session = self._sessions.begin(observation, now_ns)
         session.line = call.line
         self._plausibility.forget(session.row)

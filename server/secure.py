@@ -3,8 +3,8 @@
 A HELLO is answered in two steps. Without a valid cookie for the sender's address, the server
 answers with a CHALLENGE that contains one, and stores nothing. With the cookie, it answers with a
 RESPONSE that contains the WELCOME and a new channel. That channel is pending until the vehicle's
-first packet in it; only then does it replace the live one. So a recorded HELLO that somebody
-repeats ends no flight.
+first packet in it; only then does it replace the live channel. So an attacker who replays a
+recorded HELLO cannot end a flight.
 """
 
 import hashlib
@@ -37,12 +37,13 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 COOKIE_NS = 60 * SECOND_NS
 """Period of the cookies; each is valid in its period and the next [ns]."""
 HANDSHAKES = 5
-"""Number of attempts of a vehicle per second, and of answers to repeats of one."""
+"""Number of handshake attempts of a vehicle per second, and of answers to repeats of an attempt."""
 PENDING_MAX = 64
-"""Number of pending channels of a vehicle. It uses the first one that reaches it, and up to a round
-trip of 12 s this limit is not exceeded, even if somebody repeats its HELLOs (five a second)."""
+"""Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
+Up to a round trip of 12 s this limit is not exceeded, even if an attacker replays its HELLOs (five
+a second)."""
 COMPLETED_MAX = 16
-"""Number of a vehicle's newest completed attempts, which are not answered any more."""
+"""Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
 """Number of the gate's answers waiting to be sent; the oldest are dropped."""
 
@@ -52,9 +53,9 @@ class _Pending(NamedTuple):
 
     channel: Channel
     public: bytes
-    """Ephemeral key of its attempt."""
+    """Ephemeral key of the handshake attempt."""
     response: bytes
-    """RESPONSE that created it."""
+    """RESPONSE that created the channel."""
 
 
 FORMS = (
@@ -63,25 +64,21 @@ FORMS = (
     Form(bytes((0x92 + len(Hello._fields),)), 1, PAYLOAD_BYTES_MAX),
 )
 """Formats of vehicles' datagrams: packets of a channel, and INITIATIONs. A plaintext HELLO (an
-array of msgpack) is dropped, but admitted so that it can be reported."""
+array of msgpack) passes this filter too, so that it can be reported when it is dropped."""
 
 
 class _HandshakeRate:
-    """Rate limit of handshakes.
-
-    Args:
-        now_ns: time now; the whole second's share is available.
-    """
+    """Rate limit of handshakes, HANDSHAKES per second."""
 
     __slots__ = ("_granted_ns",)
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Time up to which shares of a second have been granted [ns]."""
+        """Virtual time of the rate limit, which each handshake advances by 1 / HANDSHAKES [ns]."""
 
     def grant(self, now_ns: int) -> bool:
-        """Whether one more is granted."""
-        # A bucket of one second: what was not used earlier is lost.
+        """Whether another handshake is granted."""
+        # Unused handshakes are saved up for one second at most.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False
@@ -90,8 +87,6 @@ class _HandshakeRate:
 
 
 class _KeyedVehicle:
-    """Channels and attempts of one vehicle."""
-
     __slots__ = ("attempts", "completed", "live", "pending", "previous", "repeats")
 
     def __init__(self, now_ns: int) -> None:
@@ -102,14 +97,13 @@ class _KeyedVehicle:
         self.live: Channel | None = None
         """Channel in which the vehicle sends."""
         self.previous: Channel | None = None
-        """Channel in which it sent before."""
+        """Channel in which the vehicle sent before the live channel."""
         self.pending: dict[int, _Pending] = {}
         """Pending channels by number, oldest first."""
         self.completed: deque[bytes] = deque(maxlen=COMPLETED_MAX)
         """Ephemeral keys of the newest completed attempts."""
 
     def find(self, number: int) -> Channel | None:
-        """Channel with a number; None if there is none."""
         for open_channel in (self.live, self.previous):
             if open_channel is not None and open_channel.number == number:
                 return open_channel
@@ -123,20 +117,19 @@ class _KeyedVehicle:
         return None if newest is None else newest.response
 
     def add(self, pending: _Pending) -> None:
-        """Add a pending channel; the oldest is dropped if there are too many."""
         self.pending[pending.channel.number] = pending
         if len(self.pending) > PENDING_MAX:
             del self.pending[next(iter(self.pending))]
 
     def promote(self, number: int, now_ns: int) -> None:
-        """Make a pending channel the live one, and drop those that were pending before it."""
+        """Make a pending channel the live one, and drop the channels pending before it."""
         channel, public, _ = self.pending[number]
         self.completed.append(public)
         for older in list(self.pending):
             del self.pending[older]
             if older == number:
                 break
-        # Both are opened for a while: packets of the old channel are still on their way.
+        # Packets of the previous channel are opened for a while: some are still on their way.
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
         self.previous, self.live = self.live, channel
@@ -152,7 +145,7 @@ class _Answer:
         self._now_ns = now_ns
         self.key = key
         self.pending: _Pending | None = None
-        """Channel created by the answer; each answer creates another one."""
+        """Channel created by the answer; each answer creates another channel."""
 
     def seal(self, payload: bytes) -> bytes:
         """Datagram that carries a WELCOME.
@@ -212,7 +205,6 @@ class SecureGate:
         self._vehicles[answer.key.vehicle].add(answer.pending)
 
     def outbox(self) -> list[Datagram]:
-        """See `Gate`."""
         out = list(self._out)
         self._out.clear()
         return out
@@ -242,8 +234,8 @@ class SecureGate:
         """HELLO of an INITIATION with a valid cookie; otherwise answers with a CHALLENGE.
 
         Repeats of an attempt get new answers while the rate limit grants them, and then the
-        previous one: somebody who repeats a vehicle's packets cannot use up the answers that it
-        needs.
+        previous answer: so an attacker who replays a vehicle's packets cannot use up the answers
+        that the vehicle needs.
         """
         packet, peer = datagram.payload, datagram.peer
         vehicle, number = handshake.address(packet)
@@ -281,14 +273,12 @@ class SecureGate:
         return GateCall(hello, vehicle, _Answer(self, key, noise, now_ns), moves=False)
 
     def _is_valid(self, cookie: bytes, peer: Address, now_ns: int) -> bool:
-        """Whether a cookie is valid for the sender now."""
         time = now_ns // COOKIE_NS
         return any(
             hmac.compare_digest(cookie, self._cookie(peer, period)) for period in (time, time - 1)
         )
 
     def _cookie(self, peer: Address, period: int) -> bytes:
-        """Cookie for an address in a period of COOKIE_NS."""
         host, port = peer
         # Computed for each comparison and never stored: any number of unknown senders costs no
         # memory.

@@ -1,10 +1,10 @@
 """Sessions of vehicles; each has a row in every array of the server.
 
 A vehicle is welcomed when it sends HELLO, and gets its row with its first observation; until then
-the session of an earlier run of its client continues. One row is kept free for each welcomed
-vehicle without a row, but no longer than WELCOME_NS if another vehicle needs it. While one run of a
-client is heard, no other run gets its number: that would be another vehicle. Free rows are reused,
-lowest first, so that the rows in use are contiguous.
+the session of an earlier run of its client continues. A row is kept free for each welcomed vehicle
+without a row, but no longer than WELCOME_NS if another vehicle needs it. While observations of one
+run of a client arrive, no other run gets its vehicle number: that would be another vehicle. Free
+rows are reused, lowest first, so that the rows in use are contiguous.
 """
 
 from collections import OrderedDict
@@ -24,8 +24,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation, Time
 
 WELCOME_NS = 5 * SECOND_NS
-"""Time after its last HELLO for which a welcomed vehicle keeps its place without an observation
-[ns]."""
+"""Time after the last HELLO for which a row is kept for a vehicle without an observation [ns]."""
 
 
 @dataclass(slots=True)
@@ -33,42 +32,40 @@ class Session:
     """Session of one run of a vehicle's client."""
 
     vehicle: int
-    """Number of the vehicle."""
     number: int
     """Number of the session, contained in every message."""
     boot_id: int
     """Number of this run of the client."""
     home: Address
-    """Address of its newest HELLO, at which it has been shown to receive."""
+    """Source address of the newest HELLO; a cookie has shown that the client receives there."""
     address: Address
-    """Address of its newest observation."""
+    """Source address of the newest observation."""
     line: ReplyPath
-    """Encoder of packets to it."""
+    """Encoder of packets to the vehicle."""
     hearing: Hearing
-    """Longest silence to ask of it."""
+    """Longest silence that the server asks of the vehicle."""
     row: int = -1
     """Row of the vehicle in every array; -1 until its first observation."""
     heard_ns: int = 0
-    """Time of the newest packet from it."""
+    """Time of the newest packet from the vehicle."""
     sent_ns: int = 0
-    """Time of the newest packet to it."""
+    """Time of the newest packet to the vehicle."""
     doubted: bool = False
-    """Whether its newest observation was rejected."""
+    """Whether the newest observation was rejected."""
     stale: int = 0
     """Number of observations that arrived after a newer one."""
     asked_ns: int = 0
-    """Longest silence that it asks of us [ns]; 0 for no bound."""
+    """Longest silence that the vehicle asks of the server [ns]; 0 for no bound."""
     sent: int = 0
     """Number of packets sent in the session, modulo NUMBERS."""
 
     def number_next(self, now_ns: int) -> int:
-        """Number of a packet that is sent now."""
         number = self.sent
         self.sent, self.sent_ns = (number + 1) % NUMBERS, now_ns
         return number
 
     def is_heartbeat_due(self, now_ns: int) -> bool:
-        """Whether nothing was sent for as long as the vehicle allows."""
+        """Whether the longest silence that the vehicle allows has passed since the last packet."""
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
     def sealed(self, payload: bytes) -> Sequence[Datagram]:
@@ -88,12 +85,11 @@ class Sessions:
     """Sessions of one run of the server.
 
     Args:
-        capacity: largest number of vehicles at once.
         entropy: returns this many random bytes, for the numbers of sessions.
         silence_ns: time after which a silent vehicle may count as gone [ns].
         hearing: makes a `Hearing` for each session.
         keeps_rows: whether a row stays reserved for its vehicle after its session. On a mission the
-            others have to keep clear of a vehicle that is not heard any more.
+            other vehicles keep away from a vehicle that has fallen silent.
     """
 
     def __init__(
@@ -111,8 +107,7 @@ class Sessions:
         self._live: dict[int, Session] = {}
         """Sessions by vehicle."""
         self.welcomed_vehicles: OrderedDict[int, Session] = OrderedDict()
-        """Welcomed vehicles without a row, oldest HELLO first; never more than there are free
-        rows."""
+        """Welcomed vehicles without a row, oldest HELLO first; at most one for each free row."""
         self._successors: dict[int, Session] = {}
         """New runs of vehicles that have a row, until their first observation, by vehicle."""
         self._by_row: dict[int, Session] = {}
@@ -126,7 +121,7 @@ class Sessions:
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
-        """Why no plan is made for the vehicle in each row, as last reported; shape (capacity,)."""
+        """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 
     def __len__(self) -> int:
         return len(self._live)
@@ -135,22 +130,19 @@ class Sessions:
         return iter(self._live.values())
 
     def first(self, count: int) -> list[Session]:
-        """The first sessions, at most `count`."""
         return list(islice(self, count))
 
     def heartbeats_due(self, now_ns: int) -> list[Session]:
-        """Sessions that are due a heartbeat, see `is_heartbeat_due`."""
         return [session for session in self._live.values() if session.is_heartbeat_due(now_ns)]
 
     def at(self, row: int) -> Session:
-        """Session of the vehicle in a row."""
         return self._by_row[row]
 
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
-        """Session of another run that holds the vehicle's number, so that this HELLO must wait.
+        """Session of another run that holds the vehicle's number, so that this HELLO is refused.
 
-        It is the live one as long as it is heard; otherwise a welcomed one that may still send its
-        first observation.
+        It is the live session while its packets arrive; otherwise a welcomed session whose first
+        observation may still come.
         """
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
@@ -163,14 +155,14 @@ class Sessions:
         return welcomed if _is_expected(welcomed, now_ns) else None
 
     def row_of_other_life(self, hello: Hello) -> int | None:
-        """Row of the vehicle that sends this HELLO, if it belongs to another run of its client."""
+        """Row of the HELLO's vehicle, if the row belongs to another run of its client."""
         live = self._live.get(hello.vehicle)
         if live is None:
             return self._reserved.get(hello.vehicle)
         return None if live.boot_id == hello.boot_id else live.row
 
     def is_full(self, hello: Hello, now_ns: int) -> bool:
-        """Whether there is no place for the vehicle that sends this HELLO."""
+        """Whether there is no row for the vehicle that sends this HELLO."""
         has_place = self._has_row(hello.vehicle) or hello.vehicle in self.welcomed_vehicles
         if has_place or len(self.welcomed_vehicles) < len(self._free_rows):
             return False
@@ -178,10 +170,7 @@ class Sessions:
         return oldest is None or _is_expected(oldest, now_ns)
 
     def welcome(self, hello: Hello, address: Address, line: ReplyPath, now_ns: int) -> Session:
-        """Session for the sender of a HELLO, a new one or its present one.
-
-        There must be a place for it, if only that of a welcomed vehicle that has not come.
-        """
+        """Session of the sender of a HELLO, present or new; `is_full` must be False."""
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
             live.home = address
@@ -192,7 +181,8 @@ class Sessions:
             number, hearing = self._number(), self._hearing()
             session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
         session.home, session.heard_ns = address, now_ns
-        # The oldest one loses its place: `is_full` has found that it is not expected any more.
+        # The oldest welcomed vehicle loses its row: `is_full` has found that it is not expected any
+        # more.
         if waiting is self.welcomed_vehicles and len(waiting) == len(self._free_rows):
             self.welcomed_vehicles.popitem(last=False)
         waiting[hello.vehicle] = session
@@ -204,19 +194,15 @@ class Sessions:
         return int.from_bytes(self._entropy(4)) | 2**31
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
-        """Dictionary in which a welcomed session of a vehicle is kept."""
         return self._successors if self._has_row(vehicle) else self.welcomed_vehicles
 
     def _has_row(self, vehicle: int) -> bool:
-        """Whether a vehicle has a row."""
         return vehicle in self._live or vehicle in self._reserved
 
     def _is_heard(self, live: Session, now_ns: int) -> bool:
-        """Whether a vehicle in session has been heard recently."""
         return now_ns - live.heard_ns <= self._silence_ns
 
     def find(self, message: Observation | Time) -> Session | None:
-        """Live session that a message belongs to; None if there is none."""
         session = self._live.get(message.vehicle)
         return session if session and session.number == message.session else None
 
@@ -224,7 +210,7 @@ class Sessions:
         """Welcomed session of a first observation, now live.
 
         Raises:
-            ProtocolError: there is none, or an earlier run of the client is heard again.
+            ProtocolError: no such session, or packets of an earlier run of the client arrive again.
         """
         before = self._live.get(observation.vehicle)
         waiting = self._waiting(observation.vehicle)
@@ -252,7 +238,7 @@ class Sessions:
         """End the live session of a vehicle.
 
         Raises:
-            ProtocolError: it has none with this number.
+            ProtocolError: it has no session with this number.
         """
         session = self._live.get(vehicle)
         if session is None or session.number != number:
@@ -260,7 +246,7 @@ class Sessions:
         self._forget(session)
 
     def expire(self, now_ns: int) -> list[Session]:
-        """Sessions that end now because their vehicles are silent."""
+        """End the sessions of silent vehicles, and return them."""
         gone = [each for each in self if now_ns - each.heard_ns > SESSION_NS]
         for session in gone:
             self._forget(session)
@@ -272,7 +258,7 @@ class Sessions:
             self._reserved[session.vehicle] = session.row
         else:
             heappush(self._free_rows, session.row)
-            # A new run that was waiting for the old one to fall silent takes the free place.
+            # A new run that was waiting for the old run to fall silent takes the free row.
             successor = self._successors.pop(session.vehicle, None)
             if successor is not None:
                 self.welcomed_vehicles[session.vehicle] = successor
@@ -283,5 +269,4 @@ class Sessions:
 
 
 def _is_expected(welcomed: Session, now_ns: int) -> bool:
-    """Whether the first observation of a welcomed vehicle may still come."""
     return now_ns - welcomed.heard_ns <= WELCOME_NS

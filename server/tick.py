@@ -1,7 +1,6 @@
 """The server's tick: the present step of each vehicle, its plan, packets and records.
 
-Ticks lie on a grid of Δt with absolute deadlines; a missed one is skipped and counted, never made
-up for.
+Ticks lie on a grid of Δt with absolute deadlines; a missed tick is skipped and counted.
 """
 
 from collections import deque
@@ -39,33 +38,24 @@ TICK_BIN_NS = MILLISECOND_NS // 20
 
 
 class Grid:
-    """Times of the ticks.
-
-    Args:
-        dt_ns: time from one tick to the next [ns].
-        events: list to which events for the operator are appended.
-    """
-
     def __init__(self, dt_ns: int, events: Events) -> None:
         self._dt_ns = dt_ns
         self._events = events
         self.due_ns: int | None = None
         """Time of the next tick; None while there is no vehicle to plan for."""
         self.missed = 0
-        """Number of missed ticks."""
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
-        """Times of the newest missed ticks."""
         self.degraded = False
         """Whether too many ticks are missed."""
 
     def arm(self, now_ns: int) -> None:
-        """Schedule the next tick, since there is a vehicle to plan for."""
         dt_ns = self._dt_ns
-        if self.due_ns is None or self.due_ns > now_ns + dt_ns:  # also if our clock was set back
-            self.due_ns = -(-now_ns // dt_ns) * dt_ns  # the next, or now
+        if (
+            self.due_ns is None or self.due_ns > now_ns + dt_ns
+        ):  # also if the server's clock was set back
+            self.due_ns = -(-now_ns // dt_ns) * dt_ns  # next multiple of Δt, or now
 
     def rest(self) -> None:
-        """Cancel the next tick."""
         self.due_ns = None
 
     def next_tick(self, now_ns: int) -> int | None:
@@ -73,7 +63,7 @@ class Grid:
         if self.due_ns is None or now_ns < self.due_ns:
             return None
         # Missed ticks are not made up for: plans for past steps are useless, and a burst of ticks
-        # would delay the next one too.
+        # would delay the next tick too.
         late = (now_ns - self.due_ns) // self._dt_ns
         self.missed += late
         self._note_missed(late, now_ns)
@@ -82,10 +72,9 @@ class Grid:
         return tick_ns
 
     def _note_missed(self, count: int, now_ns: int) -> None:
-        """Note missed ticks, and whether there are too many in a second."""
         if not (count or self.degraded):
             return
-        # An hour of suspension is many ticks, of which the deque keeps the newest few only.
+        # After an hour of suspension `count` is large; the deque keeps the newest few only.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
         if many != self.degraded:
@@ -94,19 +83,7 @@ class Grid:
 
 
 class Ticker:
-    """Decides for all vehicles in session, sends horizons and heartbeats, and records.
-
-    Args:
-        sessions: sessions of the vehicles.
-        clock: gives the step of each vehicle.
-        controller: plans and decides.
-        grid: times of the ticks.
-        stopwatch: measures the parts of a tick.
-        out: list to which datagrams are appended.
-        events: list to which events for the operator are appended.
-        recorder: receives one row per tick and vehicle.
-        plans: receives one row per horizon sent.
-    """
+    """Decides for all vehicles in session, sends horizons and heartbeats, and records."""
 
     def __init__(
         self,
@@ -137,7 +114,7 @@ class Ticker:
         """Run a tick: plan, send, and record.
 
         Args:
-            tick_ns: time at which it was due.
+            tick_ns: time at which the tick was due.
             now_ns: time now.
         """
         controller = self._controller
@@ -163,7 +140,7 @@ class Ticker:
         if controller.idle.tobytes() != self._sessions.idle.tobytes():
             self._report_idle()
         if controller.faults:
-            self._events += [Fault(traceback=said) for said in controller.faults]
+            self._events += [Fault(traceback=fault) for fault in controller.faults]
             controller.faults.clear()
         if left := controller.scheme.left_tube:
             self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
@@ -178,7 +155,6 @@ class Ticker:
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
     def _report_idle(self) -> None:
-        """Report for which vehicles planning has stopped or resumed."""
         idle = self._controller.idle
         for row in np.flatnonzero(idle != self._sessions.idle).tolist():
             self._sessions.idle[row] = idle[row]
@@ -202,7 +178,6 @@ class Ticker:
             self._send(sessions.at(row), payload, is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
-        """Send a heartbeat to each vehicle that was sent nothing at this tick."""
         for session in due:
             if session.is_heartbeat_due(now_ns):
                 idle = int(self._sessions.idle[session.row])

@@ -1,25 +1,25 @@
 """Clock map: present step of each vehicle, from the server's clock and the vehicle's time stamps.
 
-Neither clock is set; the vehicle's counts from its step 0. Every observation gives F = t2 - t1
-(sent by the vehicle, received here), and contains G = t4 - t3 (sent here, received aboard) of the
-newest packet from here. Over the last 20 s
+Neither clock is set; the vehicle's clock counts from its step 0. Every observation gives F = t2 -
+t1 (sent by the vehicle, received by the server), and contains G = t4 - t3 (sent by the server,
+received aboard) of the server's newest packet. Over the last 20 s
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
 of the vehicle's clock minus the server's. The asymmetry of the two smallest delays cannot be
 measured: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
 
-Beside this estimate there are two bounds that hold for any delays. A delay is never negative, so
-the true offset O is at least -F and at most G at the time of each sample, and changes by at most
-DRIFT of the elapsed time:
+Independently of this estimate there are two bounds that hold for any delays. A delay is never
+negative, so the true offset O is at least -F and at most G at the time of each sample, and changes
+by at most DRIFT of the elapsed time:
 
     max (-F - DRIFT age) ≤ O ≤ min (G + DRIFT age)
 
-over all samples, however old. They do not depend on the estimate.
+over all samples, however old.
 
-Other knowledge narrows these bounds: the operator's setting that the smallest delays of both
-directions differ by at most so much, and the time of day if both ends know it. It is checked
-against the bounds and against itself over time. What is contradicted is not used any more.
+Two settings narrow these bounds: the operator's bound on the difference of the smallest delays of
+the two directions, and the time of day if both ends know it. Each is checked against the bounds
+from delays and against its own earlier values, and is no longer used once it contradicts them.
 """
 
 from enum import IntEnum
@@ -37,20 +37,19 @@ from skytether.shared.law.model import Array, Indices
 BUCKET_NS = SECOND_NS // 2
 """Length of an interval for which minima are kept [ns]."""
 BUCKETS = 40
-"""Number of intervals for which minima are kept: 20 s."""
 RECENT = 3
-"""Number of intervals that count as recent when looking for a step of a clock; more, up to OLD, for
-a vehicle that reports so rarely that they hold fewer than STEP_SAMPLES."""
+"""Number of newest intervals that count as recent when looking for a step of a clock. If they hold
+fewer than STEP_SAMPLES, because a vehicle reports rarely, more are used, up to OLD."""
 OLD = 8
-"""Age in intervals from which on minima are old enough to compare recent ones with."""
+"""Age of the minima with which recent ones are compared [intervals]."""
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
-"""Smallest detected step of a clock: one direction's delay rises and the other's falls by about as
-much [ns]."""
+"""Smallest detected step of a clock [ns]: one direction's delay rises, the other's falls as much.
+"""
 
 ECHOES = 4
-"""Number of newest echoes kept per vehicle: the present delays of packets to it."""
+"""Number of newest echoes kept per vehicle, from which the present delay to it is estimated."""
 
 # The sum of two of them fits in an int64, so sums of minima need no check.
 UNSEEN = 2**61
@@ -58,7 +57,7 @@ UNSEEN = 2**61
 
 
 class Contradiction(IntEnum):
-    """What a sample contradicts of the known clock offset of a vehicle."""
+    """Knowledge of a clock offset that a sample contradicts."""
 
     NOTHING = 0
     CLOCK = 1
@@ -70,34 +69,33 @@ class Contradiction(IntEnum):
 
 
 NOTHING, CLOCK, ASYMMETRY, TIME_OF_DAY = map(int, Contradiction)
-"""Members of `Contradiction` as plain numbers, for kernels."""
 
 
 class VehicleClock:
-    """Numpy record: the clock of one vehicle."""
+    """Numpy record: clock of one vehicle."""
 
     newest: int
-    """Interval of its newest sample, counted from our clock's zero."""
+    """Interval of the newest sample, counted from zero of the server's clock."""
     heard: int
-    """`Observation.heard` of its newest observation; -1 before the first."""
+    """`Observation.heard` of the newest observation; -1 before the first."""
     echoes: int
-    """Number of our packets for which it has reported G."""
+    """Number of the server's packets for which the vehicle has reported G."""
     adopted: int
-    """Offset in use, the vehicle's clock minus ours [ns], or UNSEEN."""
+    """Offset in use, the vehicle's clock minus the server's [ns], or UNSEEN."""
     low: int
     """Lower bound of the true offset at `bounded` [ns]; -UNSEEN before the first sample."""
     high: int
     """Upper bound of the true offset at `bounded` [ns]; UNSEEN before the first sample."""
     bounded: int
-    """Our time at which these two hold; they widen before and after it [ns]."""
+    """Server's time at which `low` and `high` hold [ns]; they widen before and after it."""
     steps: int
     """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
     other_low: int
-    """Lower bound of the true offset at `other`, from other knowledge [ns], or -UNSEEN."""
+    """Lower bound of the true offset at `other` from settings and time of day [ns], or -UNSEEN."""
     other_high: int
-    """Upper bound of the true offset at `other`, from other knowledge [ns], or UNSEEN."""
+    """Upper bound of the true offset at `other` from settings and time of day [ns], or UNSEEN."""
     other: int
-    """Our time at which these two hold [ns]."""
+    """Server's time at which `other_low` and `other_high` hold [ns]."""
     doubted: int
     """1 if the time of day was contradicted; then the union of all bounds is used."""
     uneven: int
@@ -109,16 +107,13 @@ FORGOTTEN = ("newest", "heard", "echoes", "adopted")
 
 
 class StepError(NamedTuple):
-    """Possible error of the step that the server counts for a vehicle."""
-
     early: float
     """Largest number of steps by which the vehicle may be ahead of the counted step."""
     late: float
-    """Largest number of steps by which it may be behind."""
+    """Largest number of steps by which the vehicle may be behind the counted step."""
 
 
 EXACT = StepError(0.0, 0.0)
-"""Error of a step that is known exactly."""
 
 
 VEHICLE_CLOCK = record(VehicleClock)
@@ -134,18 +129,16 @@ class Seen(NamedTuple):
     samples: I2
     """Number of samples in each interval; shape (capacity, BUCKETS)."""
     echoes: I2
-    """Newest G, one per packet of ours [ns], as a ring; shape (capacity, ECHOES)."""
+    """Newest G, one per packet of the server [ns], as a ring; shape (capacity, ECHOES)."""
 
 
 class ClockMap:
     """Clock offsets and present steps of up to `capacity` vehicles.
 
-    The offset in use follows the estimate only when that has moved by more than half a step: a step
+    The offset in use follows the estimate only when it has moved by more than half a step: a step
     index that alternates at a boundary would skip and repeat steps needlessly.
 
     Args:
-        capacity: largest number of vehicles.
-        dt_ns: length of a step [ns].
         asymmetry_ns: bound on the difference of the smallest delays of the two directions over 20 s
             [ns]; 0: unknown.
     """
@@ -153,9 +146,9 @@ class ClockMap:
     def __init__(self, capacity: int, dt_ns: int, asymmetry_ns: int = 0) -> None:
         self._dt_ns, self._asymmetry_ns = dt_ns, asymmetry_ns
         self.tick_ns = 0
-        """Our time for which steps were last counted [ns]."""
+        """Server's time at which steps were last counted [ns]."""
         self._lives: list[tuple[int, int] | None] = [None] * capacity
-        """Vehicle in each row, and the boot id of its client's run."""
+        """Number of the vehicle in each row, and boot id of its client."""
         self.seen = Seen(
             vehicles=np.zeros(capacity, dtype=VEHICLE_CLOCK),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
@@ -169,9 +162,8 @@ class ClockMap:
         """Reset the row for another vehicle, or for a new session.
 
         Args:
-            row: row of the vehicle.
-            life: its number and the boot id of its client's run, during which its step 0 stays the
-                same: bounds found earlier in the same run remain valid. None if unknown.
+            life: its number and the boot id of its client, or None if unknown. With the same boot
+                id, step 0 is the same and bounds found earlier remain valid.
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
@@ -197,28 +189,26 @@ class ClockMap:
         now_ns: int,
         is_newest: bool = True,
     ) -> Contradiction:
-        """Add one F and one G of a vehicle, received at `now_ns`; returns what they contradict.
+        """Add one F and one G of a vehicle; returns what they contradict.
 
         Args:
-            row: row of the vehicle.
             forward_ns: F [ns].
             backward_ns: G [ns].
-            heard: number that differs for each packet of ours that G is of.
-            now_ns: our time [ns].
-            is_newest: whether the observation is newer than all before: of the echo in an older one
-                it is unknown when it was received.
+            heard: number of the server's packet that G belongs to.
+            now_ns: server's time of reception [ns].
+            is_newest: whether the observation is the newest; for an echo in an older one the time
+                of its reception is unknown.
         """
         sample = forward_ns, backward_ns, heard, is_newest, self._asymmetry_ns, now_ns
         return Contradiction(_observe(self.seen, row, *sample))
 
     def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
-        """Narrow the offset of a vehicle's clock by other knowledge; returns what it contradicts.
+        """Narrow the offset of a vehicle's clock by its time of day; returns what that contradicts.
 
         Args:
-            row: row of the vehicle.
-            offset_ns: the vehicle's clock minus ours [ns].
+            offset_ns: the vehicle's clock minus the server's [ns].
             error_ns: largest error of the offset [ns].
-            now_ns: our time [ns].
+            now_ns: server's time [ns].
         """
         low, high = offset_ns - error_ns, offset_ns + error_ns
         return Contradiction(
@@ -233,15 +223,14 @@ class ClockMap:
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
-        """Vehicle's clock minus ours, for vehicles observed at least once [ns]; shape (n,)."""
-        # Updates `adopted`; the steps themselves are not needed.
+        """Vehicle's clock minus the server's, for observed vehicles [ns]; shape (n,)."""
+        # Updates `adopted`; the steps are not needed.
         _steps(self.seen, rows, 0, self._dt_ns, rows.copy())
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of times that a clock was found to have been set; empty if never."""
         steps = int(self.seen.vehicles["steps"].sum())
         return {"clock_steps": steps} if steps else {}
 
@@ -250,12 +239,12 @@ class ClockMap:
 
         Args:
             rows, steps: arguments and result of `steps`; shape (n,).
-            early, late: written at these rows; shape (capacity,).
+            early, late: output, written at these rows; shape (capacity,).
         """
         _step_errors(self.seen, rows, steps, self.tick_ns, self._dt_ns, early, late)
 
     def bound_ns(self, row: int) -> int:
-        """Half of the width of the bounds of a vehicle's clock offset, now [ns]."""
+        """Half of the width of the bounds of a vehicle's clock offset at the last tick [ns]."""
         return self.middle_ns(row, self.tick_ns)[1]
 
     def middle_ns(self, row: int, now_ns: int) -> tuple[int, int]:
@@ -268,11 +257,10 @@ class ClockMap:
 
 @inline
 def least(values: I1) -> int:
-    """Least of some numbers."""
-    found = values[0]
+    smallest = values[0]
     for value in values:
-        found = min(found, value)
-    return found
+        smallest = min(smallest, value)
+    return smallest
 
 
 @part
@@ -283,16 +271,12 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest estimated delay of the newest ECHOES packets to a vehicle [ns].
-
-    It is negative while there are fewer.
-    """
+    """Shortest estimated delay of the newest ECHOES packets [ns]; negative if there are fewer."""
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
 @part
 def _by_delays(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Bounds of a vehicle's clock offset from delays alone [ns]."""
     vehicle = seen.vehicles[row]
     drift = abs(now - vehicle.bounded) // DRIFT + 1
     return vehicle.low - drift, vehicle.high + drift
@@ -300,7 +284,7 @@ def _by_delays(seen: Seen, row: int, now: int) -> tuple[int, int]:
 
 @part
 def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Bounds of a vehicle's clock offset from other knowledge [ns]."""
+    """Bounds of a vehicle's clock offset from settings and time of day [ns]."""
     vehicle = seen.vehicles[row]
     drift = abs(now - vehicle.other) // DRIFT + 1 if vehicle.other_high < UNSEEN else 0
     return vehicle.other_low - drift, vehicle.other_high + drift
@@ -308,7 +292,7 @@ def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
 
 @part
 def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Bounds of a vehicle's clock offset at a time of ours [ns]."""
+    """Bounds of a vehicle's clock offset at a time of the server [ns]."""
     low, high = _by_delays(seen, row, now)
     other_low, other_high = _by_others(seen, row, now)
     if seen.vehicles[row].doubted or max(low, other_low) > min(high, other_high):
@@ -319,15 +303,12 @@ def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
 
 @kernel
 def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
-    """Store `bounds_ns` in an array."""
     bounds[0], bounds[1] = bounds_ns(seen, row, now)
 
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds from other knowledge; resets them and returns False if that is
-    contradictory.
-    """
+    """Narrow the bounds of settings and time of day [ns]; if contradictory, reset them: False."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -341,7 +322,6 @@ def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
 
 @kernel
 def _narrow_by_time(seen: Seen, row: int, low: int, high: int, asymmetric: bool, now: int) -> int:
-    """Apply a time of day, see `ClockMap.tell`."""
     vehicle = seen.vehicles[row]
     if vehicle.doubted:
         other_low, other_high = _by_others(seen, row, now)
@@ -361,7 +341,6 @@ def _narrow_by_time(seen: Seen, row: int, low: int, high: int, asymmetric: bool,
 
 @part
 def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
-    """Apply the bound on the difference of the delays [ns]; returns what it contradicts."""
     vehicle, samples = seen.vehicles[row], 0
     for slot in range(BUCKETS):
         samples += seen.samples[row, slot]
@@ -381,11 +360,9 @@ def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now:
     """Narrow the bounds of a vehicle's clock offset by F and G [ns]; returns what these contradict.
 
     Args:
-        seen: clock samples.
-        row: row of the vehicle.
         forward, backward: F and G [ns].
         is_new: whether G is of an echo that no earlier observation contained.
-        now: our time [ns].
+        now: server's time [ns].
     """
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
@@ -419,9 +396,6 @@ def _observe(
     asymmetry: int,
     now: int,
 ) -> int:
-    """Add F and G [ns] of a vehicle, received at our time `now` [ns]; returns what they
-    contradict.
-    """
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
     is_new = is_newest and heard != vehicle.heard
     contradiction = _bound(seen, row, forward, backward, is_new, now)
@@ -430,7 +404,7 @@ def _observe(
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
         vehicle.echoes += 1
-    # At most once round the ring, however long the vehicle was silent.
+    # At most once round the ring, however long no observation came.
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
@@ -446,7 +420,7 @@ def _observe(
 
 @part
 def _change(minimum: I1, newest: int, recently: int) -> int:
-    """Smallest recent delay minus the smallest delay older than 4 s [ns]."""
+    """Smallest recent delay minus the smallest delay older than OLD intervals [ns]."""
     recent, old = UNSEEN, UNSEEN
     for age in range(BUCKETS):
         value = minimum[(newest - age) % BUCKETS]
@@ -459,7 +433,7 @@ def _change(minimum: I1, newest: int, recently: int) -> int:
 
 @part
 def _drop_stepped(seen: Seen, row: int) -> None:
-    """Forget minima from before a step of the vehicle's clock or ours, if there was one."""
+    """Drop minima from before a step of the vehicle's clock or the server's, if there was one."""
     recent, old, newest, recently = 0, 0, seen.vehicles[row]["newest"], RECENT
     for age in range(BUCKETS):
         count = seen.samples[row, (newest - age) % BUCKETS]
@@ -484,7 +458,6 @@ def _drop_stepped(seen: Seen, row: int) -> None:
 
 @kernel
 def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
-    """Fill in k of each vehicle, see `ClockMap.steps`; forgets what came before a clock step."""
     for i in range(len(rows)):
         row = rows[i]
         _drop_stepped(seen, row)
@@ -499,7 +472,6 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
 
 @kernel
 def _step_errors(seen: Seen, rows: I1, steps: I1, now: int, dt: int, early: F1, late: F1) -> None:
-    """Fill in `ClockMap.step_errors`."""
     for i in range(len(rows)):
         low, high = bounds_ns(seen, rows[i], now)
         # Subtract whole steps first: as floats, times of years in nanoseconds have too few digits.

@@ -12,7 +12,7 @@ from skytether.shared.law.terms import Terms
 
 AXIS = record(Axis)
 Axes = Annotated[NDArray[np.void], records(AXIS, 1)]
-"""Model as an array for kernels; shape (axes,)."""
+"""Model of each axis, for kernels; shape (axes,)."""
 
 
 class AxisLaw(Axis):
@@ -43,12 +43,10 @@ def axis_of(record: Axis) -> Axis:
 
 @inline
 def axis_at(model: Axes, axis: int) -> Axis:
-    """Model of one of several axes."""
     return axis_of(model[axis])
 
 
 def axes_of(model: Model) -> Axes:
-    """Model as an array for kernels; shape (axes,)."""
     return np.array([tuple(axis) for axis in model.axes()], dtype=AXIS)
 
 

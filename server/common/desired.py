@@ -1,13 +1,13 @@
 """Desired trajectory as known to the server: the window of desired states for a plan.
 
-A vehicle at step k is planned for from k + d to k + d + H. `reference.preview` limits how far ahead
-the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
-preview. What comes later is extrapolated from the last visible state at its velocity; for a moving
-target with reflection at the bounds of its region (docs/schemes.md has what else was tried). Of a
-point that is moved in flight (`live`) only the present state is known, the same for all vehicles.
+The plan at step k covers the steps from k + d to k + d + H. `reference.preview` limits how far
+ahead the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
+preview. Later states are extrapolated from the last visible state at its velocity; for a moving
+target with reflection at the bounds of its region (docs/schemes.md lists rejected alternatives). Of
+a point that is moved in flight (`live`) only the present state is known, the same for all vehicles.
 
-A vehicle with a dead time θ is planned for in the state in which its next input takes effect
-(`shared.law.dead_time`), and so along the trajectory shifted by θ on each axis.
+The plan of a vehicle with a dead time θ starts from the state in which its next input takes effect
+(`shared.law.dead_time`), and so follows the trajectory shifted by θ on each axis.
 
 Trajectories are computed in pages and looked up, not computed at each step. Vehicles with
 trajectories of their own have pages of their own.
@@ -34,9 +34,9 @@ PAGES = 256
 EMPTY = -1
 """Key of an empty slot."""
 FOUND = -1
-"""Result of a search if no vehicle's page is missing."""
+"""Result of a search that finds every vehicle's page."""
 TRAJECTORY = 2**40
-"""Stride between the keys of trajectories: page p of trajectory t has the key t TRAJECTORY + p."""
+"""Stride between keys of trajectories: page p of trajectory t has the key t * TRAJECTORY + p."""
 SPREAD = 31
 """Number of slots between the first pages of successive trajectories; odd, so that all differ."""
 TINY = 1e-9
@@ -57,22 +57,16 @@ class Window(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """Visible part of the desired trajectory on each axis; shape (axes,)."""
-
     reach: I1
-    """Number of visible steps after k."""
     rest_s: F1
-    """Time from the last of them to the end of the preview plus dead time [s]."""
+    """Time from the last visible step to the end of the preview plus dead time [s]."""
 
 
 class Desired:
     """Desired trajectories of all vehicles, as far as the server may see them.
 
     Args:
-        scenario: scenario of the flight, with the preview.
-        terms: its terms.
-        capacity: largest number of vehicles.
-        block: number of vehicles that are asked for at a time.
+        block: largest number of vehicles in one call.
         references: trajectory of each vehicle, by its number; default: the scenario's for all.
     """
 
@@ -90,16 +84,14 @@ class Desired:
         self._point = _live(scenario) if wanted.shape == "live" else None
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Number of steps in a page after its PAGE steps; without a full preview, the visible
-        steps."""
+        """Steps in a page after its PAGE steps; without a full preview, the visible steps."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             # TINY: 0.15 / 0.05 is 2.9999999999999996.
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
-        """Time from a step to the state stored for it in a page, on each axis [s]; shape
-        (axes,)."""
+        """Time from a step to the state stored for it in a page [s]; shape (axes,)."""
         left = (seen_s - self._ahead_s) / terms.dt_s + TINY
         self._outlook = Outlook(left.astype(np.int64), late_s - self._ahead_s)
         left_min = H if self._all else int(self._outlook.reach.min())
@@ -110,7 +102,6 @@ class Desired:
         self._references = references
         self._shared = scenario.make_reference()
         self._number = np.zeros(capacity, dtype=np.int64)
-        """Number of each vehicle's trajectory; shape (capacity,)."""
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
         self._axes, self._late, shifts = axes, bool(late_s.any()), bool(self._ahead_s.any())
@@ -120,7 +111,7 @@ class Desired:
         self._pages = np.zeros(pages)
         """Desired states in each slot [m, m/s]; for a live point only its present state."""
         self._at_once = np.zeros(block, dtype=np.int64)
-        """Zeros in place of d, for states from k on; shape (block,)."""
+        """Zeros in place of d, for states from k on."""
         self._keys = np.full(PAGES, EMPTY, dtype=np.int64)
         """Key of the page in each slot, or EMPTY; shape (PAGES,)."""
         self._found = Window(
@@ -135,24 +126,18 @@ class Desired:
         """Extrapolated states; not used if everything is visible."""
 
     def assign(self, row: int, vehicle: int) -> None:
-        """Assign a row to a vehicle, whose trajectory is looked up by its number."""
         self._number[row] = vehicle if self._references else 0
 
     def number(self, row: int) -> int:
-        """Number of the trajectory of the vehicle in a row."""
         return int(self._number[row])
 
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; other trajectories do not change.
-
-        Without a position it continues from its present one.
-        """
+        """Move a live point, see `LivePoint.move`; default: from its present position."""
         if self._point:
             position = self._point.at(now_ns)[:, 0] if position is None else position
             self._point.move(position, velocity, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Advance a live point to a time [ns]."""
         if self._point:
             self._pages[0, :, 0] = self._point.at(now_ns)
 
@@ -169,12 +154,8 @@ class Desired:
         return states
 
     def due(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states when the inputs of the steps k take effect; equal to `now` without a dead
-        time.
-
-        Args:
-            rows: the vehicles, no more than a block; shape (n,).
-            steps: k of each; shape (n,).
+        """Desired states at the steps k plus the dead time, when their inputs take effect; see
+        `now`.
         """
         if not self._late:
             return self.now(rows, steps)
@@ -186,7 +167,7 @@ class Desired:
         Args:
             rows: the vehicles, no more than a block; shape (n,).
             steps: k of each; shape (n,).
-            ahead: d of each; the n vehicles come first.
+            ahead: d of each, in the first n items.
         """
         if self._all:
             return self._find(rows, steps, ahead)
@@ -203,12 +184,11 @@ class Desired:
         return found.transpose(0, 2, 1, 3)
 
     def _find(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Look up desired states from k + d on, and compute missing pages."""
         if self._point:
             return self._found
         keys = self._keys
         while (i := _find(keys, self._number, rows, steps, ahead, self._found)) != FOUND:
-            # The search of `_place` needs an empty slot to end: before the last one is used, all
+            # The search of `_slot` needs an empty slot to end: before the last one is used, all
             # pages are dropped. A block of vehicles needs half of PAGES at most.
             if np.count_nonzero(keys == EMPTY) == 1:
                 keys[:] = EMPTY
@@ -226,7 +206,6 @@ class Desired:
 
 
 def _live(scenario: Scenario) -> LivePoint:
-    """Live point of a scenario at its initial position."""
     velocity = scenario.reference.velocity_mps
     start = scenario.unallocated_reference()(np.zeros(()))[:, 0]
     return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
@@ -243,9 +222,7 @@ def _slot(keys: I1, number: int, page: int) -> int:
 
 @kernel
 def _find(keys: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
-    """Fill in slots and stages from k + d on; returns the first vehicle whose page is missing,
-    or FOUND.
-    """
+    """Fill in slots and stages from k + d on; returns the first vehicle without page, or FOUND."""
     for i in range(len(rows)):
         step = steps[i] + ahead[i]
         number, page = numbers[rows[i]], step // PAGE
@@ -274,10 +251,8 @@ def _foresee(
 
     Args:
         visible: slots and stages of the desired states from k on; none after k + reach is used.
-        n: number of vehicles.
         ahead: d of each; shape (block,).
         outlook: visible part of the trajectory.
-        dt_s: length of a step [s].
         bound_m: coordinate at which the extrapolation is reflected [m].
         window: output [m, m/s]; shape (block, axes, H + 1, 2).
     """

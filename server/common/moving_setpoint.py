@@ -1,4 +1,4 @@
-"""A point that an operator moves in flight: its position and velocity, from the moves alone.
+"""A point that an operator moves in flight: position and velocity, from the moves alone.
 
 Its velocity is given with a move, or is a weighted mean over the moves: v ← v + (1 - exp(-h /
 MEMORY_S)) · (Δp / h - v), with h the time between two moves. A point without a given velocity that
@@ -13,7 +13,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 
 MEMORY_S = 0.2
-"""Time constant of the mean velocity [s], the smallest that tolerates moves wrong by 2 cm."""
+"""Time constant of the mean velocity [s]; the smallest that tolerates errors of 2 cm in moves."""
 REST_S = 1.0
 """Time without a move after which a point is at rest [s]."""
 
@@ -24,7 +24,7 @@ class LivePoint:
     Args:
         position: initial position [m]; shape (axes,).
         velocity: its velocity [m/s], or None if not given; shape (axes,).
-        fastest: largest velocity estimated from moves, on each axis [m/s]; shape (axes,).
+        fastest: largest velocity estimated from moves [m/s]; shape (axes,).
     """
 
     def __init__(self, position: Array, velocity: Array | None, fastest: Array) -> None:
@@ -33,22 +33,15 @@ class LivePoint:
         self._velocity = np.zeros_like(position) if velocity is None else velocity
         self._fastest = fastest
         self._moved_ns: int | None = None
-        """Time of its newest move, or of the first call of `at` if a velocity is given."""
+        """Time of the newest move, or of the first call of `at` if a velocity is given."""
 
     def move(self, position: Array, velocity: Array | None, now_ns: int) -> None:
-        """Move the point at once.
-
-        Args:
-            position: new position [m]; shape (axes,).
-            velocity: its velocity [m/s], or None if not given; shape (axes,).
-            now_ns: time of the server [ns].
-        """
         self._has_velocity = velocity is not None
         self._velocity = self._estimated(position, now_ns) if velocity is None else velocity
         self._position, self._moved_ns = position, now_ns
 
     def at(self, now_ns: int) -> Array:
-        """State: the newest move extrapolated at its velocity [m, m/s]; shape (axes, 2)."""
+        """State of the point: its newest move, extrapolated [m, m/s]; shape (axes, 2)."""
         if self._moved_ns is None:
             if not self._has_velocity:
                 return np.stack([self._position, self._velocity], axis=-1)
@@ -61,7 +54,6 @@ class LivePoint:
         return np.stack([self._position + since_s * self._velocity, self._velocity], axis=-1)
 
     def _estimated(self, position: Array, now_ns: int) -> Array:
-        """Velocity estimated from the moves [m/s]; shape (axes,)."""
         h_s = (now_ns - self._moved_ns) / SECOND_NS if self._moved_ns is not None else math.inf
         if h_s > REST_S:
             return np.zeros_like(position)

@@ -1,6 +1,6 @@
 """Interface of a scheme of delay compensation, and the arrays that schemes fill in.
 
-`shared.scenario.schemes` lists the schemes. On a mission `server.missions.mission_planner` is the
+`shared.scenario.schemes` lists the schemes. On a mission, `server.missions.mission_planner` is the
 scheme.
 """
 
@@ -30,8 +30,7 @@ class Splines(NamedTuple):
     """Trajectories sent by the scheme "trajectory"; with other schemes `block` is 0."""
 
     knots: S3
-    """Position [m] and velocity [m/s] of each knot, alternating; shape
-    (block, axes, 2 KNOTS_MAX)."""
+    """Position [m] and velocity [m/s] of each knot in turn; shape (block, axes, 2 KNOTS_MAX)."""
     number: I1
     """Number of knots; shape (block,)."""
     spacing: I1
@@ -53,22 +52,22 @@ class Foresight(NamedTuple):
     start: F3
     """Estimate x̂(k+d), where planning starts [m, m/s]; shape (block, axes, 2)."""
     committed: F3
-    """Committed inputs of steps k … k+d-1, in the first d columns [m/s]; shape
-    (block, axes, largest d)."""
+    """Committed inputs of steps k … k+d-1, in the first d columns [m/s]; shape (block, axes,
+    largest d)."""
     held: F3
-    """Inputs that the vehicle flies from k+d on if no further packet is sent [m/s]; shape
-    (block, axes, H)."""
+    """Inputs that the vehicle flies from k+d on if no further packet is sent [m/s]; shape (block,
+    axes, H)."""
     loss_probability: F2
-    """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape
-    (block, loss_cases), with 0 cases if no trigger uses them."""
+    """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape (block,
+    loss_cases), with 0 cases if no trigger uses them."""
     start_if_lost: F4
-    """State at k+d in each of these cases [m, m/s]; shape (block, loss_cases, axes, 2)."""
+    """State at k+d in each loss case [m, m/s]; shape (block, loss_cases, axes, 2)."""
     inputs_if_lost: F4
-    """Inputs from k+d on in each of these cases, if no further packet is sent [m/s]; shape
-    (block, loss_cases, axes, H)."""
+    """Inputs from k+d on in each loss case, if no further packet is sent [m/s]; shape (block,
+    loss_cases, axes, H)."""
     usable: I1
-    """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`;
-    shape (block,)."""
+    """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`; shape
+    (block,)."""
     disturbance: F2
     """Estimated disturbance ŵ, as an equivalent input [m/s]; shape (block, axes)."""
     horizons: S3
@@ -84,26 +83,24 @@ class PlanFigures:
     """Numpy record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
 
     row: int
-    """Row of the vehicle."""
     step: int
-    """Step k."""
     start: int
     """Step k + d, where planning starts."""
     gap: int
     """Steps from the start of the previous plan to the start of this one."""
     state_gap: float
-    """V(k) of eq. (16): (x̂ - x_p)' P (x̂ - x_p) [cost]."""
+    """V(k) of eq. (16): (x̂ - x_p)' P (x̂ - x_p)."""
     cost_gap: float
-    """Cost of flying on with the inputs already sent, minus the cost of the new plan [cost]."""
+    """Cost of flying on with the inputs already sent, minus the cost of the new plan."""
     expected_gap: float
-    """Expected value of `cost_gap` over which packets in flight are lost [cost]."""
+    """Expected value of `cost_gap` over the losses of packets in flight."""
     deviation_m: float
-    """Largest distance between the flight with the inputs already sent and the generator's
-    previous plan [m]; 0 if `fresh`."""
+    """Largest distance between the flight with the inputs already sent and the previous plan [m]; 0
+    if `fresh`."""
     fresh: bool
     """Whether no usable previous plan exists: first step, or a gap longer than H."""
     solved: bool
-    """Whether a plan was foresight, so that it may be sent."""
+    """Whether the solver has found a plan, so that it may be sent."""
 
 
 FIGURES = record(PlanFigures)
@@ -118,7 +115,6 @@ LOSS_CASES = 4
 def empty_foresight(
     block: int, axes: int, H: int, ahead_max: int, loss_cases: int = 0, *, splines: bool = False
 ) -> Foresight:
-    """Allocate the arrays for a block of vehicles, whose delay bounds are at most `ahead_max`."""
     states, trajectories = (block, axes, 2), block if splines else 0
     return Foresight(
         estimate=np.zeros(states),
@@ -146,9 +142,7 @@ class Header(NamedTuple):
     """Header of a packet to a vehicle, the same for horizons and trajectories."""
 
     vehicle: int
-    """Number of the vehicle."""
     session: int
-    """Number of its session."""
     sent_us: int
     """Server's clock when the packet is sent [µs]."""
     number: int
@@ -169,37 +163,30 @@ class Batch(NamedTuple):
     step: Indices
     """Step k of each; shape (n,)."""
     foresight: Foresight
-    """Their predictions and plans, in the first n rows of its arrays."""
+    """Predictions and plans, in the first n rows of the arrays."""
     sent: Indices
     """Indices, from 0 to n - 1, of the vehicles whose plan is sent; shape (m,)."""
 
 
 class SentPlans(NamedTuple):
-    """Plans that are sent, for the record."""
-
     step: Indices
     """Step k that each plan is made for; shape (m,)."""
     begins: Indices
-    """Step of its first planned input; shape (m,)."""
+    """First planned step of each plan; shape (m,)."""
     state: Array
-    """Predicted state at that step [m, m/s]; shape (m, axes, 2)."""
+    """Predicted state at the step `begins` [m, m/s]; shape (m, axes, 2)."""
     inputs: NDArray[np.floating]
     """Planned inputs [m/s]; shape (m, axes, H)."""
 
 
 class Fleet(NamedTuple):
-    """Arguments of a scheme's constructor: the flight and its vehicles."""
-
     scenario: Scenario
     terms: Terms
-    """Terms of the flight."""
     capacity: int
-    """Largest number of vehicles."""
     block: int
     """Largest number of vehicles planned for together."""
     clock: ClockMap
     desired: Desired
-    """Desired trajectories."""
     references: Callable[[int], Reference] | None
     """Reference of each vehicle of a mission, by its number; None without a mission."""
     stopwatch: Stopwatch
@@ -224,9 +211,8 @@ class Scheme(ABC):
         self.observed_step: Indices = np.full(fleet.capacity, -1, dtype=np.int64)
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.counts: Counter[str] = Counter()
-        """Counters of the scheme, by name, for the summary."""
         self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
-        """Figures of the newest plans; a block with fewer vehicles fills the first rows only."""
+        """Figures of the newest plans, in the first rows."""
         self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
         """States at which the newest plans start, as predicted by the previous plans [m, m/s];
         shape (block, axes, 2)."""
@@ -241,7 +227,7 @@ class Scheme(ABC):
 
     @abstractmethod
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Fill in the predictions of vehicles whose newest observation is young enough.
+        """Fill in the predictions; the newest observation of each vehicle is young enough.
 
         Args:
             rows: rows of the vehicles; shape (n,).
@@ -277,8 +263,8 @@ class Scheme(ABC):
 
         Args:
             batch: vehicles and plans.
-            header: returns the header of the next packet to the vehicle in a row; call it once for
-                each packet.
+            header: makes the header of the next packet to the vehicle in a row, with a new packet
+                number at each call: call once for each packet.
         """
 
     @abstractmethod
@@ -294,14 +280,14 @@ class Scheme(ABC):
 
     @property
     def inside(self) -> list[tuple[int, str]]:
-        """Vehicles that rest inside a zone, and its name; the caller empties the list."""
+        """Vehicles that rest inside a zone, and the zone's name; the caller empties the list."""
         return []
 
     def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes know no zones
         """Replace the zones that vehicles keep out of."""
 
     def objection(self, zones: Zones) -> str:  # noqa: ARG002
-        """Reason why the zones cannot be changed to these now; empty if they can."""
+        """Reason why the zones cannot be replaced by these now; empty if they can."""
         return ""
 
     def waits(self, row: int) -> str:  # noqa: ARG002
@@ -309,9 +295,7 @@ class Scheme(ABC):
         return ""
 
     def clock_m(self, row: int) -> float | None:  # noqa: ARG002
-        """Position error that the uncertainty of the vehicle's clock may cause [m]; None without a
-        mission.
-        """
+        """Position error that the vehicle's clock error may cause [m]; None without a mission."""
         return None
 
     def restart(self, row: int) -> bool:  # noqa: ARG002

@@ -1,4 +1,4 @@
-"""Splines that are sent to vehicles: their messages, and their inputs for the record."""
+"""Splines sent to vehicles: their messages, and their inputs for the record."""
 
 from collections.abc import Callable, Iterator
 
@@ -20,35 +20,35 @@ class SplineScheme(Scheme):
     properties = SchemeProperties(flown_as="trajectory", feedback=True)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
-        sent, told = batch.sent, batch.foresight.splines
-        rows, old = batch.rows[sent], told.age[sent]
+        sent, splines = batch.sent, batch.foresight.splines
+        rows, old = batch.rows[sent], splines.age[sent]
         step = batch.step[sent] - old
         age = step - self.observed_step[rows]
-        # A motion that is sent again is older than the newest observation, from which it was not
-        # planned; its age is 0. Others have a negative age if the server's clock was set and the
-        # clock map lags, as a horizon has: it must name an existing observation.
+        # A trajectory that is sent again is older than the newest observation: its age is set to 0.
+        # Others have a negative age if the server's clock was set and the clock map lags, as a
+        # horizon has: the age must lead to the step of an existing observation.
         age = np.where(old > 0, np.maximum(age, 0), age)
-        columns = (sent, rows, step, age, told.spacing[sent], told.number[sent])
-        for i, row, k, o, spacing, n in zip(*(each.tolist() for each in columns), strict=True):
-            knots = told.knots[i, :, : 2 * n].reshape(-1, n, 2)
+        columns = (sent, rows, step, age, splines.spacing[sent], splines.number[sent])
+        for i, row, k, age_steps, spacing, n in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            knots = splines.knots[i, :, : 2 * n].reshape(-1, n, 2)
             vehicle, session, sent_us, number, silence = header(row)
-            said = (vehicle, session, k, sent_us, o, spacing, knots, number, silence)
-            yield row, encode(Trajectory(*said))
+            fields = (vehicle, session, k, sent_us, age_steps, spacing, knots, number, silence)
+            yield row, encode(Trajectory(*fields))
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
-        terms, sent, told = self.terms, batch.sent, batch.foresight.splines
-        step = batch.step[sent] - told.age[sent]
-        knots = told.knots[sent].astype(np.float64)
+        terms, sent, splines = self.terms, batch.sent, batch.foresight.splines
+        step = batch.step[sent] - splines.age[sent]
+        knots = splines.knots[sent].astype(np.float64)
         inputs = np.empty((len(sent), terms.axes, terms.horizon))
         inputs_along(
             axes_of(terms.model),
             np.array(terms.u_max),
             terms.dt_s,
             knots,
-            told.number[sent],
-            told.spacing[sent],
+            splines.number[sent],
+            splines.spacing[sent],
             inputs,
         )
         return SentPlans(step, step + batch.foresight.ahead[sent], knots[:, :, :2], inputs)
@@ -63,7 +63,6 @@ def inputs_along(
     Args:
         model: eq. (4).
         bounds: u_max of each axis [m/s]; shape (axes,).
-        dt_s: length of a step [s].
         knots: knots of each spline, as in `Splines` [m, m/s]; shape (n, axes, 2 KNOTS_MAX).
         number: number of knots; shape (n,).
         spacing: steps from one knot to the next; shape (n,).

@@ -15,12 +15,9 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 
 class MotionMetric(NamedTuple):
-    """Scaling of distances, and length of a step."""
-
     scale: F1
     """Factor of each coordinate in distances; shape (axes,)."""
     dt_s: float
-    """Length of a step [s]."""
 
 
 class Extent(NamedTuple):
@@ -33,17 +30,7 @@ class Extent(NamedTuple):
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
-    """Positions [m] and velocities [m/s] of a motion at steps SPACING apart; see `Motion.at`.
-
-    Args:
-        motion: the motion.
-        begin: first step.
-        count: number of steps.
-        dt_s: length of a step [s].
-
-    Returns:
-        two arrays of shape (count, axes).
-    """
+    """Positions [m] and velocities [m/s] at `count` steps, SPACING apart; shapes (count, axes)."""
     position, velocity = np.empty((2, count, motion.position.shape[1]))
     _states(motion, begin, dt_s, position, velocity)
     return position, velocity
@@ -57,7 +44,6 @@ def pieces_of(begin: int, end: int) -> Array:
 
 @kernel
 def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2) -> None:
-    """Fill in `states`."""
     for i in range(len(position)):
         for x in range(position.shape[1]):
             step = float(begin + i * SPACING)
@@ -83,13 +69,11 @@ def state_at(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float
 
 @part
 def position_at(motion: Motion, axis: int, step: float, dt_s: float) -> float:
-    """Position of a motion on an axis at a step."""
     return state_at(motion, axis, step, dt_s)[0]
 
 
 @part
 def last_step(motion: Motion) -> int:
-    """Step at which a motion has come to rest, see `Motion.last`."""
     return motion.first + (len(motion.position) - 1) * SPACING
 
 
@@ -98,9 +82,7 @@ def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, hig
     """Fill in two corners of a box around a motion and a landing after it, scaled [m].
 
     Args:
-        motion: the motion.
-        lands: whether its vehicle may ever land.
-        metric: scaling of distances.
+        lands: whether the vehicle may ever land.
         low, high: output; shape (axes,).
     """
     position, velocity, scale = motion.position, motion.velocity, metric.scale
@@ -121,7 +103,6 @@ def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, hig
 
 @part
 def extent_of(motion: Motion, metric: MotionMetric) -> Extent:
-    """Bounds of the speed and curvature of a motion."""
     fastest, turn, scale = 0.0, 0.0, metric.scale
     for knot in range(len(motion.velocity)):
         speed, change = 0.0, 0.0

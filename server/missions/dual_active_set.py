@@ -18,7 +18,7 @@ from skytether.shared.law.model import Array
 SOLVED, INFEASIBLE, TOO_MANY_ROUNDS = 0, 1, 2
 """Result of the solver."""
 VIOLATED = 1e-9
-"""Violation from which on a constraint counts."""
+"""Violation above which a constraint counts as violated."""
 DEPENDENT = 1e-12
 """Squared length of a step below which a constraint depends on the active ones."""
 ROUNDS = 10
@@ -41,7 +41,6 @@ class DualWorkspace(NamedTuple):
 
 
 def workspace(n: int, m: int) -> DualWorkspace:
-    """Scratch arrays for problems with n variables and m constraints."""
     J, R = np.zeros((2, n, n))
     return DualWorkspace(np.zeros(m), J, R, np.zeros((5, n + 1)), np.zeros(n + 1, dtype=np.int64))
 
@@ -59,7 +58,7 @@ class DualActiveSet:
         self._scratch = workspace(len(hessian), 0)
 
     def solve(self, linear: Array, columns: Array, bounds: Array, equal: int) -> Array | None:
-        """Minimum x; None if there is none.
+        """Minimum x; None if infeasible, or not found.
 
         Args:
             linear: g; shape (n,).
@@ -80,7 +79,6 @@ class DualActiveSet:
 def _solve(
     root: F2, linear: F1, x: F1, columns: R2, bounds: F1, equal: int, scratch: DualWorkspace
 ) -> int:
-    """Compiled `solve_qp`."""
     return solve_qp(root, linear, x, columns, bounds, equal, scratch)
 
 
@@ -95,7 +93,6 @@ def solve_qp(
         linear: g; shape (n,).
         x: output; shape (n,).
         columns, bounds, equal: see `DualActiveSet.solve`.
-        scratch: see `workspace`.
 
     Returns:
         SOLVED, INFEASIBLE or TOO_MANY_ROUNDS.
@@ -149,7 +146,7 @@ def solve_qp(
 
 @part
 def _add_scaled(to: F1, factor: float, numbers: F1, count: int) -> None:
-    """Add multiples of the first numbers, in a loop: a slice takes numba a second to compile."""
+    """Loop in place of a slice, which takes numba a second to compile."""
     for i in range(count):
         to[i] += factor * numbers[i]
 
@@ -171,7 +168,6 @@ def _start_unconstrained(root: F2, linear: F1, x: F1, J: F2) -> None:
 
 @part
 def _most_violated(columns: R2, bounds: F1, equal: int, x: F1, slack: F1) -> int:
-    """Most violated inequality, or -1."""
     for i in range(len(bounds)):
         slack[i] = -bounds[i]
     for j in range(len(x)):
@@ -223,35 +219,34 @@ def _add_constraint(J: F2, R: F2, d: F1, q: int) -> None:
 
 @part
 def _drop_constraint(J: F2, R: F2, u: F1, active: I1, dropped: int, q: int) -> None:
-    """Drop one of the q active constraints."""
     for i in range(dropped, q - 1):
         active[i], u[i] = active[i + 1], u[i + 1]
         for j in range(q):
             R[j, i] = R[j, i + 1]
     for i in range(dropped, q - 1):
         # Givens rotations make R triangular again without the dropped column.
-        one, other = R[i, i], R[i + 1, i]
-        size = np.hypot(one, other)
+        upper, lower = R[i, i], R[i + 1, i]
+        size = np.hypot(upper, lower)
         if size == 0.0:
             continue
-        c, s = one / size, other / size
+        c, s = upper / size, lower / size
         for j in range(i, q - 1):
-            one, other = R[i, j], R[i + 1, j]
-            R[i, j], R[i + 1, j] = c * one + s * other, c * other - s * one
+            upper, lower = R[i, j], R[i + 1, j]
+            R[i, j], R[i + 1, j] = c * upper + s * lower, c * lower - s * upper
         for j in range(len(J)):
-            one, other = J[i, j], J[i + 1, j]
-            J[i, j], J[i + 1, j] = c * one + s * other, c * other - s * one
+            upper, lower = J[i, j], J[i + 1, j]
+            J[i, j], J[i + 1, j] = c * upper + s * lower, c * lower - s * upper
 
 
 @part
 def _rotate(d: F1, J: F2, j: int) -> None:
     """Rotate rows j - 1 and j so that d[j] becomes 0."""
-    one, other = d[j - 1], d[j]
-    size = np.hypot(one, other)
-    if other == 0.0:
+    upper, lower = d[j - 1], d[j]
+    size = np.hypot(upper, lower)
+    if lower == 0.0:
         return
-    c, s = one / size, other / size
+    c, s = upper / size, lower / size
     d[j - 1], d[j] = size, 0.0
     for i in range(len(J)):
-        one, other = J[j - 1, i], J[j, i]
-        J[j - 1, i], J[j, i] = c * one + s * other, c * other - s * one
+        upper, lower = J[j - 1, i], J[j, i]
+        J[j - 1, i], J[j, i] = c * upper + s * lower, c * lower - s * upper

@@ -1,7 +1,7 @@
 """Half-planes that keep a vehicle's new motion away from the motions of other vehicles.
 
 At each sampled time the boundary is normal to the line from the nearest possible position of the
-other vehicle to the position on the motion that the vehicle flies now.
+other vehicle to the vehicle's position on its motion in force.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class HalfPlanes(NamedTuple):
     """Constraints normal · p ≥ bound on positions p at some times."""
 
     time: I1
-    """Index of the time; shape (n,)."""
+    """Index into the sampled times; shape (n,)."""
     normal: F2
     """Unit vector away from the other vehicle; shape (n, axes)."""
     bound: F1
@@ -55,7 +55,7 @@ def half_planes(
     distance_m: float,
     error: StepError = EXACT,
 ) -> HalfPlanes:
-    """Half-planes normal to the lines from the others' motions to the one in force.
+    """Half-planes normal to the lines from the others' motions to the motion in force.
 
     If the step of another vehicle is not known exactly, the nearest of its possible positions is
     used, and all of them lie behind the plane.
@@ -96,7 +96,6 @@ def _half_planes(
     distance: float,
     planes: HalfPlanes,
 ) -> int:
-    """Fill in `half_planes`; returns their number."""
     scale, n, final = metric.scale, 0, len(times) - 1
     axes = len(scale)
     low, high, off, scratch = np.empty((4, axes))
@@ -114,7 +113,7 @@ def _half_planes(
         other = motion_at(others, m)
         least, capacity = shifts(error, other.error, drift)
         for i in range(len(times)):
-            # At the last time all are at rest, and those that may land have landed in the end.
+            # At the last time all are at rest, and those that may land have landed.
             descends = times[i] >= lands or (i == final and lands < NEVER)
             other_descends = times[i] + capacity >= other.lands or (
                 i == final and other.lands < NEVER
@@ -123,7 +122,6 @@ def _half_planes(
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
-            # Out of reach, the constraint could never be active; at the very same place it has no
             # Out of reach, the constraint could never be active; at the same position it has no
             # direction.
             if away >= keep + reach[i] or away == 0.0:
@@ -132,8 +130,8 @@ def _half_planes(
             for x in range(axes):
                 planes.normal[n, x] = scale[x] * off[x] / away
                 own += planes.normal[n, x] * in_force[i, x]
-            # If the two are too near already, the plane runs just behind the motion in force, which
-            # so remains a solution.
+            # If the two are too near already, the boundary runs just behind the motion in force,
+            # which thereby remains feasible.
             ahead = (way[:corners] * planes.normal[n]).sum(axis=1).max()
             planes.time[n], planes.bound[n], planes.other[n] = i, min(ahead + keep, own - 1e-4), m
             n += 1
@@ -148,10 +146,7 @@ def _possible_way(
     number.
 
     Args:
-        other: its motion.
-        step: the step.
-        least, most: bounds of the steps by which it may be ahead.
-        dt_s: length of a step [s].
+        least, most: bounds of the steps by which the other vehicle may be ahead.
         way: output [m]; shape (corners, axes).
     """
     first, last = moving_shifts(other, step, step, least, most)
@@ -174,9 +169,7 @@ def _offset_from_way(
         way: corners of the polyline; shape (n, axes).
         descends, other_descends: whether the vehicle at the point, and that on the polyline, may be
             landing.
-        scale: factors of the coordinates; shape (axes,).
-        off: output: from the nearest point to the point, scaled [m]; shape (axes,).
-        scratch: shape (axes,).
+        off: output: vector from the nearest point to `place`, scaled [m]; shape (axes,).
     """
     nearest = np.inf
     for j in range(max(len(way) - 1, 1)):

@@ -1,21 +1,22 @@
 """Mission planner: motions that keep vehicles apart and out of zones, whichever packets are lost.
 
 A motion gives the position of a vehicle at all times: a spline that ends at rest, and rest after
-that. It is sent as a trajectory with all its knots, so a vehicle that hears nothing more flies it
-to its end and hovers there. For each vehicle the server keeps every motion that may be flown:
+that. It is sent as a trajectory with all its knots, so a vehicle that receives no further packet
+flies it to its end and hovers there. For each vehicle the server keeps every motion that may be
+flown:
 
-- the one in force at its newest observation, which acknowledges it; and
-- each one sent since, as long as its packet may still be accepted. The vehicle accepts a trajectory
-  no later than `link.join_s` after its first knot, so a later observation shows for certain whether
-  it did.
+- the motion in force at its newest observation, which acknowledges it; and
+- each motion sent since, as long as its packet may still be accepted. The vehicle accepts a
+  trajectory no later than `link.join_s` after its first knot, so a later observation shows for
+  certain whether it did.
 
 A new motion is sent only if at all times it keeps the distance
 
     D = separation_m + 2 tube_m
 
-from all motions that all other vehicles may fly, wherever on these they may be given the errors of
-their clocks. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); a
-vehicle seen outside its tube is kept away from by as much more. Those motions were apart already.
+from all motions that all other vehicles may fly, at every position that the errors of their clocks
+allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); a vehicle
+observed outside its tube is kept away from by as much more. The earlier motions were apart already.
 So whichever are accepted, and whichever packets are lost or late, vehicles are `separation_m` apart
 as long as each stays in its tube (docs/together.md has the theorem). The distance from zones is
 `tube_m`. Staying on the motion in force is always possible: it needs no packet.
@@ -54,37 +55,31 @@ from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""
 ARRIVED_M = 0.02
-"""Distance from the goal within which a motion's end counts as there [m]."""
+"""Distance from the goal within which the end of a motion counts as at the goal [m]."""
 ROUNDS = 5
-"""Number of times that constraints are added for a waypoint."""
+"""Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""Share of the distance to a waypoint, 2 m at most, below which a plan counts as stuck."""
+"""A plan is stuck if it moves less than this share of the distance to its waypoint, 2 m at most."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
-"""Distance between positions tried on the way out [m], and their number."""
+"""Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Distance by which a vehicle may come nearer to the zone that it leaves [m]."""
+"""Tolerance for a vehicle that leaves a zone: it may come nearer to the zone by this [m]."""
 ZONE = "a zone"
-"""Reason for waiting: a zone is in the way."""
 CLOCK_POINTS = 33
 """Number of possible steps of a vehicle that `clock_m` evaluates."""
 BINDS_M = 1e-4
-"""Distance from a half-plane within which it counts as limiting a motion [m]."""
+"""Distance from its half-plane within which a constraint counts as limiting a motion [m]."""
 
 SILENT = np.zeros((), dtype=FIGURES)
-"""Figures of a vehicle to which nothing is sent."""
+"""Figures of a vehicle without a packet to send."""
 SILENT["gap"], SILENT["solved"] = 1, True
 
 
 class MissionPlanner(SplineScheme):
-    """Scheme "trajectory" for missions: motions that keep apart.
-
-    Args:
-        fleet: what is asked for, as its scenario's `mission` says it, and the seed of directions.
-        state: vehicles, and the motions that each may fly.
-    """
+    """Scheme "trajectory" for missions: motions that keep apart."""
 
     def __init__(self, fleet: Fleet, state: MissionState) -> None:
         super().__init__(fleet)
@@ -98,7 +93,7 @@ class MissionPlanner(SplineScheme):
         clearances = self._clearances = scenario.clearances
         self._dt_s = terms.dt_s
         self._resend_after = terms.age_max // 3
-        """Steps after which a motion is sent again, before it is too old to be flown."""
+        """Age at which a motion is sent again, before it is too old to be flown [steps]."""
         self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
         self._zones, self._lands = scenario.zones, scenario.lands
         self._waypoints = Waypoints(
@@ -109,40 +104,34 @@ class MissionPlanner(SplineScheme):
             stream(scenario.seed, "together"),
         )
         self._repeating: list[VehicleMotions] = []
-        """Vehicles whose motion is repeated at this step."""
+        """Vehicles whose latest motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
         self._scale[ALTITUDE:] = scenario.rest_scale
         """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
 
     @property
     def left_tube(self) -> list[tuple[int, float]]:
-        """See `Scheme`."""
         return self._state.left_tube
 
     @property
     def inside(self) -> list[tuple[int, str]]:
-        """See `Scheme`."""
         return self._inside
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         self._state.forget(row)
 
     def restart(self, row: int) -> bool:
-        """Note that a vehicle's client has restarted; returns whether that is news."""
         return self._state.restart(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         return self._state.observe(row, observation)
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """See `Scheme`; the observed state is used as it is."""
         n = len(rows)
         foresight.estimate[:n] = foresight.start[:n] = self._state.state[rows]
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """Plan for each vehicle every SPACING steps, not for all at the same step."""
+        """Plan for each vehicle every SPACING steps; different vehicles plan at different steps."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
         figures["expected_gap"][:n] = 0.0
@@ -171,7 +160,6 @@ class MissionPlanner(SplineScheme):
         self.planned[:n] = self._state.state[rows]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`; fills in the knots of the motions sent."""
         for i in event.nonzero()[0].tolist():
             vehicle, k = self._state.vehicles[int(rows[i])], int(step[i])
             if vehicle.repeat:
@@ -193,16 +181,14 @@ class MissionPlanner(SplineScheme):
     # -- zones -------------------------------------------------------------------------------------
 
     def change_zones(self, zones: Zones) -> None:
-        """Use other zones from now on, to which `objection` had no objection."""
+        """Use other zones from now on; the caller has asked `objection` first."""
         self._zones = zones
         self._waypoints.change_zones(zones)
         for vehicle in self._state.vehicles.values():
-            vehicle.goal = None  # what was learnt about paths to it no longer holds
+            vehicle.goal = None  # closed positions and progress belong to the old zones
 
     def objection(self, zones: Zones) -> str:
-        """Why these zones are refused: a vehicle may fly into one, or its position is unknown;
-        empty if they are accepted.
-        """
+        """Reason why these zones are refused; empty if they are accepted."""
         if zones and (number := self._state.unknown()) is not None:
             return f"zones before it is known where vehicle {number} is"
         for row, vehicle in self._state.vehicles.items():
@@ -212,8 +198,8 @@ class MissionPlanner(SplineScheme):
                 + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
-                # Earliest step that the vehicle may be at; before its first knot a motion rests
-                # there, so that a clock of which nothing is known makes no more of them.
+                # Earliest step that the vehicle may be at. Before its first knot a motion is at
+                # rest, so an unbounded clock error needs no earlier steps.
                 late = max(self._state.error(row).late, 0.0)
                 step = self._state.now + self._state.ahead(row)
                 k = math.floor(max(step - late, motion.first))
@@ -228,14 +214,13 @@ class MissionPlanner(SplineScheme):
         return ""
 
     def waits(self, row: int) -> str:
-        """Why a vehicle waits, in words; empty if it does not."""
         return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
 
     def clock_m(self, row: int) -> float | None:
         """Distance by which the clock error may displace a vehicle along its motion now [m]; None
         without a motion.
 
-        Others keep this much further away from it, along its path.
+        Other vehicles keep away by this much more, along its path.
         """
         vehicle, error = self._state.vehicles.get(row), self._state.error(row)
         if vehicle is None or vehicle.in_force is None:
@@ -249,8 +234,8 @@ class MissionPlanner(SplineScheme):
     # -- decisions ---------------------------------------------------------------------------------
 
     def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
-        """Whether a new motion may be planned for a vehicle at its step k; otherwise sets what
-        it waits for, or sends the motion in force again.
+        """Whether a motion may be planned at step k; otherwise sets `waits_for`, or repeats the
+        motion.
         """
         in_force = vehicle.in_force
         assert in_force is not None
@@ -266,9 +251,7 @@ class MissionPlanner(SplineScheme):
         return not vehicle.waits_for
 
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
-        """What a vehicle itself waits for before a motion is sent to it, in words; empty:
-        nothing.
-        """
+        """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
         if row in self._state.restarted:
             return "its client, which has begun anew"
         if vehicle.sent:
@@ -277,7 +260,7 @@ class MissionPlanner(SplineScheme):
         return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
 
     def _common_wait(self) -> str:
-        """What all vehicles wait for before motions are planned, in words; empty: nothing."""
+        """Reason why no motion is planned for any vehicle, in words; empty if there is none."""
         if self._state.absent:
             return f"vehicle {min(self._state.absent)} to begin"
         if self._state.foreign is not None:
@@ -286,7 +269,6 @@ class MissionPlanner(SplineScheme):
         return ""
 
     def _plan_to_goal(self, row: int, vehicle: VehicleMotions, k: int) -> None:
-        """Find a motion to a vehicle's goal, or to its yielding position, at its step k."""
         assert vehicle.in_force is not None
         home = self._state.goal(row)
         yields = vehicle.yielding
@@ -319,11 +301,10 @@ class MissionPlanner(SplineScheme):
             vehicle.zone_blocks = False
 
     def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
-        """Nearest position clear of zones, for a vehicle that rests within one [m]; None if it is
-        clear.
+        """Nearest position clear of zones, for a vehicle that rests within a zone [m]; None if it
+        rests outside.
 
-        No motion leads into a zone: the vehicle was there when the server started, which knew no
-        earlier zones.
+        No motion leads into a zone, so the vehicle has been there since the server started.
         """
         clearance_m = self._clearances.tube_m
         if not self._zones or self._zones.clearance(place[None]).min() >= clearance_m:
@@ -345,34 +326,25 @@ class MissionPlanner(SplineScheme):
         return None
 
     def _plan_motion(
-        self,
-        row: int,
-        vehicle: VehicleMotions,
-        k: int,
-        goal: Array,
-        targets: Array | None = None,
+        self, row: int, vehicle: VehicleMotions, k: int, goal: Array, path: Array | None = None
     ) -> None:
-        """Find a motion along a path, or towards a goal, around others in the way."""
-        vehicle.next = self._motion_toward(row, vehicle, k, goal, targets)
+        vehicle.next = self._motion_toward(row, vehicle, k, goal, path)
         self.counts["stuck"] += vehicle.next is None
 
     def _way(self, row: int, goal: Array) -> Array:
-        """Path around zones from the end of a vehicle's motion to a goal, starting there [m]."""
         in_force = self._state.vehicles[row].in_force
         assert in_force is not None
         place = in_force.motion.position[-1]
         return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
 
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
-        """Whether the asking vehicle has yet to pass the goal of the one that yields."""
+        """Whether the asking vehicle has yet to pass the goal of the yielding vehicle."""
         path = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
         (away_m,) = yielding.distance_from_way(home[None] * self._scale, path)
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
-        """Ask the first vehicle that rests at its goal in another vehicle's way to yield;
-        returns whether it does.
-        """
+        """Ask the first vehicle at rest at its goal in the way to yield; False if none does."""
         keep_m = self._clearances.planned_apart_m
         rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
@@ -408,13 +380,13 @@ class MissionPlanner(SplineScheme):
     def _motion_toward(
         self, row: int, vehicle: VehicleMotions, k: int, goal: Array, path: Array | None
     ) -> Motion | None:
-        """Motion from the one in force along a path, or if that is blocked towards a goal, away
-        from all others; None if none is found.
+        """Motion from the motion in force along a path, or if that is blocked towards a goal; None
+        if none is found.
 
-        It is added to the possible motions, so that the next vehicle's plan accounts for it.
-
-        Only constraints that a solution without them has violated are added: mostly nothing is
-        near, and the path is straight.
+        The result is added to the possible motions, so that the next vehicle's plan accounts for
+        it. Constraints are added only once a solution violates them: usually nothing is near, and
+        the
+            path is straight.
         """
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
@@ -454,7 +426,6 @@ class MissionPlanner(SplineScheme):
         return None
 
     def _half_planes(self, row: int, base: Motion, due: int) -> HalfPlanes:
-        """Half-planes of the others' motions, followed by those of zones."""
         qp, ahead = self._qp, self._state.rows.ahead[row]
         times = due + qp.times * SPACING
         in_force, _ = base.at(times, self._dt_s)
@@ -471,7 +442,7 @@ class MissionPlanner(SplineScheme):
         if not self._zones:
             return planes
         near = self._zones.planes(in_force, qp.reach_m + self._clearances.planned_clear_m)
-        # A vehicle that is too near to a zone already only has to come no nearer.
+        # A vehicle too near to a zone already only must not come nearer.
         bound = np.minimum(self._clearances.planned_clear_m, near.away_m - 1e-4)
         bound += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
@@ -482,7 +453,7 @@ class MissionPlanner(SplineScheme):
         )
 
     def _limiting_constraint(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
-        """Constraint that limits a motion most, in words."""
+        """Name of the vehicle or zone that limits a motion most; empty if none does."""
         position = self._qp.at_times(*solved)
         spare_m = np.einsum("ij,ij->i", planes.normal, position[planes.time]) - planes.bound
         binding = planes.other[spare_m < BINDS_M]
@@ -499,9 +470,8 @@ class MissionPlanner(SplineScheme):
         is for zones.
 
         Args:
-            row: row of the vehicle.
-            motion: its motion, by its own steps.
-            planned: the same, by common steps.
+            motion: the motion, by the vehicle's own steps.
+            planned: the same motion, by common steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
@@ -519,8 +489,8 @@ class MissionPlanner(SplineScheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a polyline comes too near to a zone; a zone that it starts in or too near to
-        may only be left.
+        """Whether a polyline comes too near to a zone, unless it leads away from a zone at its
+        start.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

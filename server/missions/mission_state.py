@@ -1,7 +1,7 @@
 """Mission state: the motions that each vehicle may fly, as far as the server knows.
 
-It is updated by observations, which acknowledge motions, and by the motions sent; `mission_planner`
-plans with it. The steps of all vehicles are mapped to one common grid here, so that motions can be
+Observations, which acknowledge motions, and the motions sent update it; `mission_planner` plans
+with it. The steps of all vehicles are mapped to one common grid here, so that motions can be
 compared.
 """
 
@@ -24,11 +24,15 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
-"""Largest number of steps that a motion takes."""
+"""Largest duration of a motion [steps]."""
 RESTART_STEPS = 20
+<<<<<<< HEAD
 """Steps after a client's restart up to which an observation may be from before it."""
 PLANNED = np.arange(1.0, INTERVALS + 1.0)
 """Numbers n of a motion's planned knots."""
+=======
+"""Number of steps after a client's restart in which an observation may be from before it."""
+>>>>>>> t17
 PLAN_DUE, REPEAT_DUE = 1, 2
 """Flags in `MissionState.due`: a motion may be planned for the vehicle at this step; its latest
 motion is repeated."""
@@ -40,7 +44,6 @@ class VehicleRows(NamedTuple):
     ahead: I1
     """Steps by which the vehicle is ahead of the common grid."""
     aligned: B1
-    """Whether `ahead` is known."""
     heard: B1
     """Whether an observation has arrived in this session."""
     number: I1
@@ -54,16 +57,15 @@ class VehicleRows(NamedTuple):
     sent_step: I1
     """Step of the latest motion sent and not acknowledged; 0 if there is none."""
     repeats_for: I1
-    """Steps after that up to which it is repeated, see `VehicleMotions.repeats`."""
+    """Steps after `sent_step` for which the motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
-    """Largest number of steps by which the vehicle is ahead of its counted step, see
-    `clock.StepError`."""
+    """Largest number of steps by which the vehicle is ahead of its counted step, see `StepError`.
+    """
     late: F1
-    """Largest number of steps by which it is behind."""
+    """Largest number of steps by which the vehicle is behind its counted step."""
 
     @classmethod
     def of(cls, capacity: int) -> Self:
-        """Data of rows of which nothing is known."""
         ahead, number, sent_step, repeats_for = np.zeros((4, capacity), dtype=np.int64)
         aligned, heard = np.zeros((2, capacity), dtype=np.bool_)
         observed_step, unknown_until = np.full((2, capacity), -1, dtype=np.int64)
@@ -78,13 +80,9 @@ class MissionState:
     steps.
 
     Args:
-        scenario: scenario with its mission.
-        terms: terms of the flight.
-        capacity: largest number of vehicles.
-        block: number of vehicles that are decided on at a time.
+        block: largest number of vehicles decided on together.
         references: goal of each vehicle over time, by its number.
         number_of: number of the vehicle in a row.
-        clock: step of each vehicle, and its error.
     """
 
     def __init__(
@@ -100,14 +98,12 @@ class MissionState:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.left_tube: list[tuple[int, float]] = []
-        """Vehicles that have left their tube since this was emptied, and how far outside they were
+        """Vehicles that have left their tube since the list was emptied, and their distance to it
         [m]."""
         self.state = np.zeros((capacity, terms.axes, 2))
         """Newest observed states; shape (capacity, axes, 2)."""
         self.vehicles: dict[int, VehicleMotions] = {}
-        """Motions of the vehicles, and decisions on them, by row."""
         self.number_of = number_of
-        """Number of the vehicle in a row."""
         self._references = references
         mission = scenario.make_reference()
         self.absent = set(mission.vehicles) if isinstance(mission, Mission) else set[int]()
@@ -118,15 +114,14 @@ class MissionState:
         self.kept_steps = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot up to which a motion equals the one in force."""
         self._land_after = terms.land_after if scenario.lands else NEVER
-        """Steps of hovering in silence after which a vehicle lands."""
+        """Steps of hovering without packets after which a vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
-        """Time constant and deceleration of braking without a motion [s, m/s²]."""
+        """Time constant [s] and deceleration [m/s²] of braking without a motion."""
         self.now = 0
         """Present step on the common grid: whole steps of the server's clock."""
         self.rows = VehicleRows.of(capacity)
         self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
-        """Newest observed step; shape (capacity,)."""
         self.due, self._moved_by = np.zeros((2, block), dtype=np.int64)
         """Scratch of `align`: PLAN_DUE and REPEAT_DUE of each vehicle, and the change of its offset
         on the grid."""
@@ -137,12 +132,13 @@ class MissionState:
         self._is_updated = False
         """Whether `possible` is as of the present step."""
         self._changed: set[int] = set()
-        """Rows whose motions, extra distance or offset on the grid have changed since then."""
+        """Rows whose motions, extra distance or offset on the grid have changed since the last
+        `update_possible`."""
         self.decided: set[int] = set()
         """Rows of the vehicles with a motion to be sent at their newest step."""
         self.restarted: dict[int, int] = {}
-        """Step of a client's restart without saved state, by row: until it is observed, the vehicle
-        may be anywhere on its motions."""
+        """Step of a client's restart without saved state, by row. The vehicle may be anywhere on
+        its motions until it is observed after the restart."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None if there is none."""
 
@@ -155,7 +151,7 @@ class MissionState:
             self.vehicles[row].goal = None
 
     def restart(self, row: int) -> bool:
-        """Note that a vehicle's client has restarted; returns whether that is news."""
+        """Note that a vehicle's client has restarted; False if this was known already."""
         vehicle = self.vehicles.get(row)
         if vehicle is None or row in self.restarted:
             return False
@@ -165,18 +161,14 @@ class MissionState:
         return True
 
     def brakes_m(self, vehicle: VehicleMotions) -> float:
-        """Distance that a vehicle without a motion still flies while braking, from where it was
-        observed [m]; 0 with a motion.
-        """
+        """Braking distance from the observed position, without a motion [m]; 0 with a motion."""
         brakes = vehicle.in_force is not None and vehicle.in_force.step < 0
         return self._stopping_m(vehicle) if brakes else 0.0
 
     def ahead(self, row: int) -> int:
-        """Steps by which a vehicle is ahead of the common grid."""
         return int(self.rows.ahead[row])
 
     def possible_motion(self, row: int, motion: Motion) -> PossibleMotion:
-        """Motion that a vehicle may fly, by common steps."""
         return PossibleMotion(self.in_common(row, motion), self.lands(row), self.error(row))
 
     def in_common(self, row: int, motion: Motion) -> Motion:
@@ -189,11 +181,9 @@ class MissionState:
         return lands if lands == NEVER else lands - self.ahead(row)
 
     def error(self, row: int) -> StepError:
-        """Error of the step counted for a vehicle."""
         return StepError(float(self.rows.early[row]), float(self.rows.late[row]))
 
     def note_sent(self, row: int, step: int, motion: Motion) -> None:
-        """Note a motion sent with the packet of a step."""
         vehicle = self.vehicles[row]
         vehicle.sent.append(SentMotion(step, motion))
         self._mark_changed(row, vehicle)
@@ -201,7 +191,7 @@ class MissionState:
     def unknown(self) -> int | None:
         """Number of a vehicle whose possible positions are unknown; None if there is none.
 
-        A restarted server has not heard it yet, or it flies a motion of the server before.
+        A restarted server has no observation of it yet, or it flies a motion of the earlier server.
         """
         unheard = self.absent.difference(self.rows.number[list(self.vehicles)].tolist())
         if unheard:
@@ -209,17 +199,11 @@ class MissionState:
         return None if self.foreign is None else self.number_of(self.foreign)
 
     def begins_at(self, number: int) -> Array:
-        """Start position of a vehicle on its mission [m]; shape (axes,)."""
         place: Array = self._references(number)(np.zeros(()))[:, 0]
         return place
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """Process an observation; False if it is not newer than the last.
-
-        Args:
-            row: row of the vehicle.
-            observation: the observation.
-        """
+        """Process an observation; False if it is not newer than the last."""
         if observation.step <= self.observed_step[row]:
             return False
         k = observation.step
@@ -231,28 +215,29 @@ class MissionState:
         vehicle = self.vehicles.setdefault(row, VehicleMotions())
         self.rows.number[row] = self.number_of(row)
         if observation.in_force == NO_HORIZON:
-            # It hovers or comes to rest where it is: no motion was accepted, or all have ended.
+            # The vehicle hovers or comes to rest where it is: no motion was accepted, or all have
+            # ended.
             vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
             vehicle.is_foreign = False
-            # Nor will any motion of an earlier session be accepted.
+            # No motion of an earlier session will be accepted either.
             if not observation.takes or not self.rows.heard[row]:
                 vehicle.sent.clear()
         elif vehicle.in_force is None or vehicle.in_force.step != observation.in_force:
-            taken = next(
+            accepted = next(
                 (candidate for candidate in vehicle.sent if candidate.step == observation.in_force),
                 None,
             )
-            vehicle.is_foreign = taken is None
-            if taken is None:  # of another server, or of another vehicle that was in this row
+            vehicle.is_foreign = accepted is None
+            if accepted is None:  # of another server, or of another vehicle that was in this row
                 self.rows.unknown_until[row] = observation.in_force + LONGEST
-                taken = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
-            vehicle.in_force = taken
+                accepted = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
+            vehicle.in_force = accepted
         flies_on = k <= self.rows.unknown_until[row]
         if flies_on:
             self.foreign = row
         if flies_on or vehicle.is_foreign:
             # Also at the first observation after that motion has ended: the vehicle rests there,
-            # not where it was observed before, on its way.
+            # not at an earlier observed position.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
@@ -271,7 +256,6 @@ class MissionState:
         return True
 
     def _mark_changed(self, row: int, vehicle: VehicleMotions) -> None:
-        """Mark a row whose possible or repeated motions have changed."""
         self._changed.add(row)
         vehicle.repeat = None
         self.rows.sent_step[row], self.rows.repeats_for[row] = vehicle.repeats
@@ -282,9 +266,9 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            # Its first observation may be from another run, which counts its own steps.
+            # The first observation may be from another run of the client, with steps of its own.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
-                # It may have hovered in silence for long, but not since before an earlier step.
+                # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)
             case Mode.HOVER | Mode.LAND | Mode.MANUAL | Mode.FAULT:
                 lands[row] = k
@@ -292,7 +276,7 @@ class MissionState:
                 lands[row] = k + self._land_after
 
     def _measure(self, row: int, vehicle: VehicleMotions, expected: Array) -> None:
-        """Update how far a vehicle may be from its motion."""
+        """Update the distance of a vehicle from its tube, and its speed."""
         number, state = self.number_of(row), self.state[row]
         assert vehicle.in_force is not None
         outside_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
@@ -308,13 +292,10 @@ class MissionState:
         vehicle.outside_m = 0.0 if number in self.absent else max(outside_m, 0.0)
 
     def _stopping_m(self, vehicle: VehicleMotions) -> float:
-        """Stopping distance of a braking vehicle [m]."""
         return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Resting position of a vehicle without a motion: its start on the mission, or where it
-        is.
-        """
+        """Resting position without a motion: the start of the mission if near, or as observed."""
         number = self.number_of(row)
         if number not in self.absent:
             return observed
@@ -341,7 +322,6 @@ class MissionState:
         self.foreign = None if foreign < 0 else foreign
 
     def update_possible(self) -> None:
-        """Update the possible motions of vehicles for which they have changed; once a step."""
         if self._is_updated:
             return
         self._is_updated = True
@@ -354,6 +334,7 @@ class MissionState:
         self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
+<<<<<<< HEAD
         """Present goal of a vehicle [m]; shape (axes,). In a show: where its path leads by the end
         of a motion that is planned now.
         """
@@ -369,9 +350,14 @@ class MissionState:
         """Desired positions of a vehicle [m]; shape of the times + (axes,)."""
         desired = self._references(self.number_of(row))(times_s)
         return np.ascontiguousarray(desired[..., 0])  # kernels need contiguous arrays
+=======
+        k = self.now + self.ahead(row)
+        desired = self._references(self.number_of(row))(np.array(k * self._dt_s))
+        return np.ascontiguousarray(desired[:, 0])  # kernels need contiguous arrays
+>>>>>>> t17
 
     def resting_places(self, row: int) -> list[Array]:
-        """Resting positions of all vehicles but one [m]."""
+        """Positions of the other vehicles at rest [m]."""
         places = []
         for other, each in self.vehicles.items():
             motions, now = each.motions(), self.now + self.rows.ahead[other]
@@ -389,13 +375,13 @@ def _align(
     Args:
         rows, step: the vehicles, and the step of each; shape (n,).
         now: present step on the grid.
-        vehicles: see `MissionState.rows`.
         due: output: PLAN_DUE, REPEAT_DUE, both or 0; shape (n,) at least.
         moved_by: output: change of the offset on the grid [steps]; shape (n,) at least.
 
     Returns:
         number of vehicles whose offset on the grid has changed, and the row of a vehicle that may
-        still fly a motion of another server, or -1.
+        still fly a motion of another server, or
+        -1.
     """
     moved, foreign = 0, -1
     for i in range(len(rows)):

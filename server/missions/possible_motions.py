@@ -2,9 +2,9 @@
 
 The server knows the position of each vehicle on its motion up to the error of the step that it
 counts (`clock.StepError`). Between two vehicles only the sum of both errors matters: the number of
-steps by which the other one may be ahead or behind. So one vehicle is taken at its counted step,
-and the other anywhere between two steps: a swept piece of its path, longer the faster it flies, and
-a point when it rests.
+steps by which the second vehicle may be ahead or behind. So the first vehicle is taken at its
+counted step, and the second anywhere between two steps: a swept piece of its path, longer the
+faster it flies, and a point when it rests.
 
 In three dimensions a vehicle without contact lands after a while. From the first step at which it
 may, it may be anywhere between its motion, which is at rest by then, and the ground. So in the end
@@ -25,7 +25,6 @@ from skytether.shared.law.motion import INTERVALS, JOIN_MAX, Motion
 KNOTS = INTERVALS + JOIN_MAX + 1
 """Largest number of knots of a motion."""
 NEVER = 2**62
-"""First step of landing of a vehicle that never lands."""
 
 
 class PossibleMotion(NamedTuple):
@@ -33,28 +32,22 @@ class PossibleMotion(NamedTuple):
 
     motion: Motion
     lands: int = NEVER
-    """First step at which the vehicle may begin to land."""
     error: StepError = EXACT
-    """Error of the step counted for the vehicle."""
 
 
 class MotionArrays(NamedTuple):
     """Possible motions in arrays; shapes (capacity, …)."""
 
     first: I1
-    """Step of the first knot."""
     knots: I1
-    """Number of knots."""
     row: I1
-    """Row of the vehicle."""
     lands: I1
-    """First step at which the vehicle may begin to land."""
     extra: F1
-    """Distance to keep from this motion beyond that from others [m]."""
+    """Additional distance to keep from this motion [m]."""
     early: F1
     """Largest number of steps by which the vehicle is ahead, see `clock.StepError`."""
     late: F1
-    """Largest number of steps by which it is behind."""
+    """Largest number of steps by which the vehicle is behind."""
     position: F3
     """Positions of the knots [m]; shape (capacity, KNOTS, axes)."""
     velocity: F3
@@ -62,7 +55,7 @@ class MotionArrays(NamedTuple):
     low: F2
     """Lower corner of a box around the whole motion, scaled [m]; shape (capacity, axes)."""
     high: F2
-    """Upper corner of that box."""
+    """Upper corner of the box."""
 
 
 class PossibleMotions:
@@ -70,7 +63,6 @@ class PossibleMotions:
 
     Args:
         scale: see `MotionMetric`; shape (axes,).
-        dt_s: length of a step [s].
     """
 
     def __init__(self, scale: Array, dt_s: float) -> None:
@@ -82,7 +74,6 @@ class PossibleMotions:
         self.arrays = MotionArrays._make([*numbers, *floats, *knots, *corners])
 
     def replace(self, row: int, motions: Sequence[PossibleMotion], extra_m: float = 0.0) -> None:
-        """Replace all motions of a vehicle; see `add`."""
         self.count = _remove(self.arrays, self.count, row, self.metric)
         for motion in motions:
             self.add(row, motion, extra_m)
@@ -91,9 +82,7 @@ class PossibleMotions:
         """Add a motion.
 
         Args:
-            row: row of the vehicle.
-            motion: its motion.
-            extra_m: distance to keep from this motion beyond that from others [m].
+            extra_m: additional distance to keep from this motion [m].
         """
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
@@ -103,23 +92,17 @@ class PossibleMotions:
         self.count += 1
 
     def set_errors(self, early: Array, late: Array) -> None:
-        """Replace the errors of all vehicles' steps.
-
-        Args:
-            early, late: errors by row, see `clock.StepError`; shape (capacity,).
-        """
+        """Replace the errors of all vehicles' steps, given by row; shape (capacity,)."""
         n, rows = self.count, self.rows
         self.arrays.early[:n], self.arrays.late[:n] = early[rows], late[rows]
 
     @property
     def rows(self) -> Indices:
-        """Row of the vehicle of each motion; shape (count,)."""
         return self.arrays.row[: self.count]
 
 
 @making_part  # numba counts references to what it returns
 def motion_at(arrays: MotionArrays, m: int) -> PossibleMotion:
-    """Motion at index m."""
     n = arrays.knots[m]
     return PossibleMotion(
         Motion(arrays.first[m], arrays.position[m, :n], arrays.velocity[m, :n]),
@@ -137,7 +120,6 @@ def write(
     extra: float,
     metric: MotionMetric,
 ) -> None:
-    """Store a motion at index m, see `PossibleMotions.add`."""
     position, velocity = motion.motion.position, motion.motion.velocity
     n, axes = position.shape
     arrays.first[m], arrays.knots[m], arrays.row[m] = motion.motion.first, n, row
@@ -160,15 +142,12 @@ def _add(
     extra: float,
     metric: MotionMetric,
 ) -> None:
-    """Compiled `write`."""
     write(arrays, m, row, motion, extra, metric)
 
 
 @making_kernel
 def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
-    """Remove the motions of a vehicle by moving the last ones into their places; returns the
-    number left.
-    """
+    """Remove a vehicle's motions, whose places the last ones take; returns the number left."""
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1
@@ -180,7 +159,6 @@ def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) ->
 
 @part
 def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) -> bool:
-    """Whether a box is further than a distance from the box of the motion at index m."""
     square = 0.0
     for x in range(len(low)):
         off = max(low[x] - arrays.high[m, x], arrays.low[m, x] - high[x], 0.0)
@@ -190,7 +168,7 @@ def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) 
 
 @part
 def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
-    """Height difference of two vehicles that counts as distance, if each may be landing.
+    """Height difference of two vehicles that counts as distance.
 
     Args:
         height: height of the first motion above the second [m]; may be negative.
@@ -204,11 +182,11 @@ def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
 
 @part
 def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
-    """Bounds of the steps by which another vehicle may be ahead, relative to one vehicle's counted
-    step.
+    """Bounds of the steps by which another vehicle may be ahead, relative to the first vehicle's
+    counted step.
 
     Args:
-        one, other: errors of their steps.
+        one, other: errors of the steps of both vehicles.
         drift: added for the drift of the clocks over the time looked ahead [steps].
     """
     return -other.late - one.early - drift, other.early + one.late + drift
@@ -218,12 +196,11 @@ def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float
 def moving_shifts(
     other: Motion, begin: float, end: float, least: float, most: float
 ) -> tuple[float, float]:
-    """Part of the shifts from `least` to `most` that changes where another motion is.
+    """Part of the shifts from `least` to `most` that changes the position on another motion.
 
     Args:
-        other: the motion.
-        begin, end: steps between which it is evaluated.
-        least, most: bounds of the steps by which it may be ahead.
+        begin, end: steps between which the motion is evaluated.
+        least, most: bounds of the steps by which the other vehicle may be ahead.
     """
     last = last_step(other)
     return min(max(least, other.first - end), most), max(min(most, last - begin), least)

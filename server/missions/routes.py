@@ -14,21 +14,19 @@ from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.zones import Zones
 
 NODES_MAX = 200
-"""Largest number of nodes; beyond it the corners of further zones are left out, the sharpest
-last."""
+"""Largest number of nodes; with more, corners of the last zones are left out."""
 OFF_M = 0.1
 """Distance of nodes from corners beyond the clearance [m]."""
 GRAPHS_MAX = 64
-"""Largest number of cached graphs, each for the zones at some heights."""
+"""Largest number of cached graphs, one for each choice of zones by height."""
 TINY_M = 1e-6
-"""Rounding tolerance."""
+"""Rounding tolerance [m]."""
 
 
 class Routes:
     """Routes around zones.
 
     Args:
-        zones: the zones.
         clearance_m: distance of routes from zones [m].
     """
 
@@ -37,13 +35,8 @@ class Routes:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """Shortest route: its corners, then the goal; only the goal if there is no route.
-
-        Args:
-            place, goal: positions; shape (axes,).
-
-        Returns:
-            shape (n, axes); n >= 1.
+        """Corners of the shortest route, then the goal; without a route only the goal; shape (n,
+        axes).
         """
         if not self._zones:
             return goal[None]
@@ -53,12 +46,10 @@ class Routes:
         return points
 
     def reaches(self, place: Array, goal: Array) -> bool:
-        """Whether there is a route; shapes (axes,)."""
         graph = self._graph(self._heights(place, goal))
         return bool(graph.sees(place[None, :2], self.way(place, goal)[:1, :2])[0])
 
     def _heights(self, place: Array, goal: Array) -> tuple[bool, ...]:
-        """Flags of the zones at heights between those of two positions."""
         if len(place) < 3:
             return (True,) * len(self._zones.zones)
         low, high = sorted((float(place[2]), float(goal[2])))
@@ -79,10 +70,9 @@ class Routes:
 
 
 class Graph:
-    """Visibility graph in the plane.
+    """Visibility graph in the plane; the zones are taken as infinitely high.
 
     Args:
-        zones: the zones, taken as infinitely high.
         clearance_m: distance of routes from zones [m].
     """
 
@@ -93,31 +83,29 @@ class Graph:
             clear = zones.clearance(self._nodes).min(axis=1) >= clearance_m
             self._nodes = self._nodes[clear][:NODES_MAX]
         n = len(self._nodes)
-        here, there = np.triu_indices(n, 1)
+        first, second = np.triu_indices(n, 1)
         far = np.full((n, n), np.inf)
         np.fill_diagonal(far, 0.0)
         if n > 1:
-            sees = self.sees(self._nodes[here], self._nodes[there])
-            here, there = here[sees], there[sees]
-            far[here, there] = np.linalg.norm(self._nodes[here] - self._nodes[there], axis=1)
-            far[there, here] = far[here, there]
+            sees = self.sees(self._nodes[first], self._nodes[second])
+            first, second = first[sees], second[sees]
+            far[first, second] = np.linalg.norm(self._nodes[first] - self._nodes[second], axis=1)
+            far[second, first] = far[first, second]
         after = np.where(np.isfinite(far), np.arange(n), -1)
         for via in range(n):
             longer = far > far[:, [via]] + far[[via]]
             far = np.where(longer, far[:, [via]] + far[[via]], far)
             after = np.where(longer, after[:, [via]], after)
         self._far, self._after = far, after
-        """Length of the shortest path between two nodes, infinite without one [m], and the next
-        node on it."""
+        """Length of the shortest path between two nodes [m], infinite without one, and its next
+        node."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest path between two positions; empty if there is none or it is
-        straight.
-        """
-        here, there, nodes = place[None], goal[None], self._nodes
-        if not len(nodes) or self.sees(here, there)[0]:
+        """Corners of the shortest path between two positions; empty if it is straight, or absent."""
+        start, end, nodes = place[None], goal[None], self._nodes
+        if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]
-        long = self._lengths(here)[:, None] + self._far + self._lengths(there)
+        long = self._lengths(start)[:, None] + self._far + self._lengths(end)
         via, at = np.unravel_index(int(long.argmin()), long.shape)
         if not np.isfinite(long[via, at]):
             return nodes[:0]
@@ -126,17 +114,15 @@ class Graph:
             path.append(int(self._after[path[-1], at]))
         return nodes[path]
 
-    def sees(self, here: Array, there: Array) -> Flags:
+    def sees(self, starts: Array, ends: Array) -> Flags:
         """Whether straight lines keep their clearance; shape (n,), for points of shape (n, 2)."""
-        return are_clear(self._zones, here, there, self._clearance_m - TINY_M)
+        return are_clear(self._zones, starts, ends, self._clearance_m - TINY_M)
 
-    def _lengths(self, here: Array) -> Array:
-        """Distances of nodes from a position, infinite if not joined by a clear line; shape
-        (n,).
-        """
+    def _lengths(self, start: Array) -> Array:
+        """Distances of nodes from a position [m], infinite without a clear line; shape (n,)."""
         nodes = self._nodes
-        sees = self.sees(np.repeat(here, len(nodes), axis=0), nodes)
-        return np.where(sees, np.linalg.norm(nodes - here, axis=1), np.inf)
+        sees = self.sees(np.repeat(start, len(nodes), axis=0), nodes)
+        return np.where(sees, np.linalg.norm(nodes - start, axis=1), np.inf)
 
 
 def _nodes(zones: Zones, off_m: float) -> Array:
@@ -155,6 +141,6 @@ def _nodes(zones: Zones, off_m: float) -> Array:
         straight = size[:, 0] < 1e-6
         halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
         size[straight] = 1.0
-        # On both sides: vehicles may be on either.
+        # Vehicles may be on either side.
         points += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
     return np.concatenate(points)

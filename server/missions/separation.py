@@ -1,4 +1,4 @@
-"""Separation: whether a motion comes too near to the motions that others may fly."""
+"""Separation: whether a motion comes too near to the motions that other vehicles may fly."""
 
 from typing import NamedTuple
 
@@ -31,32 +31,28 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 NEARER_M = 1e-3
 """Tolerance for motions that are too near already: a solver may bring them nearer by this [m]."""
 PIECES_MAX = 10_000
-"""Largest number of pieces sampled of a pair; ordinary motions and clocks need hundreds."""
+"""Largest number of pieces sampled for a pair; usual motions and clocks need hundreds."""
 
 
 class Pair(NamedTuple):
-    """Motions of two vehicles."""
-
     one: PossibleMotion
     other: PossibleMotion
     metric: MotionMetric
 
 
 class Span(NamedTuple):
-    """Time interval in which one motion is compared with another."""
+    """Time interval in which a motion is compared with another."""
 
     begin: float
-    """First step."""
     end: float
-    """Last step; equal to the first if the one motion rests."""
+    """Last step; equal to the first if the first motion rests."""
     least: float
-    """Least number of steps by which the other one may be ahead."""
+    """Least number of steps by which the other vehicle may be ahead."""
     most: float
-    """Largest number of steps by which it may be ahead."""
+    """Largest number of steps by which the other vehicle may be ahead."""
     descends: bool
-    """Whether the one vehicle may be landing."""
+    """Whether the first vehicle may be landing."""
     other_descends: bool
-    """Whether the other vehicle may be landing."""
 
 
 def too_near(
@@ -67,20 +63,16 @@ def too_near(
     possible: PossibleMotions,
     distance_m: float,
 ) -> Flags:
-    """Flags of the possible motions to which a planned one may come too near from a step on.
+    """Flags of the possible motions to which a planned motion may come too near; shape
+    (possible.count + 1,), with False in the last, which is for zones.
 
     Args:
-        planned: the planned motion.
-        in_force: motion in force of the same vehicle. If that is too near already (not only by the
-            error of straight pieces), the planned one must come no nearer than it by more than
-            NEARER_M: it may always fly away.
+        in_force: motion in force of the same vehicle. If it is too near already (not only by the
+            error of straight pieces), the planned motion may be nearer by NEARER_M at most: the
+            vehicle can always fly away.
         begin: first step that counts.
         row: row of the vehicle, whose own motions are left out.
-        possible: motions of all vehicles.
-        distance_m: distance to keep from them [m].
-
-    Returns:
-        shape (possible.count + 1,); the last, which is for zones, is False.
+        distance_m: distance to keep from the possible motions [m].
     """
     is_near = np.zeros(possible.count + 1, dtype=np.bool_)
     others = possible.arrays, possible.metric
@@ -99,7 +91,6 @@ def _too_near(
     distance: float,
     is_near: B1,
 ) -> None:
-    """Fill in `too_near`."""
     scratch = np.empty((6, len(metric.scale)))
     bounding_box(planned.motion, planned.lands < NEVER, metric, scratch[4], scratch[5])
     for m in range(len(is_near) - 1):
@@ -120,14 +111,10 @@ def comes_too_near(
     distance: float,
     scratch: F2,
 ) -> bool:
-    """Whether a planned motion comes too near to a possible motion of another vehicle; see
+    """Whether a planned motion comes too near to the possible motion m of another vehicle; see
     `too_near`.
 
     Args:
-        planned, in_force, begin: see `too_near`.
-        others, m: all possible motions, and the index of this one.
-        metric: scaling of distances.
-        distance: distance to keep [m].
         scratch: its last two rows are the corners of a box around the planned motion [m]; shape (6,
             axes).
     """
@@ -138,9 +125,9 @@ def comes_too_near(
     least = _least_distance(Pair(planned, other, metric), begin, keep, sides)
     if least >= keep:
         return False
-    # The bounds of both motions are compared; otherwise they could come nearer by the error of the
-    # pieces again and again. If a vehicle may land, a bound may be wrong by more than the
-    # curvature, so a motion that only seems to be too near has to keep the distance.
+    # The bounds of both motions are compared; otherwise the planned motion could come nearer by the
+    # error of the pieces again and again. If a vehicle may land, a bound may be wrong by more than
+    # the curvature, so a motion that only seems to be too near has to keep the distance.
     before = Pair(PossibleMotion(in_force, planned.lands, planned.error), other, metric)
     if least < _least_distance(before, begin, keep, sides) - NEARER_M:
         return True
@@ -154,9 +141,6 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
     """Lower bound of the distance of two motions from a step on, at most `limit` [m].
 
     Args:
-        pair: the motions.
-        begin: first step that counts.
-        limit: largest distance of interest [m].
         sides: scratch; shape (4, axes).
     """
     one, other, metric = pair.one, pair.other, pair.metric
@@ -179,8 +163,8 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
             nearest = min(nearest, within)
             i += 1
             continue
-        # With each piece the midpoints approach by no more than both fly, and the sweep may grow by
-        # a piece: together less than twice as much.
+        # With each piece the midpoints approach by no more than both vehicles fly, and the sweep
+        # may grow by a piece: together less than twice as much.
         skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
         i = max(i + 1, min(i + skipped, pieces))
     return max(nearest, 0.0)
@@ -190,15 +174,15 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
 def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
     """Upper bound of the distance of two motions from a step on, at most `limit` [m].
 
-    It is the least distance at some steps, a piece apart, and for some of their errors, each of
-    which is possible.
+    It is the least distance at some steps, a piece apart, and for some of the possible errors of
+    these steps.
     """
     one, other, metric = pair.one, pair.other, pair.metric
     least, most = shifts(one.error, other.error, 0.0)
     piece = SPACING / SAMPLES
-    # At the last step both rest, and have landed if they ever do.
+    # At the last step both vehicles rest, and those that ever land have landed.
     last = max(last_step(one.motion), last_step(other.motion) - least)
-    # Any steps give an upper bound: of a clock of which nothing is known, not all are tried.
+    # Any steps give an upper bound: if the clock error is unbounded, not all are tried.
     pieces = int(np.ceil(min(max((last - begin) / piece, 0.0), PIECES_MAX))) + 1
     nearest = limit
     for i in range(pieces + 1):
@@ -222,16 +206,16 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
 
 @part
 def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
-    """Difference of two motions on an axis, the other one shifted by some steps, scaled [m]."""
+    """Scaled difference of two motions on an axis, the other motion `shift` steps ahead [m]."""
     dt_s = pair.metric.dt_s
-    here = position_at(pair.one.motion, x, step, dt_s)
-    return pair.metric.scale[x] * (here - position_at(pair.other.motion, x, step + shift, dt_s))
+    position = position_at(pair.one.motion, x, step, dt_s)
+    return pair.metric.scale[x] * (position - position_at(pair.other.motion, x, step + shift, dt_s))
 
 
 @part
 def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float) -> Span:
-    """Time interval number `i` from a step on: first the pieces until the one motion ends, then
-    all the time until the other rests too, then the time when all that ever land have landed.
+    """Time interval number `i` from a step on: first the pieces until the first motion ends, then
+    the time until the other rests too, then the time when all that ever land have landed.
     """
     other, lands, other_lands = pair.other.motion, pair.one.lands, pair.other.lands
     last = last_step(other)
@@ -251,9 +235,7 @@ def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
     """Distance of the midpoints of two motions in a time interval [m].
 
     Args:
-        pair: the motions.
-        span: the interval.
-        lands: whether either may ever land, so that heights do not count.
+        lands: whether either vehicle may ever land, so that heights do not count.
     """
     square = 0.0
     middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
@@ -269,7 +251,7 @@ def _least_distance_within(
 ) -> float:
     """Lower bound of the distance of two motions in a time interval [m].
 
-    The shift of the other one is divided into slices no longer than a piece. In a slice the
+    The shift of the other motion is divided into slices no longer than a piece. In a slice the
     difference of the two motions is p + t a + s b + t s c for t and s from -1/2 to 1/2, with c
     small: a parallelogram, with an error of at most |c| / 4.
     """

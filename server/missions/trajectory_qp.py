@@ -10,8 +10,8 @@ and each time,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
-where q is that motion, or the zone's nearest point, and p̃ the motion in force. That fulfils all
-constraints, so there is always a solution.
+where q is the near motion, or the zone's nearest point, and p̃ the motion in force. The motion in
+force fulfils all constraints, so there is always a solution.
 
 For a vehicle far from all others there are no half-planes, and no constraint couples the axes:
 `solve_axes` solves them one by one. Its result equals that of `solve` to the last bit, where the
@@ -46,14 +46,12 @@ LAST_WEIGHT = 5.0
 
 
 class QPConstants(NamedTuple):
-    """Constants of all motion QPs."""
-
     T: float
-    """Time from one knot of a motion to the next [s]."""
+    """Time between successive knots of a motion [s]."""
     acceleration: float
     """Largest acceleration on an axis, a_max [m/s²]."""
     most: F1
-    """Bound of v_n + τ a_n on each axis, u [m/s]; shape (axes,)."""
+    """Bound u of v_n + τ a_n [m/s]; shape (axes,)."""
     weights: F1
     """Weights w_n of positions; shape (N,)."""
     to_position: F2
@@ -61,7 +59,7 @@ class QPConstants(NamedTuple):
     times: F1
     """Times at which distances are kept [intervals]; shape (times,)."""
     to_sample: F2
-    """Positions at these times from accelerations [s²]; shape (times, N)."""
+    """Positions at `times` from accelerations [s²]; shape (times, N)."""
 
 
 class AxisProblem(NamedTuple):
@@ -81,7 +79,6 @@ class TrajectoryQP:
     """Solver of the QP for one motion.
 
     Args:
-        terms: terms of the flight.
         acceleration_mps2: largest acceleration on an axis, a_max [m/s²].
         speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
     """
@@ -92,14 +89,14 @@ class TrajectoryQP:
         tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
         most = INPUT_SHARE * np.array(terms.u_max) * gain
         if speed_mps:
-            # A bound per axis keeps the constraints linear: exact on the diagonal, cautious along
+            # A bound per axis keeps the constraints linear: exact on the diagonal, stricter along
             # an axis.
             most = np.minimum(most, speed_mps / np.sqrt(axes))
         place = np.arange(n)
         to_velocity = T * np.tril(np.ones((n, n)))
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * TIMES_PER_INTERVAL + 1) / TIMES_PER_INTERVAL
-        """Times at which distances are kept, from the begin of the plan [intervals]."""
+        """Times at which distances are kept, from the beginning of the plan [intervals]."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         hessian = to_position.T @ (weights[:, None] * to_position)
@@ -111,7 +108,7 @@ class TrajectoryQP:
         self.constants = QPConstants(
             T, acceleration_mps2, most, weights, to_position, self.times, to_sample
         )
-        # Bounds of the input v + τ a at the end and at the begin of each interval.
+        # Bounds of the input v + τ a at the end and at the beginning of each interval.
         ends = [to_velocity + tau_s[x] * np.eye(n) for x in range(axes)]
         before = np.vstack([np.zeros(n), to_velocity[:-1]])
         begins = [before + tau_s[x] * np.eye(n) for x in range(axes)]
@@ -135,11 +132,10 @@ class TrajectoryQP:
             x=np.zeros(n),
             scratch=workspace(n, m),
         )
-        """QPs of single axes."""
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
-        """Largest distance at these times between two motions from the same state [m]."""
+        """Largest distance at `times` between two motions from the same state [m]."""
 
     def solve(
         self, kept_p: Array, kept_v: Array, targets: Array, planes: HalfPlanes | None = None
@@ -148,8 +144,8 @@ class TrajectoryQP:
         without a solution.
 
         Args:
-            kept_p, kept_v: knots of the motion in force up to the begin of the plan [m, m/s]; shape
-                (kept, axes).
+            kept_p, kept_v: knots of the motion in force up to the beginning of the plan [m, m/s];
+                shape (kept, axes).
             targets: g_1 … g_N [m]; shape (N, axes).
             planes: constraints on positions at `times`.
         """
@@ -173,8 +169,7 @@ class TrajectoryQP:
         """QP for `DualActiveSet`: linear term, columns of the constraints, and their bounds.
 
         Args:
-            p0, v0: state at the begin of the plan [m, m/s]; shape (axes,).
-            targets, planes: see `solve`.
+            p0, v0: state at the beginning of the plan [m, m/s]; shape (axes,).
         """
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
@@ -198,7 +193,6 @@ class TrajectoryQP:
 
 @kernel
 def _fill_qp(constants: QPConstants, p0: F1, v0: F1, targets: F2, linear: F1, bounds: F1) -> None:
-    """Fill in the linear term, and the bounds of the constraints that are always present."""
     axes = len(p0)
     for x in range(axes):
         _fill_axis(constants, x, p0[x], v0[x], targets, linear, bounds, x, axes)
@@ -221,7 +215,7 @@ def _fill_axis(
     bounds[at] = -v
     for i in range(n):
         linear[at * n + i] = 0.0
-        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and begins of
+        # In the order of `TrajectoryQP._fixed`: accelerations, inputs at the ends and beginnings of
         # intervals, each lower and then upper bound.
         for group, limit in enumerate((-a, -most - v, -most - v, -a, v - most, v - most)):
             bounds[axes + (group * axes + at) * n + i] = limit
@@ -239,10 +233,9 @@ def solve_axes(
     """Fill in the knots of a motion without half-planes; returns whether there is a solution.
 
     Args:
-        constants, problem: see `TrajectoryQP`.
-        kept: number of given knots, those of the motion in force.
+        kept: number of knots taken from the motion in force.
         targets: g_1 … g_N [m]; shape (N, axes).
-        position, velocity: knots, the given ones first [m, m/s]; shape (kept + N, axes).
+        position, velocity: knots, the kept ones first [m, m/s]; shape (kept + N, axes).
     """
     linear, bounds = problem.linear, problem.bounds
     for x in range(targets.shape[1]):
@@ -284,7 +277,6 @@ def _integrate_axis(
 def _append_half_planes(
     constants: QPConstants, p0: F1, v0: F1, planes: HalfPlanes, columns: F2, bounds: F1
 ) -> None:
-    """Fill in the columns and bounds of half-planes, which come last."""
     n, fixed = len(constants.weights), len(bounds) - len(planes.time)
     for m in range(len(planes.time)):
         at = planes.time[m]
@@ -301,7 +293,6 @@ def _append_half_planes(
 def _integrate(
     constants: QPConstants, accelerations: F1, kept: int, position: F2, velocity: F2
 ) -> None:
-    """Fill in the planned knots from the accelerations."""
     n = len(constants.weights)
     for x in range(position.shape[1]):
         _integrate_axis(constants, accelerations, x * n, x, kept, position, velocity)
@@ -316,7 +307,6 @@ def _positions(times: Array, place: Indices, T: float) -> Array:
 
 
 def _blocks(blocks: list[Array]) -> Array:
-    """Block-diagonal matrix."""
     rows, columns = (sum(block.shape[axis] for block in blocks) for axis in (0, 1))
     whole, row, column = np.zeros((rows, columns)), 0, 0
     for block in blocks:

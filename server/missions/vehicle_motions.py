@@ -1,8 +1,8 @@
 """Motions that one vehicle on a mission may fly, as far as the server knows.
 
 A motion that is not acknowledged is repeated unchanged while it may still be accepted. If a motion
-or its acknowledgement is lost, nothing can be planned until an observation shows that; so after
-such a loss the next motions are sent twice, and then three times.
+or its acknowledgement is lost, no motion can be planned until a later observation; so after such a
+loss the next motions are sent twice, and then three times.
 """
 
 import math
@@ -16,77 +16,67 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Motion
 
 COPIES_MAX = 3
-"""Largest number of times that a motion is sent."""
 COPY_STEPS = 4
-"""Steps between repeats."""
 PATIENCE_STEPS = 120
-"""Steps without coming nearer to its goal after which a vehicle asks another to yield."""
+"""Number of steps without progress towards its goal after which a vehicle asks another to yield."""
 CLOSED_MAX = 8
-"""Largest number of positions that count as closed."""
+"""Largest number of closed positions."""
 NEARER_M = 0.3
-"""Distance that counts as having come nearer [m]."""
+"""Reduction of the remaining path that counts as progress [m]."""
 PROMPT_COUNT = 8
-"""Number of successive motions acknowledged at once after which they are sent less often."""
+"""Number of successive motions acknowledged at once after which motions are sent less often."""
 
 
 class SentMotion(NamedTuple):
-    """A motion that was sent."""
-
     step: int
-    """Step of its packet."""
     motion: Motion
 
 
 class VehicleMotions:
-    """Motions of one vehicle, and decisions on them."""
-
     def __init__(self) -> None:
         self.in_force: SentMotion | None = None
-        """Motion that it flies, with its packet's step; None before the first observation."""
+        """Motion that the vehicle flies; None before the first observation."""
+
         self.is_foreign = False
         """Whether `in_force` stands for a motion of another server: the vehicle rests where it was
         last observed, or is still flying."""
         self.sent: deque[SentMotion] = deque(maxlen=64)
-        """Motions sent after that, oldest first, that may still be accepted."""
+        """Motions sent after the motion in force, oldest first, that may still be accepted."""
         self.next: Motion | None = None
-        """Motion to be sent at this step."""
         self.turned_rad = 0.0
-        """Angle by which its waypoints are turned to the right of its goal [rad]."""
+        """Angle by which waypoints are turned to the right of the goal [rad]."""
         self.outside_m = 0.0
-        """Distance outside its tube when last observed [m]."""
+        """Distance outside the tube when last observed [m]."""
         self.speed_mps = 0.0
-        """Speed when last observed [m/s]."""
         self.detour: Routes | None = None
-        """Routes around resting vehicles where it was stuck; None if it never was."""
+        """Routes around resting vehicles where the vehicle was stuck; None if it never was."""
         self.detour_until = 0
-        """Step up to which it uses them."""
+        """Step until which `detour` is used."""
         self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
         """Positions on routes between zones that are too close for a motion [m]."""
         self.goal: Array | None = None
-        """Latest goal that it flew to [m]; shape (axes,); None before the first, and when what was
-        learnt about routes to it no longer holds."""
+        """Goal to which progress is measured [m]; shape (axes,). None before the first, and after
+        the zones or the client's steps have changed."""
         self.remaining_m = 0.0
-        """Shortest remaining path to that goal so far [m]."""
+        """Shortest remaining path to `goal` so far [m]."""
         self.progress_step = 0
-        """Step at which it came that near, or last asked another to yield."""
+        """Step of the latest progress, or of the latest request to yield."""
         self.zone_blocks = False
-        """Whether a zone has held it back since it was last found stuck."""
+        """Whether a zone has limited its plans since it was last found stuck."""
         self.yielding: Yielding | None = None
-        """Position to which it yields; None if it flies to its own goal."""
+        """Temporary goal of a yielding vehicle; None if it flies to its own goal."""
         self.in_zone = False
-        """Whether it rests within a zone, or too near to one."""
         self.waits_for = ""
-        """Why it waits, in words for the operator; empty if it does not."""
+        """Reason for waiting, for the operator; empty if it does not wait."""
 
         self.copies = 1
-        """Number of times that a motion is sent to it."""
+        """Number of times that a motion is sent."""
         self.prompt_count = 0
-        """Number of successive motions that it acknowledged at once."""
+        """Number of successive motions acknowledged at once."""
         self.repeat: SentMotion | None = None
-        """Motion that is repeated at this step."""
 
     def motions(self) -> list[Motion]:
-        """Motions that may be flown, including the one to be sent at this step."""
+        """Motions that may be flown, including the motion to be sent at this step."""
         motions = [self.in_force.motion] if self.in_force else []
         motions += [sent.motion for sent in self.sent]
         if self.next and not (self.in_force and self.next is self.in_force.motion):
@@ -106,11 +96,10 @@ class VehicleMotions:
             self.copies = max(self.copies - 1, 1)
 
     def is_stuck(self, step: int, goal: Array, remaining_m: float) -> bool:
-        """Whether it has come no nearer to its goal for PATIENCE_STEPS; True at most once in that
-        time.
+        """Whether there was no progress for PATIENCE_STEPS; True at most once in that time.
 
         Args:
-            step: k, by its own count.
+            step: k, by the vehicle's own count.
             goal: its goal [m]; shape (axes,).
             remaining_m: length of the remaining path [m].
         """
@@ -126,15 +115,12 @@ class VehicleMotions:
         return False
 
     def repeat_at(self, step: int) -> SentMotion | None:
-        """Motion to be repeated at a step; None if there is none."""
         sent_step, repeats_for = self.repeats
         return self.sent[-1] if repeats_after(step - sent_step, repeats_for) else None
 
     @property
     def repeats(self) -> tuple[int, int]:
-        """Step of the latest motion sent, and number of steps after it up to which it is
-        repeated, every COPY_STEPS; 0 if there is none.
-        """
+        """Step of the latest motion sent, and number of steps for which it is repeated; or 0, 0."""
         if not self.sent:
             return 0, 0
         return self.sent[-1].step, (self.copies - 1) * COPY_STEPS
@@ -142,10 +128,5 @@ class VehicleMotions:
 
 @shared
 def repeats_after(since: int, repeats_for: int) -> bool:
-    """Whether a motion is repeated.
-
-    Args:
-        since: steps since it was first sent.
-        repeats_for: steps after that up to which it is, see `VehicleMotions.repeats`.
-    """
+    """Whether a motion is repeated `since` steps after it was first sent, see `repeats`."""
     return 0 < since <= repeats_for and since % COPY_STEPS == 0

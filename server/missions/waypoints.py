@@ -1,5 +1,5 @@
-"""Waypoint selection: a vehicle's goal, a point on its route around zones, or one to the right of
-it.
+"""Waypoint selection: a vehicle's goal, a point on its route around zones, or a point to the right
+of it.
 
 A stuck vehicle also flies around resting vehicles for a while, and its waypoints turn further and
 further to the right, finally to random directions: so vehicles that meet pass each other.
@@ -22,25 +22,22 @@ TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """Angles to the right by which waypoints of a stuck vehicle turn: step, largest before random
 directions, and step back once it moves [rad]."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Distance within which a stuck vehicle flies around resting ones [m], and for how long [s]."""
+"""Distance and time for which a stuck vehicle flies around resting vehicles [m, s]."""
 CLOSED_M = 0.6
-"""Least distance ahead of a vehicle at which its route is closed [m]; three tubes if that is
-more."""
+"""Least distance ahead of a vehicle at which its route is closed [m]; at least three tubes."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
 """Corners of an octagon around 0, of radius 1; shape (8, 2)."""
 TRIES = 5
-"""Number of directions tried at a time."""
+"""Number of directions tried at a step."""
 
 
 class Waypoints:
     """Waypoints of the vehicles of a mission.
 
     Args:
-        zones: the zones.
         tube_m: distance of motions from zones [m].
         apart_m: distance of motions from each other [m].
-        detour_steps: steps for which a stuck vehicle flies around others.
-        rng: source of random directions.
+        detour_steps: number of steps for which a stuck vehicle flies around others.
     """
 
     def __init__(
@@ -57,7 +54,6 @@ class Waypoints:
         self.change_zones(zones)
 
     def change_zones(self, zones: Zones) -> None:
-        """Replace the zones that routes lead around."""
         self._zones, self.routes = zones, Routes(zones, self._tube_m)
 
     def candidates(
@@ -69,14 +65,11 @@ class Waypoints:
         resting_places: Callable[[], Sequence[Array]],
     ) -> Iterator[Array]:
         """Waypoints to try in turn: on the route to the goal, its next corner, and to the right of
-        that.
+        that corner.
 
         Args:
-            vehicle: the vehicle.
-            k: its step.
-            place: position at the begin of the plan [m]; shape (axes,).
-            goal: shape (axes,).
-            resting_places: returns the positions at which others rest [m]; shape (axes,) each.
+            place: position at the beginning of the plan [m]; shape (axes,).
+            resting_places: returns the positions of the other vehicles at rest [m].
         """
         way = self._ways_of(vehicle, k).way(place, goal)
         if not vehicle.turned_rad:
@@ -106,9 +99,8 @@ class Waypoints:
                 vehicle.turned_rad = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
 
     def _ways_of(self, vehicle: VehicleMotions, k: int) -> Routes:
-        """Routes that a vehicle uses at a step: around what it was stuck at, or around zones."""
-        is_taken = k < vehicle.detour_until or vehicle.closed
-        return vehicle.detour if vehicle.detour and is_taken else self.routes
+        uses_detour = k < vehicle.detour_until or vehicle.closed
+        return vehicle.detour if vehicle.detour and uses_detour else self.routes
 
     def close_way(self, vehicle: VehicleMotions, k: int, place: Array, goal: Array) -> bool:
         """Close the route ahead of a vehicle until it has another goal, if there is another route;
@@ -116,12 +108,6 @@ class Waypoints:
 
         Routes keep `tube_m` from zones, and motions a margin more: between two zones there may be
         space for a route but not for a motion.
-
-        Args:
-            vehicle: the vehicle.
-            k: its step.
-            place: position at the begin of the plan [m]; shape (axes,).
-            goal: shape (axes,).
         """
         way = self._ways_of(vehicle, k).way(place, goal)
         ahead = _along(place, way, self._closed_m)
@@ -135,8 +121,8 @@ class Waypoints:
     def _detour(
         self, place: Array, goal: Array, resting: Iterable[Array], closed: Iterable[Array]
     ) -> Routes:
-        """Routes around zones, closed positions, and vehicles that rest nearby, except those at
-        the goal.
+        """Routes around zones, closed positions, and vehicles at rest nearby that are not at the
+        goal.
         """
         zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m
         for at in resting:
@@ -162,7 +148,6 @@ def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:
 
 
 def _along(place: Array, way: Array, far_m: float) -> Array:
-    """Point at a distance ahead on a route, or its end."""
     for corner in way:
         step_m = float(np.linalg.norm(corner - place))
         if step_m >= far_m:

@@ -1,6 +1,6 @@
-"""Yielding: vehicles at rest make way for one that cannot pass them.
+"""Yielding: vehicles at rest make way for a vehicle that cannot pass them.
 
-A vehicle that has come no nearer to its goal for a while asks the first vehicle at rest at its own
+A vehicle without progress towards its goal for a while asks the first vehicle at rest at its own
 goal that stands in the way to yield. That vehicle flies to a position off the way, waits there
 until the other has passed, and flies back. Only its goal changes meanwhile: its motions are
 planned, checked and sent like any other.
@@ -21,23 +21,21 @@ YIELD_S = 30.0
 AHEAD_M = 4.0
 """Length of the path ahead on which vehicles are asked to yield [m]."""
 DIRECTIONS = 12
-"""Number of directions from its goal in which a position is searched."""
+"""Number of directions in which a yielding position is searched."""
 FURTHER = (1.2, 1.8, 2.7, 4.0)
-"""Distances of such positions from the goal, as multiples of the distance between vehicles."""
+"""Distances of yielding positions from the goal, as multiples of the distance between vehicles."""
 
 NO_NEARER_M = 1e-4
-"""Tolerance for a vehicle that must come no nearer, since its motion is checked in pieces [m]."""
+"""Tolerance for a vehicle that must not come nearer, since its motion is checked in pieces [m]."""
 
 
 class Yielding(NamedTuple):
-    """Yielding of a vehicle."""
-
     place: Array
     """Temporary goal [m]; shape (axes,)."""
     asker: int
     """Row of the vehicle that is to pass."""
     until: int
-    """Common step at which it goes back, whether or not that vehicle has passed."""
+    """Common step at which the vehicle flies back, even if the asking vehicle has not passed."""
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:
@@ -48,7 +46,7 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 
     Args:
         way: the path: start, corners and end [m]; shape (n, axes).
-        places: the positions; shape (m, axes) [m].
+        places: the positions [m]; shape (m, axes).
         apart_m: distance between vehicles [m].
     """
     passed_m, kept_m = 0.0, _kept_distance(places, way[0], apart_m)
@@ -63,19 +61,17 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 
 
 def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
-    """Distances to keep between vehicles at some positions and one at another [m]; shape (n,).
+    """Distances to keep between a vehicle at `at` and vehicles at some positions [m]; shape (n,).
 
-    Plans keep a margin more than motions must: vehicles at rest may be nearer than that, and then
-    only have to come no nearer.
+    Plans keep a larger distance than motions must. A vehicle that is nearer already must only not
+    come nearer.
     """
     kept: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
     return kept
 
 
 def distance_from_way(places: Array, way: Array) -> Array:
-    """Distances of positions from a path [m]; shape (n,), of shapes (n, axes) and (corners,
-    axes).
-    """
+    """Distances of positions (n, axes) from a path (corners, axes) [m]; shape (n,)."""
     starts, along = way[:-1], np.diff(way, axis=0)
     from_start = places[:, None] - starts
     length = np.maximum((along**2).sum(axis=1), 1e-12)
@@ -97,12 +93,11 @@ def place_to_yield(
     """Nearest position off a path to which a vehicle at rest can go; None if there is none.
 
     Args:
-        home: where it rests [m]; shape (axes,).
+        home: position where it rests [m]; shape (axes,).
         way: path of the vehicle that is to pass, from its position [m]; shape (n, axes).
         others: present or future resting positions of the other vehicles [m]; shape (m, axes).
         apart_m: distance between vehicles [m].
         scale: factors of coordinates in distances between vehicles; shape (axes,).
-        zones, routes: the zones, and the routes around them.
         clearance_m: distance from zones [m].
     """
     turn = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS

@@ -17,8 +17,7 @@ class PlanMemory(NamedTuple):
     """Latest plans of both MPCs for every vehicle."""
 
     # Inputs are float32, and states are computed from them anew: 0.8 MB for a thousand vehicles.
-    # With float64 and the states stored it was four times as large, and exceeded the cache of a
-    # core.
+    # With float64 and stored states it was four times as large, and exceeded the cache of a core.
     inputs: S4
     """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
     start: F3
@@ -39,8 +38,8 @@ class Draft(NamedTuple):
     guess: F3
     """Shifted plan of the previous step [m/s]; shape (block, axes, H)."""
     inputs: S4
-    """Inputs U(k) of both MPCs, rounded: planning continues with what is really sent [m/s]; shape
-    (2, block, axes, H)."""
+    """Inputs U(k) of both MPCs, rounded, since planning continues with the inputs as sent [m/s];
+    shape (2, block, axes, H)."""
     distance: F1
     """Scratch: squared distances [m²]; shape (H + 1,)."""
 
@@ -51,7 +50,7 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True
-    # After a gap longer than H nothing of the previous plan is left (E17).
+    # After a gap longer than H no input of the previous plan is left (E17).
     plan.fresh = last < 0 or not 0 <= start - last <= memory.inputs.shape[3]
 
 
@@ -59,7 +58,7 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
 def planned_state(
     mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
 ) -> tuple[float, float]:
-    """Planned state x_p(k|k-1) on one axis: that of the generator's previous plan after `plan.gap`
+    """Planned state x_p(k|k-1) on one axis: state of the generator's previous plan after `plan.gap`
     steps.
 
     Source: eq. (14).
@@ -81,17 +80,12 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add the squared deviations of flying on with `held` from the generator's previous plan on one
-    axis.
+    """Add the squared deviations, on one axis, of flying on with `held` from the generator's
+    previous plan.
 
     Args:
-        mpc: the problem.
-        memory: previous plans.
-        foresight: predictions for the vehicles.
-        plan: record of the vehicle's plan.
         i: index of the vehicle in the block.
-        axis: the axis.
-        distance: sum to which each stage adds, as far as both are flown [m²]; shape (H + 1,).
+        distance: sums to which the stages add, as far as both are flown [m²]; shape (H + 1,).
     """
     held, flown = foresight.held[i, axis], foresight.usable[i]
     model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)
@@ -119,11 +113,9 @@ def _add_gap(
     change: F1,
     cost: float,
 ) -> float:
-    """Add to `cost` twice the excess cost of other inputs over the optimal ones on one axis.
+    """Add to `cost` twice the excess cost of other inputs over the optimal inputs on one axis.
 
     Args:
-        mpc: the problem.
-        axis: the axis.
         x: difference of the state at stage 0 [m, m/s].
         held: the other inputs [m/s]; shape (H,).
         u: the optimal inputs [m/s]; shape (H,).
@@ -142,7 +134,6 @@ def _add_gap(
 
 @lanes
 def copy(numbers: Inputs, to: Inputs) -> None:
-    """Copy numbers to the beginning of an array."""
     for i in range(len(numbers)):
         to[i] = numbers[i]
 

@@ -4,19 +4,18 @@ A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the opt
 
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0
 
-So with a given set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in
-O(H), where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of
-each stage: beyond the bound the stage belongs in the set, otherwise it does not. A set that
-reproduces itself is optimal. From the shifted plan of the previous step this takes one or two
-iterations. The set may cycle instead (long steps, a tiny R, corners of the reference); then only
-the input with the largest violation changes, one per iteration. If that does not converge either,
-DAQP, a dual active-set method, solves the QP, and its answer is used only if it meets the
-optimality conditions.
+So for a fixed set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in O(H),
+where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of each
+stage: beyond the bound the stage belongs in the set, otherwise it does not. A set that reproduces
+itself is optimal. From the shifted plan of the previous step this takes one or two iterations. The
+set may cycle instead (long steps, a tiny R, corners of the reference); then only the input with the
+largest violation changes, one per iteration. If that does not converge either, DAQP, a dual
+active-set method, solves the QP, and its answer is used only if it meets the optimality conditions.
 
-One vehicle alone would be served as well by DAQP (24 µs for 10 in a hot loop, the same in a paced
-one). This solver is kept for many: it solves vehicles side by side, and takes 0.9 to 1.7 µs for
-each of 64 and 0.8 to 1.8 µs for each of 1000, where DAQP, called for one after the other, takes
-13 to 17 and 21 to 29 µs (axes 2, H = 50; measured in one run at commit df76e24).
+For a single vehicle DAQP is as fast (24 µs for 10 in a hot loop, the same in a paced loop). This
+solver is kept for many vehicles: it solves them side by side, and takes 0.9 to 1.7 µs for each of
+64 and 0.8 to 1.8 µs for each of 1000, where DAQP, called for one vehicle after the other, takes 13
+to 17 and 21 to 29 µs (axes 2, H = 50; measured in one run at commit df76e24).
 """
 
 from typing import NamedTuple
@@ -44,9 +43,9 @@ ROUNDS_MAX = 8
 PIVOTS_MAX = 200
 """Number of further iterations, in which one input enters or leaves the set."""
 SNAP = 1e-12
-"""Distance from its bound within which DAQP's input is moved onto it [m/s]."""
+"""Distance from its bound within which DAQP's input is moved onto the bound [m/s]."""
 RESIDUAL_MAX = 1e-7
-"""Largest relative residual of the optimality conditions, by the gradient, of an answer of DAQP."""
+"""Largest residual of the optimality conditions of DAQP's answer, relative to the gradient."""
 
 # Quantities of a stage that depend on the active set alone. The cost to go from the stage is ½ c u²
 # + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
@@ -55,8 +54,6 @@ K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
 
 
 class RiccatiWorkspace(NamedTuple):
-    """Tables and scratch arrays of a solver."""
-
     free: F4
     """Backward passes with every input free, for FIRST and LATER weights and each axis; shape (2,
     axes, H, 7)."""
@@ -72,7 +69,7 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 @part
 def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, Three]:
-    """One stage of a backward pass: its columns from S0 to F11, and P before W is added.
+    """One stage of a backward pass: s, k, 1 / c and F of the stage, and P before W is added.
 
     Args:
         model: eq. (4) on one axis.
@@ -121,13 +118,7 @@ def _first_set(bound: float, simd: SimdBatch) -> None:
 
 @lanes
 def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
-    """One iteration with every input of every vehicle free.
-
-    Args:
-        mpc, axis: the problem.
-        simd: the vehicles.
-        stages: its backward pass; shape (H, 7).
-    """
+    """One iteration with every input free; `stages` is the backward pass, shape (H, 7)."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1 = model.b0, model.b1
     q0, q1, x0, x1 = simd.p, simd.v, simd.leader_p, simd.leader_v
@@ -202,8 +193,6 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
     """Forward pass: each stage's unconstrained choice decides on the active set.
 
     Args:
-        mpc, axis: the problem.
-        simd: the vehicles.
         singly: whether only the input with the largest violation may change the set.
     """
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
@@ -241,7 +230,6 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
 
 @lanes
 def _change_worst(simd: SimdBatch) -> None:
-    """Let the input with the largest violation enter or leave each vehicle's active set."""
     for lane in range(len(simd.p)):
         i = int(simd.worst_at[lane])
         if i >= 0:
@@ -251,7 +239,6 @@ def _change_worst(simd: SimdBatch) -> None:
 
 @lanes
 def _any(number: F1) -> bool:
-    """Whether a number is positive for any vehicle."""
     is_any = False
     for lane in range(len(number)):
         is_any |= number[lane] > 0.0
@@ -260,17 +247,13 @@ def _any(number: F1) -> bool:
 
 @part
 def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, settled: B1) -> int:
-    """Fill in the optimal inputs of one axis.
+    """Fill in the optimal inputs of one axis; returns the number of iterations.
 
     Args:
-        mpc, axis: the problem.
         which: FIRST or LATER weights.
         simd: reads gradient and previous, whose active set is the first; fills in inputs [m/s].
-        free: of `RiccatiWorkspace`.
+        free: `RiccatiWorkspace.free`.
         settled: set to False for a vehicle without a solution; shape (L,).
-
-    Returns:
-        number of iterations.
 
     Source: eqs. (6), (8), (10).
     """
@@ -299,7 +282,6 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
 
 @kernel
 def _table(mpc: MPC, work: RiccatiWorkspace) -> None:
-    """Fill in the backward passes with every input free."""
     W = mpc.weights.states
     for which in range(2):
         for axis in range(len(mpc.model)):
@@ -316,9 +298,7 @@ def _table(mpc: MPC, work: RiccatiWorkspace) -> None:
 def _solve(
     mpc: MPC, which: int, work: RiccatiWorkspace, gradient: F3, guess: F3, inputs: F3, settled: B1
 ) -> None:
-    """Fill in inputs (n, axes, H) of n vehicles and which are solved, (axes n,); see
-    `active_sets`.
-    """
+    """Fill in the inputs of n vehicles (n, axes, H), and which are solved (axes n,)."""
     alone, together, n = simd_batch(work.memory), simd_batch(work.together), len(gradient)
     for axis in range(len(mpc.model)):
         first = 0
@@ -336,7 +316,6 @@ def _solve(
 
 
 def workspace(mpc: MPC) -> RiccatiWorkspace:
-    """Workspace for the problems of an MPC."""
     axes, H = len(mpc.model), len(mpc.weights.states)
     work = RiccatiWorkspace(np.empty((2, axes, H, 7)), simd_memory(H, 1), simd_memory(H, WIDTH))
     _table(mpc, work)
@@ -353,10 +332,9 @@ class ExactSolver:
         self._problem = problem
         self.work = workspace(problem.mpc)
         self.fallbacks = 0
-        """Number of problems that DAQP had to solve."""
+        """Number of problems solved by DAQP."""
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `Solver`."""
         inputs = np.empty_like(gradient)
         n, axes, _ = gradient.shape
         settled = np.ones((axes, n), dtype=np.bool_)
@@ -381,7 +359,7 @@ class ExactSolver:
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
         )
-        # It may leave an input short of its bound by a rounding error.
+        # DAQP may leave an input short of its bound by a rounding error.
         answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
         inputs: Array = np.clip(answer, -bound, bound)
         slope = hessian @ inputs + gradient

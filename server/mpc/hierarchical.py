@@ -2,12 +2,12 @@
 
 Both are the MPC of eq. (9), one after the other, each warm-started from its own previous plan. The
 generator plans from its own last prediction and never uses the vehicle's state (E17); the tracker
-controls the vehicle's estimated state along the generator's plan. The new plan is compared with
-what was sent: V of eq. (16), and cost and deviation of flying on with the old plan.
+controls the vehicle's estimated state along the generator's plan. The new plan is compared with the
+inputs already sent: V of eq. (16), and cost and deviation of flying on with the old plan.
 
 With the exact solver all of this is one compiled pass for one or several vehicles
 (`server.mpc.problem`). Any other solver is called in between: pose the generator's QP, solve; pose
-the tracker's, solve; conclude.
+the tracker's QP, solve; conclude.
 """
 
 from typing import NamedTuple
@@ -63,19 +63,13 @@ class PlanBatch(NamedTuple):
     compares: bool
     """Whether the inputs sent before are known, so that a plan is compared with them."""
     memory: PlanMemory
-    """Previous plans of all vehicles."""
     draft: Draft
-    """Plans being computed."""
     desired: Window
-    """Desired states along the plans."""
     foresight: Foresight
-    """Predictions for the vehicles."""
     figures: Figures
-    """Costs of their plans."""
     together: F3
     """Scratch for WIDTH vehicles, see `mpc.simd_memory`."""
     alone: F3
-    """Scratch for one vehicle."""
     single: I1
     """Scratch: index of one vehicle in the block; shape (1,)."""
     picked: I1
@@ -85,7 +79,6 @@ class PlanBatch(NamedTuple):
 
 
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
-    """Solver named by a scenario."""
     if control.solver == "exact":
         return ExactSolver(problem)
     # OSQP needs scipy, which takes 0.2 s and 40 MB.
@@ -115,7 +108,7 @@ class Planner:
         self.solvers = [
             make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]
-        """Solvers for a vehicle's first plan and for later ones; may be replaced."""
+        """Solvers for a vehicle's first plan and for later plans; may be replaced."""
         self._stopwatch = stopwatch
         self._memory = PlanMemory(
             inputs=np.zeros((2, capacity, axes, H), dtype=np.float32),
@@ -135,7 +128,7 @@ class Planner:
         self._picked = np.zeros(block, dtype=np.int64)
         self._settled = np.zeros(WIDTH, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """Costs of the latest plans; those of a block come first."""
+        """Costs of the latest plans, in the first rows."""
         self.planned = self._draft.planned
         """Planned states x_p(k+d|k-1) of the latest plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
@@ -145,16 +138,10 @@ class Planner:
         """Time taken to plan for the last block [ns], or -1 if not measured."""
 
     def forget(self, row: int) -> None:
-        """Make the next plan of this vehicle its first."""
         self._memory.step[row] = -1
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.
-
-        Args:
-            rows: the vehicles; shape (n,).
-            step: k of each; shape (n,).
-            foresight: their predictions.
 
         Source: eqs. (14), (15).
         """
@@ -173,9 +160,6 @@ class Planner:
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _batch_of(self, window: Window, foresight: Foresight) -> PlanBatch:
-        """Arguments of the planning kernels in one tuple; it refers to the same arrays at every
-        step.
-        """
         return PlanBatch(
             mpc=self._mpc,
             terminal_weight=self._terminal_weight,
@@ -207,7 +191,6 @@ class Planner:
         _conclude_all(batch, left)
 
     def _solve(self, tier: int, left: Indices) -> None:
-        """Solve the QPs in the draft for some vehicles of the block, by index."""
         draft = self._draft
         fresh = self.figures["fresh"][left]
         for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
@@ -238,7 +221,7 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axi
         if not plan.fresh:
             x = planned_state(mpc, memory, plan, axis)
         draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-        # The generator does not use the vehicle's state, and so no disturbance either.
+        # The generator does not use the vehicle's state, hence no disturbance either.
         simd.p[lane], simd.v[lane], simd.w[lane] = x[0], x[1], 0.0
         set_target(desired.states[page, axis, first : first + H + 1], simd, lane)
         before = memory.inputs[GENERATOR, plan.row, axis]
@@ -278,14 +261,13 @@ def _keep(batch: PlanBatch, simd: SimdBatch, some: I1, tier: int, axis: int) -> 
 
 @part
 def _plan_some(batch: PlanBatch, memory: F3, some: I1, which: int, work: RiccatiWorkspace) -> int:
-    """Plan for some vehicles at once, after `begin`; returns how many are not solved.
+    """Plan for some vehicles at once, after `begin`; returns the number of unsolved plans.
 
     Args:
-        batch: the block.
-        memory: of a `SimdBatch` for as many vehicles.
+        memory: memory of a `SimdBatch` for as many vehicles.
         some: indices of the vehicles in the block; shape (L,).
         which: weights of all of them, FIRST or LATER.
-        work: of the exact solver.
+        work: workspace of the exact solver.
     """
     mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
     simd, settled, undone = simd_batch(memory), batch.settled[: len(some)], 0
@@ -314,7 +296,6 @@ def _plan_some(batch: PlanBatch, memory: F3, some: I1, which: int, work: Riccati
 
 @part
 def _conclude(batch: PlanBatch, i: int) -> None:
-    """Compute the figures of a vehicle's plan, and store it."""
     conclude(
         batch.mpc,
         batch.terminal_weight,
@@ -329,9 +310,10 @@ def _conclude(batch: PlanBatch, i: int) -> None:
 
 @kernel
 def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
-    """Plan for vehicles with the exact solver, see `Planner.plan`; returns how many are not solved.
+    """Plan for vehicles with the exact solver, see `Planner.plan`; returns the number of unsolved
+    plans.
 
-    The unsolved ones are not `solved` in their figures, and are left unchanged.
+    The data of unsolved vehicles do not change, except that `solved` is False in their figures.
     """
     memory, foresight, figures = batch.memory, batch.foresight, batch.figures
     picked, undone = batch.picked, 0
@@ -342,8 +324,8 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     for i in range(len(rows)):
         begin(memory, foresight.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
-            # Vehicles planned for together need the same weights; a first plan has other ones (E8),
-            # and is rare.
+            # Vehicles planned for together need the same weights; a first plan has other weights
+            # (E8), and is rare.
             batch.single[0] = i
             undone += _plan_some(batch, batch.alone, batch.single, FIRST, work)
         elif memory.bounded[rows[i]]:
@@ -359,7 +341,7 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     while waiting - first >= WIDTH:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
-    # Too few are left for a full batch; alone each gets the same bits
+    # Too few are left for a full batch; alone each vehicle gets the same bits
     # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
@@ -387,7 +369,6 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1) -> None:
-    """Compute figures and store plans of the vehicles `left`, solved by another solver."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

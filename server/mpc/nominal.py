@@ -2,8 +2,8 @@
 
 It is the MPC of eq. (9) for an undisturbed vehicle, starting from the reference state at step k,
 along the desired trajectory as far as the server sees it, within the input bounds of eq. (6). The
-vehicle is told to follow its states, so a trajectory never demands what the vehicle cannot fly: it
-turns early before a sharp corner, and smooths one that is not worth the effort.
+vehicle follows the planned states, so a trajectory never demands more than the vehicle can fly: it
+turns early before a sharp corner, and cuts small corners.
 """
 
 from typing import NamedTuple
@@ -29,22 +29,20 @@ from skytether.shared.scenario.schema import ControlConfig
 
 
 class Nominal(NamedTuple):
-    """The problem, and the previous plans of all vehicles for warm starts."""
+    """Nominal problem, and the previous plans of all vehicles for warm starts."""
 
     mpc: MPC
     """Problem of eq. (9), without S-term."""
     work: RiccatiWorkspace
-    """Scratch of the solver."""
     inputs: F3
     """Latest planned inputs [m/s]; shape (capacity, axes, H)."""
     step: I1
-    """Step of these plans, or -1; shape (capacity,)."""
+    """Step of the latest plans, or -1; shape (capacity,)."""
     settled: B1
     """Scratch: whether a plan is solved; shape (1,)."""
 
 
 def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal:
-    """Problem of a scenario, for up to `capacity` vehicles."""
     mpc, H = make_mpc(terms, control), terms.horizon
     return Nominal(
         mpc=mpc,
@@ -60,11 +58,8 @@ def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) ->
     """Fill in the nominal states of a vehicle from k on; False if the QP is not solved.
 
     Args:
-        nominal: the problem.
-        row: row of the vehicle.
-        k: present step.
         desired: states from k on [m, m/s]; shape (axes, H + 1 or more, 2).
-        states: output, after the first stage, which is the given reference state at k [m, m/s];
+        states: output, after the first stage, which contains the reference state at k [m, m/s];
             shape (axes, H + 1 or fewer, 2).
     """
     mpc, settled, simd = nominal.mpc, nominal.settled, simd_batch(nominal.work.memory)

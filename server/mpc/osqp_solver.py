@@ -1,8 +1,8 @@
 """OSQP as a solver of the QPs of `server.mpc.problem`, a reference for the exact solver.
 
 OSQP's interface checks little: a wrong length gives NaN, a NaN stays in its warm start for ever,
-and an iteration limit does not raise. So everything is checked here before and after, and each
-solve sets its own warm start, so that an answer depends on its problem and guess alone.
+and an iteration limit does not raise. So inputs and results are checked here, and each solve sets
+its own warm start, so that an answer depends on its problem and guess alone.
 """
 
 import numpy as np
@@ -15,10 +15,9 @@ from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, at the cost of 30 iterations,
-not 20."""
+"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, after 30 iterations."""
 RHO_PER_CURVATURE = 2.5
-"""OSQP's step size over the mean curvature of the Hessian: fewest iterations in the worst case."""
+"""OSQP's step size over the mean curvature of the Hessian, for the fewest iterations."""
 
 
 class OsqpSolver:
@@ -33,7 +32,6 @@ class OsqpSolver:
         self._axes = [_set_up(H, b) for H, b in zip(self._hessian, self._u_max, strict=True)]
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `Solver`."""
         inputs = guess.copy()
         solved = np.ones(len(gradient), dtype=np.bool_)
         for vehicle in range(len(gradient)):

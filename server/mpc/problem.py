@@ -11,8 +11,9 @@ the target and the previous plan. W holds Q at the stages 1 … H-1 and P at H.
 The work of a step is done in O(H), by recursion along the horizon, on one axis, for several
 vehicles at once. In a recursion every stage waits for the previous one, about ten cycles, while the
 processor could do many times as much: so the innermost loop runs over vehicles, and the compiler
-turns it into vector instructions. A single vehicle is a batch of one. Vehicles are independent, and
-a vehicle gets the same bits alone as in a batch, which a BLAS product with Γ does not guarantee.
+turns it into vector instructions. A single vehicle is a batch of size 1. Vehicles are independent,
+and a vehicle gets the same bits alone as in a batch, which a BLAS product with Γ does not
+guarantee.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ Inputs = F1 | S1
 
 
 class Weights(NamedTuple):
-    """Weights of eq. (9), for the first step of a flight and for all later ones.
+    """Weights of eq. (9), for the first step of a flight and for all later steps.
 
     Without a previous plan there is no S-term (E8): the first of two rows leaves it out.
     """
@@ -50,7 +51,6 @@ class Weights(NamedTuple):
 
 
 FIRST, LATER = 0, 1
-"""Rows of `Weights`: first step of a flight, and later ones."""
 
 
 class MPC(NamedTuple):
@@ -91,7 +91,6 @@ class Problem:
 
     model: Model
     mpc: MPC
-    """Weights, bounds and model of the QPs."""
     which: int
     """FIRST or LATER weights."""
     hessian: Array
@@ -99,7 +98,7 @@ class Problem:
 
 
 def pose(model: Model, mpc: MPC, which: int) -> Problem:
-    """QPs for the FIRST step or for LATER ones.
+    """QPs for the FIRST step or for LATER steps.
 
     Source: eqs. (5), (9).
     """
@@ -112,7 +111,7 @@ def pose(model: Model, mpc: MPC, which: int) -> Problem:
             # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
-    # As a full matrix, since it is computed twice a flight only; every step's work is O(H), see
+    # As a full matrix, since it is computed twice a flight only; the work of a step is O(H), see
     # below.
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
@@ -125,9 +124,7 @@ WIDTH = 16
 
 
 class SimdBatch(NamedTuple):
-    """Scratch for the problems of several vehicles on one axis; L = WIDTH or 1 vehicles, last
-    index.
-    """
+    """Scratch for the problems of several vehicles on one axis; L = WIDTH or 1 vehicles."""
 
     p: F1
     """Position, or its costate, at the current stage; shape (L,)."""
@@ -154,7 +151,7 @@ class SimdBatch(NamedTuple):
     worst: F1
     """Largest violation by an input that must enter or leave the active set; shape (L,)."""
     worst_at: F1
-    """Stage of that input, -1 without one; shape (L,)."""
+    """Stage of the input in `worst`, -1 without one; shape (L,)."""
     target_p: F2
     """Desired positions at the stages 0 … H [m]; shape (H + 1, L)."""
     target_v: F2
@@ -180,13 +177,9 @@ class SimdBatch(NamedTuple):
     k1: F2
     """Column K1."""
     f00: F2
-    """Column F00."""
     f01: F2
-    """Column F01."""
     f10: F2
-    """Column F10."""
     f11: F2
-    """Column F11."""
 
 
 def simd_memory(H: int, width: int) -> Array:
@@ -196,7 +189,6 @@ def simd_memory(H: int, width: int) -> Array:
 
 @shared
 def simd_batch(memory: F3) -> SimdBatch:
-    """Batch that uses memory from `simd_memory`."""
     H = memory.shape[1] - 1
     return SimdBatch(
         p=memory[0, 0],
@@ -249,14 +241,12 @@ def set_target(states: F2, simd: SimdBatch, lane: int) -> None:
 
 @lanes
 def set_inputs(inputs: Inputs, simd: SimdBatch, lane: int) -> None:
-    """Fill in inputs computed elsewhere [m/s]; shape (H,)."""
     for stage in range(len(inputs)):
         simd.inputs[stage, lane] = inputs[stage]
 
 
 @lanes
 def column(numbers: F2, lane: int, to: Inputs) -> None:
-    """Copy the column of one vehicle, one value per stage."""
     for stage in range(len(to)):
         to[stage] = numbers[stage, lane]
 
@@ -316,13 +306,12 @@ def follow(mpc: MPC, axis: int, simd: SimdBatch) -> None:
 def adjoint(
     model: Axis, co: tuple[float, float], drift_p: float, drift_v: float
 ) -> tuple[float, float]:
-    """Costate λ of eq. (4) one stage earlier, λ(i) = Aᵀ λ(i+1) + drift(i); Bᵀ λ is an input's
-    effect.
+    """Costate λ of eq. (4) one stage earlier: λ(i) = Aᵀ λ(i+1) + drift(i). Bᵀ λ is the derivative
+    of the cost by an input.
 
     Args:
-        model: eq. (4) on one axis.
         co: λ of the next stage, on position and velocity; 0 after the last.
-        drift_p, drift_v: derivative of the cost by the state that the stage leads to.
+        drift_p, drift_v: derivative of the cost by the state at the next stage.
     """
     return co[0] + drift_p, model.a01 * co[0] + model.a11 * co[1] + drift_v
 
@@ -334,7 +323,6 @@ def pulled(S: float, previous: float, T: float, target_v: float, R: float, w: fl
     Args:
         S, T, R: weights of change, desired velocity and input, see `Weights`.
         previous: this input in the previous plan [m/s].
-        target_v: desired velocity [m/s].
         w: disturbance that adds to the input [m/s].
     """
     return S * previous + T * target_v - R * w
@@ -345,7 +333,6 @@ def gradient(mpc: MPC, axis: int, which: int, simd: SimdBatch, target_v: F2) -> 
     """Fill in g of the QP of one axis: Γᵀ drift by the adjoint of eq. (4), minus R and S terms.
 
     Args:
-        mpc, axis: the problem.
         which: FIRST or LATER weights.
         simd: reads drift, previous and w.
         target_v: desired velocities [m/s]; shape (H + 1, L).
@@ -369,13 +356,7 @@ def gradient(mpc: MPC, axis: int, which: int, simd: SimdBatch, target_v: F2) -> 
 
 @lanes
 def slope(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
-    """Replace g by 𝓗 U + g, with U as sent: 0 where U is optimal and within its bounds.
-
-    Args:
-        mpc, axis: the problem.
-        which: FIRST or LATER weights.
-        simd: reads gradient and inputs; replaces the gradient.
-    """
+    """Replace g by 𝓗 U + g, with U as sent: 0 where U is optimal and within its bounds."""
     model, W, L = axis_at(mpc.model, axis), mpc.weights.states, len(simd.p)
     p, v, u, g = simd.p, simd.v, simd.inputs, simd.gradient
     drift_p, drift_v = simd.drift_p, simd.drift_v
@@ -402,7 +383,6 @@ def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: floa
     """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
 
     Args:
-        mpc, axis: the problem.
         x: change of position [m] and velocity [m/s] at stage 0; if 0, the sum is ΔUᵀ 𝓗 ΔU.
         change: ΔU [m/s]; shape (H,).
         cost: the sum so far.

@@ -5,7 +5,7 @@ from typing import Protocol
 from skytether.shared.law.model import Array, Flags
 
 NEAR = 1.0 - 1e-6
-"""Share of its bound from which on a guessed input counts as at the bound: guesses were float32."""
+"""Share of the bound above which a guessed input, rounded to float32, counts as at the bound."""
 
 
 class SolverFailed(Exception):

@@ -16,9 +16,9 @@ w is the disturbance (wind, a wrong gain) as an equivalent input, estimated by
 `server.schemes.disturbance`.
 
 With feedback aboard, a horizon also carries its reference state x̄, which starts at x̂(k), and the
-vehicle flies u(i) + K (x̄(i) - x(i)). The server replays this feedback too. Committed are then the
-inputs that the vehicle flies along x̄ without further disturbance. As K never changes, it makes no
-difference when the next horizon replaces the present one.
+vehicle flies u(i) + K (x̄(i) - x(i)). The server replays this feedback too. The committed inputs
+are then those that the vehicle flies along x̄ without further disturbance. As K never changes, it
+makes no difference when the next horizon replaces the present one.
 
 `schemes.sent` tracks the horizons sent, `schemes.sent_horizons` stores them, `schemes.replay`
 predicts with them, and `schemes.loss_scenarios` predicts the cases in which some are lost.
@@ -78,10 +78,7 @@ class Replay:
     """Predictor of the scheme "committed": replays sent horizons from the newest observation.
 
     Args:
-        terms: terms of the flight.
-        control: `observer_s` and `delay_bound`.
         gain: gain K of the feedback aboard, 0 without feedback; shape (axes, 2).
-        capacity: largest number of vehicles.
         clock: gives half of the smallest round trip, the first value of the delay bound.
     """
 
@@ -123,13 +120,11 @@ class Replay:
             self.forget(row)
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         tracker.forget(self._memory.sent, row)
         self._memory.seen[row] = (-1, NO_HORIZON, 1, 1)
         self._memory.state["w"][row] = 0.0
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         return store_observation(
             self._memory,
             row,
@@ -157,12 +152,10 @@ class Replay:
             self.counts["horizons_lost"] += lost
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`; only horizons that are sent are stored."""
         store_sent(self._settings, self._memory, rows, step, foresight, event)
 
 
 def make(fleet: Fleet) -> HorizonScheme:
-    """The scheme "committed"."""
     control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
     return HorizonScheme(Replay(fleet.terms, control, gain, fleet.capacity, fleet.clock), fleet)
 
@@ -182,14 +175,7 @@ def _foresee(
     steps: I1,
     foresight: Foresight,
 ) -> int:
-    """Fill in the predictions of vehicles at their steps k.
-
-    Args:
-        schedule, track: scratch memory.
-
-    Returns:
-        number of horizons newly known to be lost.
-    """
+    """Fill in the predictions at the steps k; returns the number of horizons newly known lost."""
     axes, H, sent, lost = len(settings.laws), settings.H, memory.sent, 0
     for i in range(len(rows)):
         row, k, bound = rows[i], steps[i], sent.bound.steps
@@ -204,7 +190,7 @@ def _foresee(
         d = bound[row]
         if settings.decay < 1.0:
             observe_disturbance(settings, memory, row, age + d, schedule, track)
-        # A vehicle that accepts no horizons hovers, whatever is in flight to it.
+        # A vehicle that accepts no horizons hovers, even if horizons are in flight to it.
         in_force, in_flight = HOVERS, range(0)
         if memory.seen[row].takes == 1:
             in_force = number_of(sent, row, delivery.in_force)

@@ -1,4 +1,4 @@
-"""Delay bound d: number of steps from making a horizon to when it is in force at the latest.
+"""Delay bound d: number of steps within which a horizon comes into force after it is made.
 
 Every acknowledged horizon gives one sample: the step at which it came into force minus the step
 that it was made for. With each sample of a vehicle
@@ -19,11 +19,10 @@ from skytether.shared.base.kernel import I1, I2, part
 from skytether.shared.base.units import seconds_to_ns
 
 SAMPLES = 128
-"""Number of samples that are stored for each vehicle."""
 LATE = 0.01
-"""Largest share of these samples that may exceed d."""
+"""Largest share of the samples that may exceed d."""
 RECENT = 16
-"""Number of newest samples of which none may exceed d. Measured on the paper's network, d then
+"""Number of newest samples none of which may exceed d. Measured on the paper's network, d then
 changes every 4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten),
 and 0.3 to 1.3 % of the horizons come later than d."""
 
@@ -34,21 +33,17 @@ class DelayBound(NamedTuple):
     steps: I1
     """Delay bound d of each vehicle, or 0 while it is unknown; shape (capacity,)."""
     samples: I2
-    """Newest samples of each [steps], in a ring; shape (capacity, SAMPLES)."""
+    """Newest samples of each vehicle [steps], in a ring; shape (capacity, SAMPLES)."""
     seen: I1
-    """Number of samples seen so far; shape (capacity,)."""
+    """Number of samples so far; shape (capacity,)."""
     least: int
-    """Smallest d."""
     most: int
-    """Largest d."""
 
 
 def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
     """Delay bounds of vehicles without any sample.
 
     Args:
-        capacity: number of vehicles.
-        dt_s: length of a step [s].
         most: largest d that fits a horizon.
         fixed_s: fixed bound [s]; None to estimate it.
     """
@@ -63,13 +58,11 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
 
 
 def forget(bound: DelayBound, row: int) -> None:
-    """Forget the samples of a vehicle that is new or has restarted."""
     bound.steps[row] = bound.seen[row] = 0
 
 
 @part
 def set_first(bound: DelayBound, row: int, guess: int) -> None:
-    """Set d of a vehicle without samples to a guess [steps]."""
     bound.steps[row] = min(max(guess, bound.least), bound.most)
 
 
@@ -81,12 +74,12 @@ def raise_to(bound: DelayBound, row: int, delay: int) -> None:
 
 @part
 def add_sample(bound: DelayBound, row: int, delay: int) -> None:
-    """Update d of a vehicle with a sample [steps]; d falls by one at most."""
+    """Update d of a vehicle with a sample [steps]; d falls by 1 at most."""
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # It rises at once: with too small a d every horizon comes into force after other inputs than
-    # its plan assumes.
+    # d rises at once: with too small a d every horizon comes into force after other inputs than its
+    # plan assumes.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
     needed, since = 0, count  # samples of d or more, and number of samples after the last of them

@@ -2,8 +2,8 @@
 
 From each observation the flown horizons are replayed to the next one. The difference between the
 replayed and the observed velocity drives the disturbance observer (`server.schemes.observer`), with
-the time constant `control.observer_s`. Observed velocities are noisy. So the observer low-pass
-filters them with the time constant FOLLOW_S; else it would learn the noise.
+the time constant `control.observer_s`. Observed velocities are noisy, so they are low-pass filtered
+with the time constant FOLLOW_S; otherwise the noise would enter the estimate.
 """
 
 from skytether.server.schemes.observer import updated_disturbance
@@ -43,8 +43,8 @@ def observe_disturbance(
         return
     before = number_of(sent, row, seen.base_in_force)
     after = number_of(sent, row, delivery.in_force)
-    # A vehicle that accepts no horizons brakes by its failsafe, whose inputs the server does not
-    # know.
+    # A vehicle that accepts no horizons brakes by its failsafe, whose inputs are unknown to the
+    # server.
     inputs_known = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
     # Horizons older than `age_max` may be gone from the ring.
     replayable = inputs_known and begin >= 0 and end - begin <= settings.age_max
@@ -52,7 +52,7 @@ def observe_disturbance(
     if replayable:
         first = first_in_flight(sent, row, seen.base_in_force, begin)
         legs = make_schedule(schedule, sent, row, begin, before, range(first, after))
-        # The newest observation tells which horizon is in force, and since when.
+        # The newest observation reports the horizon in force, and since when.
         while legs > 1 and schedule.begins[legs - 1] >= delivery.since:
             legs -= 1
         if delivery.since <= begin:

@@ -1,6 +1,6 @@
-"""Wrapper that catches the errors of a plug-in's scheme, so that none ends the flight.
+"""Wrapper that catches the errors of a plug-in's scheme, so that no error ends the flight.
 
-If the scheme fails for a vehicle, the vehicle is sent no plan at that step. It flies its present
+If the scheme fails for a vehicle, no plan is sent to it at that step. The vehicle flies its present
 plan to the end, and then its failsafe acts.
 """
 
@@ -33,13 +33,7 @@ from skytether.shared.wire.protocol import (
 
 
 class GuardedScheme(Scheme):
-    """A plug-in's scheme, called for a whole block first, and for each vehicle alone if that fails.
-
-    Args:
-        name: name of the scheme, for messages.
-        inner: the scheme.
-        fleet: flight and vehicles.
-    """
+    """A plug-in's scheme, called for a whole block, and for each vehicle alone if that fails."""
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
         super().__init__(fleet)
@@ -48,10 +42,9 @@ class GuardedScheme(Scheme):
         self._ahead_max = committed_max(fleet.terms) if fleet.terms.commits else 0
         self._bounds = INPUT_TOLERANCE * np.array(fleet.terms.u_max)[:, None]
         self._withheld: set[int] = set()
-        """Rows of vehicles to which no plan is sent at this step."""
+        """Rows of the vehicles to which no plan is sent at this step."""
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         try:
             self._inner.forget(row)
         except Exception as error:
@@ -84,7 +77,7 @@ class GuardedScheme(Scheme):
         self.figures[some], self.planned[some] = inner.figures[:n], inner.planned[:n]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`; if the scheme fails for a vehicle, its plan is not sent."""
+        """See `Scheme`; the plan of a vehicle for which the scheme fails is not sent."""
         failed = self._call(len(rows), partial(self._remember, rows, step, foresight, event))
         self._withheld = {int(rows[i]) for i in failed}
 
@@ -96,7 +89,6 @@ class GuardedScheme(Scheme):
         self._check(cut)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
         for i in batch.sent.tolist():
             if int(batch.rows[i]) not in self._withheld:
                 try:
@@ -115,7 +107,6 @@ class GuardedScheme(Scheme):
             return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
 
     def _call(self, n: int, call: Callable[[slice], None]) -> list[int]:
-        """Call for n vehicles at once, or for each alone if that fails; indices of failed ones."""
         failed = []
         try:
             call(slice(0, n))

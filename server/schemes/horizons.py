@@ -1,7 +1,7 @@
 """Schemes that send horizons of inputs: a predictor, the hierarchical MPC, and the encoding.
 
 observations → x̂(k), x̂(k+d) (predictor) → U(k+d) (`mpc.hierarchical`)
-             → horizon: d committed inputs, then H planned ones
+             → horizon: d committed inputs, then H planned inputs
 """
 
 from collections import Counter
@@ -51,7 +51,6 @@ class InputScheme(Scheme):
         self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        """See `Scheme`."""
         # Bytes of one input on all axes.
         width, planned = 4 * self.terms.axes, self.terms.planned
         feedback, feedback_bytes = NO_FEEDBACK, 0
@@ -71,10 +70,9 @@ class InputScheme(Scheme):
             )
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`."""
         sent, foresight = batch.sent, batch.foresight
         step, ahead = batch.step[sent], foresight.ahead[sent]
-        # The planned inputs follow d committed ones; d differs between vehicles.
+        # The planned inputs follow d committed inputs; d differs between vehicles.
         stages = ahead[:, None] + np.arange(self.terms.planned)
         inputs = np.take_along_axis(foresight.horizons[sent], stages[:, None], axis=2)
         return SentPlans(step, step + ahead, foresight.start[sent], inputs)
@@ -94,24 +92,19 @@ class HorizonScheme(InputScheme):
         self.figures, self.planned = self.planner.figures, self.planner.planned
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         self.predictor.forget(row)
         self.planner.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         return self.predictor.observe(row, observation)
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`."""
         self.predictor.foresee(rows, step, foresight)
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`."""
         self.predictor.remember(rows, step, foresight, event)
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`."""
         self.planner.plan(rows, step, foresight)
         self.solve_ns = self.planner.solve_ns
 
@@ -120,7 +113,6 @@ class Packing:
     """Packs the horizons of a block of vehicles into one buffer, for encoding.
 
     Args:
-        axes: number of axes.
         most: largest number of inputs of a horizon on each axis.
         planned: number of planned inputs H; the others are committed.
     """
@@ -135,12 +127,11 @@ class Packing:
         """Pack the horizons that are sent.
 
         Args:
-            batch: vehicles and plans.
             observed: step of the newest observation of each vehicle; shape (capacity,).
 
         Returns:
-            a row of COLUMNS for each horizon, and the bytes of all horizons, concatenated; each has
-            d + H inputs on each axis. The bytes are valid until the next call.
+            a row of COLUMNS for each horizon, and the bytes of all horizons, concatenated, with d +
+            H inputs on each axis of each horizon. The bytes are valid until the next call.
         """
         n = len(batch.sent)
         if n > len(self._numbers):
@@ -178,7 +169,6 @@ def _pack(
     numbers: I2,
     packed: S1,
 ) -> None:
-    """Fill in `numbers` and `packed`, see `Packing.pack`."""
     at = 0
     for n in range(len(sent)):
         i = sent[n]

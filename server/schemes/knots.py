@@ -14,11 +14,10 @@ spline_at = shared(spline.spline_at)
 
 @part
 def fewest_knots(intended: F3, dt_s: float, error_m: float, knots: S2) -> tuple[int, int]:
-    """Fit a spline with the fewest knots that meet the bound; with KNOTS_MAX if none meets it.
+    """Fit a spline with the fewest knots that meet the bound, or else with KNOTS_MAX.
 
     Args:
         intended: states of the trajectory from k on [m, m/s]; shape (axes, seen + 1, 2).
-        dt_s: length of a step [s].
         error_m: largest error on each axis [m].
         knots: output: position and velocity of each knot [m, m/s]; shape (axes, 2 KNOTS_MAX).
 

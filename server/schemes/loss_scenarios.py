@@ -1,7 +1,7 @@
 """Predictions for the cases in which horizons in flight are lost.
 
-In case j exactly the newest j + 1 horizons are lost; the last case also stands for all in which
-more are lost. Losses are taken as independent, with the share of horizons that was lost recently.
+In case j exactly the newest j + 1 horizons are lost; the last case also stands for more losses.
+Losses are assumed independent, with the loss rate of recent horizons.
 """
 
 from skytether.server.common.scheme import Foresight
@@ -31,8 +31,6 @@ def foresee_losses(
     """Fill in `loss_probability`, `start_if_lost` and `inputs_if_lost` of vehicle i of a block.
 
     Args:
-        row: row of the vehicle.
-        k: present step.
         in_force: number of the horizon in force at its newest observation.
         in_flight: numbers of the horizons in flight.
         schedule, track: scratch memory.

@@ -1,4 +1,4 @@
-"""The scheme "none": the paper's MPC, which plans from the newest observation as if it were new."""
+"""The scheme "none": the paper's MPC, which takes the newest observation as the present state."""
 
 from skytether.server.schemes import predictive
 

@@ -5,8 +5,8 @@ difference to the observed velocity updates the estimate:
 
     ŵ ← ŵ + (1 - e^(-m Δt / T)) (w' - ŵ)          w': constant input that explains the difference
 
-with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with the
-flown inputs as it knows them.
+with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with its own
+record of the flown inputs.
 """
 
 import numpy as np
@@ -43,6 +43,7 @@ def updated_disturbance(
     """
     # An input of 1 m/s for m steps changes the velocity by 1 - a11^m.
     missing = off / (1.0 - a11**m)
-    # Measured without this: the loop oscillates at round trips above 1.5 s (docs/schemes.md).
+    # Without this factor the loop oscillates at round trips above 1.5 s (measured,
+    # docs/schemes.md).
     slower = max(1.0, trip_ns / TRIP_NS)
     return bounded(w + (1.0 - decay ** (m / slower)) * missing, bound)

@@ -48,13 +48,10 @@ class EstimatorSettings(NamedTuple):
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
     compensate: bool
-    """Whether observations are predicted to the present; False for the scheme "none"."""
     dt_ns: int
-    """Length of a step [ns]."""
     decay: float
     """See `observer.decay_of`."""
     feeds_back: bool
-    """Whether horizons carry feedback."""
 
 
 class EstimatorMemory(NamedTuple):
@@ -65,18 +62,17 @@ class EstimatorMemory(NamedTuple):
     state: F3
     """Observed state [m, m/s]; shape (capacity, axes, 2)."""
     flown: F2
-    """Input flown at the step of that observation [m/s]; shape (capacity, axes)."""
+    """Input flown at the step of the newest observation [m/s]; shape (capacity, axes)."""
     base: I1
-    """Step of the observation that updated the disturbance last, or -1; shape (capacity,)."""
+    """Step of the previous observation that updated the disturbance, or -1; shape (capacity,)."""
     base_velocity: F2
-    """Velocity in that observation [m/s]; shape (capacity, axes)."""
+    """Velocity in the observation of step `base` [m/s]; shape (capacity, axes)."""
     base_flown: F2
-    """Input flown at its step [m/s]; shape (capacity, axes)."""
+    """Input flown at the step `base` [m/s]; shape (capacity, axes)."""
     disturbance: F2
     """Disturbance ŵ [m/s]; shape (capacity, axes)."""
     inputs: F3
-    """Input history û, a ring over the steps, initially 0 [m/s]; shape (capacity, axes,
-    age_max)."""
+    """Input history û, a ring over the steps [m/s]; shape (capacity, axes, age_max)."""
     last: I1
     """Newest step with an entry in the input history, or -1; shape (capacity,)."""
 
@@ -85,10 +81,8 @@ class Estimator:
     """Predictor of the schemes "predictive" and "none".
 
     Args:
-        terms: terms of the flight.
         control: `observer_s`, which the scheme "none" ignores.
         gain: gain K of the feedback aboard, 0 without feedback; shape (axes, 2).
-        capacity: largest number of vehicles.
     """
 
     def __init__(self, terms: Terms, control: ControlConfig, gain: Array, capacity: int) -> None:
@@ -114,17 +108,14 @@ class Estimator:
             last=np.full(capacity, -1, dtype=np.int64),
         )
         self.observed_step: Indices = self._memory.observed
-        """Step of the newest observation, or -1; shape (capacity,)."""
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         memory = self._memory
         memory.observed[row] = memory.base[row] = memory.last[row] = -1
         memory.disturbance[row] = 0.0
         memory.inputs[row] = 0.0
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         memory = self._memory
         if observation.step <= memory.observed[row]:
             return False
@@ -155,7 +146,6 @@ class Estimator:
 
 
 def make(fleet: Fleet) -> HorizonScheme:
-    """Make the scheme "predictive" or "none"."""
     control, gain = fleet.scenario.control, feedback_gain(fleet.scenario)
     return HorizonScheme(Estimator(fleet.terms, control, gain, fleet.capacity), fleet)
 
@@ -168,7 +158,6 @@ KERNELS = (horizons, hierarchical, exact)
 def _observe_disturbance(
     settings: EstimatorSettings, memory: EstimatorMemory, row: int, k: int
 ) -> None:
-    """Update the disturbance of a vehicle if it has a new observation."""
     begin, end = memory.base[row], memory.observed[row]
     m, near = end - begin, APART_NS // settings.dt_ns
     for i in range(len(settings.laws)):

@@ -1,4 +1,4 @@
-"""Replay of horizons: a schedule of which horizon is in force when, and the flight by it.
+"""Replay of horizons: a schedule of the horizon in force at each step, and the flight by it.
 
 The schedule is made from the horizons in force and in flight, and flown by the rule of flight
 (`shared.law.rule`), one axis after the other:
@@ -18,7 +18,7 @@ from skytether.shared.law.rule import AxisHorizon
 
 
 class HorizonSchedule(NamedTuple):
-    """Which horizon is in force when: legs in order of time. The arrays are longer than needed."""
+    """Horizon in force at each step, as legs in order of time; arrays are longer than needed."""
 
     begins: I1
     """First step of each leg."""
@@ -44,18 +44,11 @@ def make_schedule(
     in_force: int,
     following: range,
 ) -> int:
-    """Fill in the schedule from step `begin` on.
+    """Fill in the schedule from step `begin` on; returns the number of legs.
 
     Args:
-        schedule: output.
-        sent: tracker of the horizons.
-        row: row of the vehicle.
-        begin: first step of the schedule.
-        in_force: number of the horizon in force then.
-        following: numbers of the horizons after it, each in force from the step it is due.
-
-    Returns:
-        number of legs.
+        in_force: number of the horizon in force at `begin`.
+        following: numbers of the later horizons, each in force from the step it is due.
     """
     ring, legs = sent.plans.shape[1], 1
     schedule.begins[0], schedule.numbers[0] = begin, in_force
@@ -85,11 +78,7 @@ def fly_schedule(
     """Fly one axis by a schedule from its first step to step `end`.
 
     Args:
-        settings, memory: constants, and the horizons that were sent.
-        row: row of the vehicle.
-        axis: axis that is flown.
-        schedule: the schedule.
-        legs: number of its legs.
+        legs: number of legs of the schedule.
         end: step after the last.
         x: observation at the first step: position [m], velocity [m/s], input flown on this axis
             [m/s], and magnitude of the input over all axes [m/s].
@@ -156,21 +145,18 @@ def _fly(
     first_input: float,
     track: FlownTrack,
 ) -> tuple[float, float]:
-    """Fly one axis by a horizon from step `first` to `last`.
+    """Fly one axis by a horizon from step `first` to `last`; returns position [m] and velocity
+    [m/s] at `last`.
 
     Args:
-        horizon: the horizon.
-        made_for: step that it was made for.
-        ref_p, ref_v: its reference state x̄ at `first` [m, m/s].
+        made_for: step that the horizon was made for.
+        ref_p, ref_v: reference state x̄ at `first` [m, m/s].
         p, v: position [m] and velocity [m/s] at `first`.
         w: disturbance [m/s].
         first, last: first step, and step after the last.
         begin: first step of `track`.
-        first_input: observed input at that step [m/s].
+        first_input: observed input at `begin` [m/s].
         track: output: inputs and states.
-
-    Returns:
-        position [m] and velocity [m/s] at `last`.
     """
     for k in range(first, last):
         u, _, ref_p, ref_v = step(horizon, k - made_for, ref_p, ref_v, p, v)

@@ -1,9 +1,9 @@
 """Tracker of the plans sent to vehicles: which are in force, in flight, or lost.
 
 Plans (horizons or trajectories) are numbered from 0 in the order of sending; the newest are stored
-in a ring. An observation names the plan in force by the step that it was made for, from which its
-number is found. A later plan is in flight until it is due, d steps after the step it was made for
-(`schemes.delay_bound`). If it is not in force by then, it is lost.
+in a ring. An observation identifies the plan in force by the step that it was made for. A later
+plan is in flight until it is due, d steps after the step it was made for (`schemes.delay_bound`).
+If it is not in force by then, it is lost.
 """
 
 from typing import Annotated, NamedTuple
@@ -26,8 +26,8 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
-"""In place of a plan's number: no plan is in force, so the vehicle brakes and hovers; or a plan of
-which nothing is stored, sent before the server restarted or dropped aboard."""
+"""In place of a plan's number: no plan is in force, so the vehicle brakes and hovers; or a plan
+that is not stored, since it was sent before the server restarted or dropped aboard."""
 MARGIN = 2
 """Steps added to half a round trip for the first delay bound, before any acknowledgement."""
 FIRST_LOSS, LOSS_WEIGHT = 0.1, 0.05
@@ -38,9 +38,9 @@ class Delivery:
     """Numpy record: delivery of the plans sent to a vehicle, as its observations report it."""
 
     in_force: int
-    """Step that the plan in force at its newest observation was made for, or NO_HORIZON."""
+    """Step that the plan in force at the newest observation was made for, or NO_HORIZON."""
     since: int
-    """First step flown with that plan."""
+    """First step flown with the plan in force."""
     acknowledged: int
     """Step that the newest plan with a delay sample was made for, or NO_HORIZON."""
     judged: int
@@ -48,18 +48,15 @@ class Delivery:
     sent: int
     """Number of plans sent so far."""
     first: int
-    """Number of the first plan that the vehicle may still have: it dropped those before."""
+    """Number of the first plan that the vehicle may still have: earlier plans were dropped."""
     loss: float
     """Loss rate of recent plans, from 0 to 1."""
 
 
 class SentPlan:
-    """Numpy record: a plan that was sent."""
-
     step: int
-    """Step that it was made for."""
     due: int
-    """Step at which it is either in force or lost."""
+    """Step at which the plan is either in force or lost."""
 
 
 DELIVERY, SENT_PLAN = record(Delivery), record(SentPlan)
@@ -69,25 +66,19 @@ class Sent(NamedTuple):
     """Plans sent to each vehicle, and their delivery."""
 
     observed: I1
-    """Step of the newest observation of each, or -1; shape (capacity,)."""
+    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
     delivery: Annotated[NDArray[np.void], records(DELIVERY, 1)]
-    """Delivery state of each vehicle; shape (capacity,)."""
     plans: Annotated[NDArray[np.void], records(SENT_PLAN, 2)]
     """Newest plans, in a ring: plan n has index n modulo `ring`; shape (capacity, ring)."""
     bound: DelayBound
-    """Delay bound d."""
     dt_ns: int
-    """Length of a step [ns]."""
 
 
 def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
     """Tracker without any plan.
 
     Args:
-        capacity: number of vehicles.
         ring: number of plans stored for each vehicle.
-        terms: terms of the flight.
-        control: `delay_bound`.
         most: largest delay bound d that fits a plan.
     """
     fixed_s = None if control.delay_bound == "auto" else control.delay_bound
@@ -104,7 +95,6 @@ def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig,
 
 
 def forget(sent: Sent, row: int) -> None:
-    """Forget the plans sent to a vehicle, and its delay bound."""
     sent.observed[row] = -1
     sent.delivery[row] = (NO_HORIZON, 0, NO_HORIZON, -1, 0, 0, FIRST_LOSS)
     delay.forget(sent.bound, row)
@@ -112,17 +102,15 @@ def forget(sent: Sent, row: int) -> None:
 
 @part
 def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
-    """Update delay bound and loss rate of a vehicle from its newest observation.
-
-    Returns:
-        number of plans newly known to be lost.
+    """Update delay bound and loss rate from the newest observation; returns the number of plans
+    lost.
     """
     delivery, bound, observed = sent.delivery[row], sent.bound, sent.observed[row]
     # No sample yet: half a round trip, rounded up, plus a margin.
     if bound.steps[row] == 0:
         set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
     raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
-    # Plans later than the one in force that are due now are lost. They stay in the ring, so
+    # Plans later than the plan in force that are due now are lost. They stay in the ring, so
     # `judged` keeps them from being counted twice.
     lost = 0
     for number in range(first_after(sent, row, delivery.in_force), delivery.sent):
@@ -139,7 +127,7 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
 
 @part
 def add_plan(sent: Sent, row: int, step: int, d: int) -> int:
-    """Store that a plan made for a step is sent, due d steps later; its index in the ring."""
+    """Store that a plan made for a step is sent, due d steps later; returns its ring index."""
     delivery = sent.delivery[row]
     slot = delivery.sent % sent.plans.shape[1]
     delivery.sent += 1
@@ -168,7 +156,6 @@ def number_of(sent: Sent, row: int, made_for: int) -> int:
 
 @part
 def first_after(sent: Sent, row: int, step: int) -> int:
-    """Number of the first plan made for a later step."""
     ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least and sent.plans[row, (number - 1) % ring].step > step:
         number -= 1
@@ -177,11 +164,10 @@ def first_after(sent: Sent, row: int, step: int) -> int:
 
 @part
 def first_in_flight(sent: Sent, row: int, in_force: int, observed: int) -> int:
-    """Number of the first plan in flight at an observation: after the one in force, not yet due.
+    """Number of the first plan in flight at an observation: later than the plan in force, not yet
+    due.
 
     Args:
-        sent: the tracker.
-        row: row of the vehicle.
         in_force: step that the plan in force was made for.
         observed: step of the observation.
     """

@@ -33,19 +33,15 @@ class ObservedAxis:
     """Numpy record: the two newest observations of a vehicle on one axis."""
 
     p: float
-    """Position in the newest observation [m]."""
     v: float
-    """Velocity in the newest observation [m/s]."""
     u: float
     """Input flown at the step of the newest observation [m/s]."""
     base_p: float
-    """Position in the previous observation [m]."""
     base_v: float
     """Velocity in the previous observation, low-pass filtered by the observer [m/s]."""
     base_u: float
     """Input flown at the step of the previous observation [m/s]."""
     w: float
-    """Disturbance ŵ [m/s]."""
 
 
 class SentHorizon:
@@ -54,21 +50,16 @@ class SentHorizon:
     length: int
     """Number of inputs that are flown before they are too old."""
     speed: float
-    """Magnitude of the last of these inputs over all axes [m/s]."""
+    """Magnitude of the last flown input over all axes [m/s]."""
 
 
 class ReferenceState:
-    """Numpy record: reference state x̄ of a horizon on one axis.
-
-    It is advanced to the newest observation, as replays never start before that.
-    """
+    """Numpy record: reference state x̄ of a horizon on one axis at the newest observation."""
 
     stage: int
     """Stage of the horizon that x̄ belongs to."""
     p: float
-    """Position of x̄ [m]."""
     v: float
-    """Velocity of x̄ [m/s]."""
     w: float
     """Disturbance ŵ that the horizon compensates [m/s]."""
 
@@ -81,39 +72,34 @@ class ReplaySettings(NamedTuple):
     """Constants shared by all vehicles."""
 
     laws: Laws
-    """Model, bound and gain of each axis; shape (axes,)."""
     H: int
-    """Number of planned inputs."""
     age_max: int
     """Largest age of an observation that is used [steps]."""
     dt_ns: int
-    """Length of a step [ns]."""
     brake: float
-    """Speed that braking takes away in a step [m/s]."""
+    """Reduction of the speed in a step of braking [m/s]."""
     decay: float
     """See `observer.decay_of`."""
     follow: float
-    """Share of a jump of the observed velocity that the observer's low-pass filter has not followed
-    after a step."""
+    """Share of a velocity jump that the observer's low-pass filter has not followed after a step.
+    """
     feeds_back: bool
-    """Whether horizons carry feedback."""
 
 
 class ReplayMemory(NamedTuple):
     """Newest observations of every vehicle, and the horizons sent to it."""
 
     sent: Sent
-    """Tracker of which horizons are in force, in flight or lost."""
     seen: Annotated[NDArray[np.void], records(OBSERVATIONS, 1)]
-    """Newest observations; shape (capacity,)."""
+    """Shape (capacity,)."""
     state: Annotated[NDArray[np.void], records(AXIS_STATE, 2)]
-    """Newest observations on each axis; shape (capacity, axes)."""
+    """Shape (capacity, axes)."""
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4
-    """Inputs of these horizons [m/s]; shape (capacity, ring, axes, largest d + H)."""
+    """Shape (capacity, ring, axes, largest d + H)."""
     reference: Annotated[NDArray[np.void], records(REFERENCE_STATE, 3)]
-    """Reference states of these horizons; shape (capacity, ring, axes)."""
+    """Shape (capacity, ring, axes)."""
 
 
 @kernel
@@ -127,7 +113,6 @@ def store_observation(
     state: R2,
     flown: R1,
 ) -> bool:
-    """Store an observation, see `Replay.observe`."""
     sent = memory.sent
     if step <= sent.observed[row]:
         return False
@@ -149,7 +134,6 @@ def store_sent(
     foresight: Foresight,
     event: B1,
 ) -> None:
-    """Store the horizons that are sent, see `Replay.remember`."""
     for i in range(len(rows)):
         if not event[i]:
             continue
@@ -160,7 +144,7 @@ def store_sent(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = foresight.horizons[i, axis, stage]
-            # As `HorizonFollower` computes it aboard: both ends have to brake from the same speed.
+            # Computed as by `HorizonFollower` aboard: both ends have to brake from the same speed.
             last = bounded(
                 float(foresight.horizons[i, axis, length - 1]), settings.laws[axis].bound
             )

@@ -23,7 +23,6 @@ from skytether.shared.scenario.registry import SCHEMES
 OURS = {
     name: import_module(f"{__package__}.{name}") for name, entry in SCHEMES.items() if entry.is_ours
 }
-"""Module of each built-in scheme."""
 
 
 def make(fleet: Fleet) -> Scheme:

@@ -6,14 +6,14 @@ At step k the server sends the trajectory to follow from k on:
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
 - the target's present state, if the server knows nothing ahead.
 
-It is sent as a spline with the fewest uniform knots that keep it within `control.spline_error_m`
-(`shared.law.spline`); a single state is one knot. A regulator aboard follows the spline, so the
-server's estimate is simply the newest observation.
+It is sent as a spline with the fewest uniform knots that keep its error within
+`control.spline_error_m` (`shared.law.spline`); a single state is one knot. A regulator aboard
+follows the spline, so the newest observation serves as the server's estimate.
 
-The server is not certain which trajectory the vehicle follows: an observation acknowledges the one
-in force, and later ones may be in flight or lost. With the measured loss rate ℓ and the share S(t)
-of delays longer than t, a trajectory sent a time t before an observation that does not acknowledge
-it will still arrive with the probability
+The server is not certain which trajectory the vehicle follows: an observation acknowledges the
+trajectory in force, and later ones may be in flight or lost. With the measured loss rate ℓ and the
+share S(t) of delays longer than t, a trajectory sent a time t before an observation that does not
+acknowledge it will still arrive with the probability
 
     π = (1 - ℓ) S(t) / ((1 - ℓ) S(t) + ℓ)
 
@@ -27,7 +27,7 @@ and h = (1 + K_v) / K_p, with which the regulator weighs velocity: K_p (Δp + h 
 its input. The gap is averaged over the steps k + d, when a packet sent now is in force at the
 latest; k + 2 d, when the server knows whether it arrived; and k + 3 d, when a packet sent then
 would be in force. With k + d alone, a trajectory that ends was replaced too late if a packet was
-lost. A vehicle to which no trajectory has arrived hovers where it was observed.
+lost. A vehicle that no trajectory has reached hovers at its observed position.
 """
 
 from typing import Annotated, NamedTuple
@@ -87,18 +87,15 @@ TINY = 1e-9
 along, guided_to = shared(spline.along), shared(spline.guided_to)
 regulated = shared(spline.regulated)
 follow = shared(spline.follow)
-"""The rule of flight along a spline, compiled for kernels."""
 
 
 class SentTrajectory:
     """Numpy record: a trajectory that was sent, without its knots."""
 
     ends: int
-    """First step at which it is too old to be flown."""
+    """First step at which the trajectory is too old to be flown."""
     spacing: int
-    """Steps from one knot to the next."""
     count: int
-    """Number of its knots."""
 
 
 TRAJECTORY = record(SentTrajectory)
@@ -108,20 +105,18 @@ class Settings(NamedTuple):
     """Constants shared by all vehicles."""
 
     dt_s: float
-    """Length of a step [s]."""
     age_max: int
     """Largest age of an observation that is used [steps]."""
     seen: int
-    """Steps ahead for which the desired trajectory is known, at most H."""
+    """Number of steps for which the desired trajectory is known ahead, at most H."""
     bounds: F1
     """Largest velocity on each axis [m/s]; shape (axes,)."""
     weight: float
     """Weight Q_p on the position [1/m²]."""
     lead_s: F1
-    """Time h of each axis [s]; shape (axes,)."""
+    """Time h [s]; shape (axes,)."""
     error_m: float
-    """`control.spline_error_m`: largest error of a spline on each axis, if KNOTS_MAX suffices
-    [m]."""
+    """`control.spline_error_m`: largest error of a spline, if KNOTS_MAX suffices [m]."""
     plans: bool
     """Whether the nominal motion is sent, and not the desired trajectory itself."""
 
@@ -130,19 +125,16 @@ class Memory(NamedTuple):
     """Newest observation of every vehicle, and the trajectories sent to it."""
 
     sent: Sent
-    """Which trajectories are in force, in flight or lost."""
     state: F3
     """State in the newest observation [m, m/s]; shape (capacity, axes, 2)."""
     trajectories: Annotated[NDArray[np.void], records(TRAJECTORY, 2)]
     """Trajectories in the ring; shape (capacity, RING)."""
     knots: F4
-    """Knots of these trajectories, rounded as they are sent [m, m/s]; shape
-    (capacity, RING, axes, 2 KNOTS_MAX)."""
+    """Knots of these trajectories, rounded as they are sent [m, m/s]; shape (capacity, RING, axes,
+    2 KNOTS_MAX)."""
 
 
 class Guidance(SplineScheme):
-    """The scheme "trajectory"."""
-
     def __init__(self, fleet: Fleet) -> None:
         super().__init__(fleet)
         terms, control, desired = fleet.terms, fleet.scenario.control, fleet.desired
@@ -173,15 +165,12 @@ class Guidance(SplineScheme):
         self.observed_step = self._memory.sent.observed
         self._nominal = make_nominal(terms, control, capacity if plans else 0)
         self._intended = np.zeros((block, axes, desired.seen + 1, 2))
-        """Trajectory of each vehicle that would be sent now, from k on [m, m/s]; shape
-        (block, axes, seen + 1, 2)."""
+        """Trajectory that would be sent now [m, m/s]; shape (block, axes, seen + 1, 2)."""
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         tracker.forget(self._memory.sent, row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         delivery = self._memory.sent.delivery[row]
         if observation.step <= self.observed_step[row]:
             return False
@@ -202,12 +191,8 @@ class Guidance(SplineScheme):
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Make the trajectories that would be sent now, and fill in `figures` and `planned`.
 
-        `planned` has the states at k of the trajectories sent last.
-
-        Args:
-            rows: rows of the vehicles; shape (n,).
-            step: step k of each; shape (n,).
-            foresight: output: first column of `horizons`, the velocity at k as an input.
+        `planned` has the states at k of the trajectories sent last. The first column of `horizons`
+        is the velocity at k, as an input.
         """
         lost, unsolved = _appraise(
             self._settings,
@@ -244,7 +229,6 @@ def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
     """State of the trajectory that would be sent now at a stage, on one axis [m, m/s].
 
     Args:
-        settings: `seen` and `dt_s`.
         intended: states from k on [m, m/s]; shape (seen + 1, 2).
         stage: steps after k.
     """
@@ -261,11 +245,7 @@ def _followed(
     """State of a sent trajectory at a step, on one axis [m, m/s].
 
     Args:
-        settings, memory: constants, and the trajectories that were sent.
-        row: row of the vehicle.
         number: number of the trajectory; negative if the vehicle hovers without one.
-        axis: the axis.
-        step: the step.
     """
     if number < 0:
         return memory.state[row, axis, 0], 0.0
@@ -278,11 +258,10 @@ def _followed(
 
 @part
 def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
-    """Probability π that a packet will arrive, although an observation does not acknowledge it.
+    """Probability π that a packet will still arrive, although an observation does not acknowledge
+    it.
 
     Args:
-        bound: delay samples of the vehicles.
-        row: row of the vehicle.
         loss: loss rate, from 0 to 1.
         since: steps from sending to the observation; negative if the observation is older.
     """
@@ -303,11 +282,8 @@ def _gap(
     """Mean of Q_p Σ (Δp + h Δv)² if a sent trajectory is followed, and |Δp| at k + d [m].
 
     Args:
-        settings, memory: constants, and the trajectories that were sent.
         intended: trajectory that would be sent now [m, m/s]; shape (axes, seen + 1, 2).
-        row: row of the vehicle.
         number: number of the sent trajectory; negative if the vehicle hovers without one.
-        k: present step.
         d: delay bound [steps].
     """
     gap, squares = 0.0, 0.0
@@ -329,9 +305,6 @@ def _intend(
     """Fill in the trajectory that would be sent now; False if the nominal MPC finds no plan.
 
     Args:
-        settings, nominal: constants, and the nominal MPC.
-        row: row of the vehicle.
-        k: present step.
         desired: desired trajectory from k on [m, m/s]; shape (axes, seen + 1 or more, 2).
         intended: output; its first stage, the state at k, is input to the nominal MPC [m, m/s];
             shape (axes, seen + 1, 2).
@@ -360,11 +333,7 @@ def _appraise(
     planned: F3,
     intended: F4,
 ) -> tuple[int, int]:
-    """Fill in `figures`, `planned` and `intended`, see `Guidance.plan`.
-
-    Returns:
-        number of trajectories newly known to be lost, and number of plans not foresight.
-    """
+    """See `Guidance.plan`; returns the numbers of newly lost trajectories and of unsolved plans."""
     sent, lost, unsolved, axes = memory.sent, 0, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
@@ -377,7 +346,8 @@ def _appraise(
         first = first_in_flight(sent, row, delivery.in_force, observed)
         for number in range(first, delivery.sent):
             newest, ends = number, max(ends, memory.trajectories[row, number % RING].ends)
-        # Only if a new one could be flown at k + d: otherwise one would be sent at each step.
+        # Only if a new trajectory could be flown at k + d: otherwise one would be sent at each
+        # step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         for axis in range(axes):
             p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
@@ -423,7 +393,6 @@ def _fit_and_store(
     event: B1,
     splines: Splines,
 ) -> None:
-    """Fit and store the splines that are sent, see `Guidance.remember`."""
     for i in range(len(rows)):
         if not event[i]:
             continue
