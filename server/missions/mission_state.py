@@ -26,13 +26,9 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Largest duration of a motion [steps]."""
 RESTART_STEPS = 20
-<<<<<<< HEAD
-"""Steps after a client's restart up to which an observation may be from before it."""
+"""Number of steps after a client's restart in which an observation may be from before it."""
 PLANNED = np.arange(1.0, INTERVALS + 1.0)
 """Numbers n of a motion's planned knots."""
-=======
-"""Number of steps after a client's restart in which an observation may be from before it."""
->>>>>>> t17
 PLAN_DUE, REPEAT_DUE = 1, 2
 """Flags in `MissionState.due`: a motion may be planned for the vehicle at this step; its latest
 motion is repeated."""
@@ -334,27 +330,20 @@ class MissionState:
         self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
-<<<<<<< HEAD
-        """Present goal of a vehicle [m]; shape (axes,). In a show: where its path leads by the end
-        of a motion that is planned now.
+        """Present goal of a vehicle [m]; shape (axes,). In a show: the point of its path at the end
+        of a motion planned now.
         """
         steps = self.kept_steps + INTERVALS * SPACING if self.is_show else 0
         return self._desired(row, np.array((self.now + self.ahead(row) + steps) * self._dt_s))
 
     def targets(self, row: int) -> Array:
-        """Points of a show's path at the knots of a motion planned now [m]; shape (N, axes)."""
+        """Points of a show's path at the planned knots of a motion [m]; shape (N, axes)."""
         steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
         return self._desired(row, steps * self._dt_s)
 
     def _desired(self, row: int, times_s: Array) -> Array:
-        """Desired positions of a vehicle [m]; shape of the times + (axes,)."""
         desired = self._references(self.number_of(row))(times_s)
         return np.ascontiguousarray(desired[..., 0])  # kernels need contiguous arrays
-=======
-        k = self.now + self.ahead(row)
-        desired = self._references(self.number_of(row))(np.array(k * self._dt_s))
-        return np.ascontiguousarray(desired[:, 0])  # kernels need contiguous arrays
->>>>>>> t17
 
     def resting_places(self, row: int) -> list[Array]:
         """Positions of the other vehicles at rest [m]."""

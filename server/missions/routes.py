@@ -101,7 +101,7 @@ class Graph:
         node."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest path between two positions; empty if it is straight, or absent."""
+        """Corners of the shortest path between two positions; empty if it is straight or absent."""
         start, end, nodes = place[None], goal[None], self._nodes
         if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]
