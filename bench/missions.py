@@ -52,7 +52,7 @@ from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
-from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.scenario.zones import Zones
@@ -321,7 +321,7 @@ def random_mission(options: RandomOptions, seed: int, folder: Path) -> Scenario:
     half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
     shapes = list(_zones(rng, obstacles, half_m))
     apart_m = reading.load("swap").clearances.apart_m
-    kept = zones.parse(" & ".join(shapes), 2)
+    kept = zone_texts.parse(" & ".join(shapes), 2)
     places = _places(rng, vehicles, half_m, kept, apart_m)
     if options.space:
         heights = stream(seed, "heights")

@@ -20,7 +20,16 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
-from skytether.shared.scenario import contradictions, grammar, mission, reading, reference, zones
+from skytether.shared.scenario import (
+    contradictions,
+    grammar,
+    mission,
+    plans,
+    reading,
+    tracks,
+    zone_files,
+    zone_texts,
+)
 from skytether.shared.scenario.air import pings, recorded, traces
 from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.grammar import GrammarError
@@ -72,7 +81,7 @@ class ScenarioFile(Text):
         reading,
         contradictions,
         grammar,
-        reference,
+        tracks,
         toml,
         importlib.import_module("tomllib._parser"),
     )
@@ -121,7 +130,7 @@ class NamedFiles(Text):
     values that can be flown.
     """
 
-    code = (reference, mission, zones, recorded, pings, traces, captures, keys)
+    code = (tracks, mission, plans, zone_files, zone_texts, recorded, pings, traces, captures, keys)
     largest = 20_000
 
     def __init__(self, folder: Path) -> None:
@@ -133,10 +142,29 @@ class NamedFiles(Text):
         feature = '{{"type":"Feature","properties":{},"geometry":{{"type":"{}","coordinates":{}}}}}'
         box = feature.format('{"kind":"fence"}', "Polygon", ring)
         point = feature.format('{"radius_m":3}', "Point", "[4,4]")
+        item = '{"type":"SimpleItem","command":16,"frame":3,"params":[1,0,0,null,47.001,8,9]}'
+        route = (
+            '{"fileType":"Plan","mission":{"plannedHomePosition":[47,8,400],"hoverSpeed":5,'
+            f'"items":[{item}]}},"geoFence":{{"circles":[{{"inclusion":true,"circle":'
+            '{"center":[47,8],"radius":50}}],"polygons":[{"inclusion":false,"polygon":'
+            "[[47,8.001],[47,8.002],[47.001,8.002]]}]}}"
+        )
         texts = (
             "t,x,y\n0,0,0\n5,1.5,-2\n",
             "vehicle,t,x,y\n1,0,0,0\n1,5,4,4\n2,0,9,0\n",
+            "t,lat,lon\n0,47,8\n5,47.0001,8\n",
+            (
+                "duration,x^0,x^1,x^2,x^3,x^4,x^5,x^6,x^7,y^0,y^1,y^2,y^3,y^4,y^5,y^6,y^7\n"
+                "2,0,1,0,0,0,0,0,0,1,0,0,0,0,0,0,0\n"
+            ),
+            route,
             f'{{"type":"FeatureCollection","units":"m","features":[{box},{point}]}}',
+            (
+                "<kml><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>"
+                "8,47 8.001,47 8.001,47.001</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+                "</Placemark></kml>"
+            ),
+            route,
             "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
             "timestamp,rtt\n1700000000000,20\n1700000000200,-1\n",
             "\n".join(map(row.format, (1, 2, 4))),
@@ -156,7 +184,7 @@ class NamedFiles(Text):
             "0\n3\n3\n17\n",
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
-        kinds = b"\0\1\2" + 7 * b"\3" + b"\4\6"
+        kinds = b"\0\1\1\0\0\2\2\2" + 7 * b"\3" + b"\4\6"
         known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
         known.append(b"\5" + capture(0) + capture(9))
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
@@ -166,12 +194,17 @@ class NamedFiles(Text):
         with suppress(ConfigError, GrammarError, ValueError):
             match (payload or b"\0")[0] % 7:
                 case 0:
-                    assert np.isfinite(reference.from_csv(payload[1:], 2)(SAMPLES_S)).all()
+                    assert np.isfinite(tracks.path(payload[1:], 2, (47.0, 8.0))(SAMPLES_S)).all()
                 case 1:
-                    mission.mission(payload[1:], 2).nearest(1.0, 1.0)
+                    found = tracks.tracks(payload[1:], 2, (47.0, 8.0))
+                    for is_show in (False, True):
+                        mission.Mission(found, 2, 1, is_show=is_show).nearest(1.0, 1.0)
                 case 2:
-                    file = File("it", payload[1:])
-                    zones.parse("geojson(it)", 2, (file,)).clearance(np.zeros((2, 2)))
+                    file = File("it", payload[1:], (47.0, 8.0))
+                    for kind in ("geojson", "kml", "plan"):
+                        with suppress(GrammarError):
+                            kept = zone_texts.parse(f"{kind}(it)", 2, (file,))
+                            kept.clearance(np.zeros((2, 2)))
                 case 3:
                     parsed = recorded.recorded_in.__wrapped__(File("it", payload[1:]), "auto")
                     assert np.isfinite(parsed.delay_s).all()

@@ -233,6 +233,13 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
     for vehicle in goals.vehicles if zones else ():
         places = goals.goals(vehicle)
+        if goals.is_show and (zone_name := zones.in_the_way(places, clear_m)):
+            yield (
+                "mission.zones",
+                zone_name,
+                f"none within {clear_m:g} m of the path of vehicle {vehicle}",
+            )
+            return
         near = np.argwhere(zones.clearance(places) < clear_m)
         if len(near):
             goal, zone = near[0]

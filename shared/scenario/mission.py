@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import GrammarError, calls
-from skytether.shared.scenario.reference import (
-    FAR_M,
-    Reference,
-    check_times,
-    read_table,
-    timed_path,
-)
+from skytether.shared.scenario.reference import FAR_M, Reference, timed_path
 
 SWAP_AT_S = 2.0
 """Time at which vehicles that swap places depart."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
-VEHICLES_MAX = 65_535
 CROWDED = 32
 """Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
@@ -363,27 +356,3 @@ def sphere(vehicles: int, radius_m: float, altitude_m: float = 0.0) -> Mission:
         off *= 1.0 if number % 2 else -1.0
         goals[number] = times_s, np.stack([off, -off]) + np.array([0.0, 0.0, altitude_m])
     return Mission(goals, 3, 1)
-
-
-def mission(content: bytes, axes: int, *, is_show: bool = False) -> Mission:
-    """Mission from a CSV table with the columns vehicle, t [s], x, y and, with three axes, z [m].
-
-    Raises:
-        ValueError: the table is invalid; says what and in which line.
-    """
-    rows, lines = read_table(content, ["vehicle", "t", "x", "y", "z"][: axes + 2])
-    numbers = rows[:, 0]
-    valid = (numbers >= 1) & (numbers <= VEHICLES_MAX) & (numbers == np.rint(numbers))
-    if not len(rows) or not valid.all():
-        raise ValueError(f"column vehicle: expected numbers from 1 to {VEHICLES_MAX}")
-    numbers = numbers.astype(np.int64)
-    goals = {}
-    order = np.argsort(numbers, kind="stable")
-    names, begins = np.unique(numbers[order], return_index=True)
-    for number, at in zip(names.tolist(), np.split(order, begins[1:]), strict=True):
-        own = rows[at]
-        check_times(own[:, 1], lines[at])
-        goals[number] = own[:, 1], own[:, 2:]
-    if (np.abs(rows[:, 2:]) > FAR_M).any():
-        raise ValueError(f"expected at most {FAR_M:g} m from the origin")
-    return Mission(goals, axes, 1, is_show=is_show)

@@ -5,9 +5,11 @@ the differences from the other. Every value is checked here, and every file that
 read here, so that endpoints open no files. `skytether scenarios` lists the built-in scenarios.
 """
 
+import io
 import math
 import re
 import typing
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -237,11 +239,23 @@ def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
 
 def _content(where: str, name: str, most: int) -> bytes:
     try:
-        return files.read(Path(name), most)
+        path = Path(name)
+        return _zipped(path, most) if path.is_dir() else files.read(path, most)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         expected = f"a file that can be read ({reason})"
         raise ConfigError(f"{where}: got {_short(repr(name))}, expected {expected}") from None
+
+
+def _zipped(folder: Path, most: int) -> bytes:
+    """The CSV files in a folder, as a zip that is equal for equal files."""
+    content, left = io.BytesIO(), most
+    with zipfile.ZipFile(content, "w") as archive:
+        for path in sorted(folder.glob("*.[cC][sS][vV]")):
+            own = files.read(path, left)
+            left -= len(own)
+            archive.writestr(zipfile.ZipInfo(path.name), own)
+    return content.getvalue()
 
 
 def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:

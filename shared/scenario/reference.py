@@ -4,16 +4,13 @@ A reference is a function from time since the epoch [s; any shape] to the desire
 [m, m/s; that shape + (axes, 2)], in the world frame with the third axis up.
 """
 
-import io
 from collections.abc import Callable
-from contextlib import suppress
-from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import Array
 
 FAR_M = 1e6
 """Largest coordinate of a trajectory [m]."""
@@ -25,9 +22,6 @@ TURN_S = 3600.0
 """Time after which a target's path is run backwards, then forwards again, to bound the memory for
 the random walk."""
 GRID_BLOCK = 1024
-COLUMNS_MAX = 64
-"""Largest number of columns of a table, which bounds time and memory per line."""
-
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
 increasingly sparse up to a day. No round numbers, since a trajectory may be special at those."""
@@ -242,65 +236,3 @@ def sampled(reference: Reference, axes: int) -> bytes:
         if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # NaN fails too
             raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
     return np.rint(1000.0 * states).astype(np.int64).tobytes()
-
-
-def from_csv(content: bytes, axes: int) -> Reference:
-    """Path from a CSV table with the columns t [s], x, y and, with three axes, z [m].
-
-    Raises:
-        ValueError: the table is invalid; says what and in which line.
-    """
-    data, lines = read_table(content, ["t", "x", "y", "z"][: axes + 1])
-    if len(data) < 2:
-        raise ValueError("expected at least two lines of finite numbers")
-    check_times(data[:, 0], lines)
-    return timed_path(data[:, 0], data[:, 1:])
-
-
-def check_times(times_s: Array, lines: Indices) -> None:
-    """Refuse times in a table that do not start at 0, or do not rise, by a ValueError."""
-    if times_s[0] != 0.0:
-        raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
-    for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:
-        after, got = times_s[i : i + 2]
-        raise ValueError(f"line {lines[i + 1]}: expected t above {after:g}, got {got:g}")
-
-
-def read_table(content: bytes, names: list[str]) -> tuple[Array, Indices]:
-    """Named columns of a CSV table, shape (rows, columns), and the number of each row's line.
-
-    Raises:
-        ValueError: the table is invalid; says what and in which line.
-    """
-    import csv  # needed for files only
-
-    try:
-        text = io.StringIO(content.decode("utf-8-sig"), newline="")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"line {line}: expected text in UTF-8") from None
-    table = csv.DictReader(text, skipinitialspace=True)
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    try:
-        table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
-        if len(header) > COLUMNS_MAX:
-            raise ValueError(f"line 1: expected at most {COLUMNS_MAX} columns")
-        if any(name not in header for name in names):
-            got = ", ".join(map(repr, header))[:80] or "nothing"
-            raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
-        for row in table:
-            rows.append(_numbers([row[name] for name in names], table.line_num))
-            lines.append(table.line_num)
-    except csv.Error as error:
-        raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    return np.array(rows).reshape(-1, len(names)), np.array(lines, np.int64)
-
-
-def _numbers(words: list[str | None], line: int) -> list[float]:
-    with suppress(TypeError, ValueError):
-        numbers = [float(word) for word in words]  # type: ignore[arg-type]
-        if all(map(isfinite, numbers)):
-            return numbers
-    got = ", ".join(word or "nothing" for word in words)[:80]
-    raise ValueError(f"line {line}: expected {len(words)} finite numbers, got {got}")

@@ -61,18 +61,20 @@ class File(NamedTuple):
 
     name: str
     content: bytes
+    origin: tuple[float, ...] = ()
+    """Latitude and longitude of the scenario's origin [degrees]; empty: not given."""
 
 
 Files = tuple[File, ...]
 
 
-def content(files: Files, name: str) -> bytes:
+def file_of(files: Files, name: str) -> File:
     """Content of a file that a scenario names; raises ConfigError if it was not read with the
     scenario.
     """
     for file in files:
         if file.name == name:
-            return file.content
+            return file
     raise ConfigError(f"{name}: has not been read")
 
 
@@ -264,10 +266,7 @@ class PluginTable(dict[str, Entry]):
         Raises:
             ConfigError: a file of the call was not read with the scenario.
         """
-        args = [
-            File(str(value), content(files, str(value))) if file else value
-            for value, file in self._args(call)
-        ]
+        args = [file_of(files, str(value)) if file else value for value, file in self._args(call)]
         return self[call.name].make(*given, *args)
 
     def with_files(self, text: str, change: Callable[[str], str]) -> str:

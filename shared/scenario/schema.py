@@ -24,7 +24,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Clearances, bend_m
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario import schemes, zones
+from skytether.shared.scenario import schemes, zone_texts
 from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.grammar import TEXT_MAX, leaves
 from skytether.shared.scenario.mission import Mission
@@ -49,7 +49,7 @@ from skytether.shared.scenario.registry import (
     VEHICLES,
     Entry,
     Files,
-    content,
+    file_of,
 )
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
@@ -65,6 +65,7 @@ TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
 Strength = Annotated[float, Meta(ge=0, le=1e3)]
 Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
 Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
+Degrees = Annotated[float, Meta(ge=-180, le=180)]
 Amount = Annotated[float, Meta(ge=0, le=1e9)]
 Duration = Annotated[float, Meta(ge=0, le=3600)]
 Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
@@ -179,8 +180,11 @@ class ReferenceConfig(Section, frozen=True):
     loop: Term[bool] = False
     """Whether the waypoints are repeated."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """CSV file with the columns t, x, y (and z), for a mission also vehicle; relative to the
-    scenario's folder."""
+    """File with the points and their times, see docs/vehicles.md: CSV with the columns t, x, y (and
+    z), for a mission also vehicle; relative to the scenario's folder."""
+    origin: OfEach[tuple[Degrees, ...]] = ()
+    """Latitude and longitude of the scenario's origin [degrees], for files with coordinates of the
+    globe; default: that of the file, if it has one."""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -454,7 +458,7 @@ class Scenario(Section, frozen=True):
             ConfigError: the file was not read with the scenario.
         """
         file = self.reference.file
-        return content(self.files, file) if self.reference.shape in TABLES else b""
+        return file_of(self.files, file).content if self.reference.shape in TABLES else b""
 
     @property
     def uplink(self) -> air.Path:
@@ -533,7 +537,7 @@ class Scenario(Section, frozen=True):
             points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
             speed_mps=reference.speed_mps,
             loop=reference.loop,
-            table=_digest(self.table),
+            table=_digest(self.table + repr(reference.origin).encode() * bool(reference.origin)),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
@@ -591,7 +595,7 @@ class Scenario(Section, frozen=True):
         Raises:
             GrammarError: the text is invalid.
         """
-        parsed = zones.parse(self.mission.zones, self.model.axes, self.files)
+        parsed = zone_texts.parse(self.mission.zones, self.model.axes, self.files)
         return parsed.to_the_sky() if self.lands else parsed
 
     def entries(self) -> Iterator[Entry]:
@@ -620,7 +624,7 @@ class WithFiles(Scenario, frozen=True):
 
     @property
     def files(self) -> Files:
-        return self.contents
+        return tuple(each._replace(origin=self.reference.origin) for each in self.contents)
 
 
 def _digest(content: bytes) -> str:

@@ -13,6 +13,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import mission as missions
 from skytether.shared.scenario import reference as curves
+from skytether.shared.scenario import tracks
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
@@ -62,8 +63,8 @@ def hover(scenario: Scenario) -> Reference:
 
 @reference
 def csv(scenario: Scenario) -> Reference:
-    """Path from the table in `file`, with the columns t, x, y (and z)."""
-    return curves.from_csv(scenario.table, scenario.model.axes)
+    """Timed path of one vehicle from `file`, straight from point to point."""
+    return tracks.path(scenario.table, scenario.model.axes, scenario.reference.origin)
 
 
 @reference
@@ -103,11 +104,17 @@ def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 1
 
 @reference
 def mission(scenario: Scenario) -> Reference:
-    """Mission with goals from the table in `file`, with the columns vehicle, t, x, y (and z)."""
-    return missions.mission(scenario.table, scenario.model.axes)
+    """Mission with timed goals from `file`, at each of which a vehicle rests."""
+    return _mission(scenario, is_show=False)
 
 
 @reference
 def show(scenario: Scenario) -> Reference:
-    """Mission of timed paths, straight from row to row of the same table, each reached at its t."""
-    return missions.mission(scenario.table, scenario.model.axes, is_show=True)
+    """Mission of timed paths from `file`: each point is reached at its time, and not after it."""
+    return _mission(scenario, is_show=True)
+
+
+def _mission(scenario: Scenario, *, is_show: bool) -> Reference:
+    axes = scenario.model.axes
+    found = tracks.tracks(scenario.table, axes, scenario.reference.origin)
+    return missions.Mission(found, axes, 1, is_show=is_show)

@@ -1,40 +1,18 @@
-"""Zones that vehicles of a mission keep out of, or stay within.
+"""Zones that vehicles of a mission keep out of, or stay within: polygons between two altitudes."""
 
-    box(x0, x1, y0, y1) & cylinder(x, y, radius) & polygon(x, y, x, y, x, y, …)
-    fence(x0, x1, y0, y1) & fence(x, y, x, y, x, y, …) & corridor(width, x, y, x, y, …)
-    geojson(file)
-
-Numbers are metres; zones are joined by & (`shared.scenario.grammar`). `box` and `cylinder` may end
-with two more numbers, the lowest and the highest altitude; otherwise they have no vertical limits.
-Vehicles keep out of `box`, `cylinder` and `polygon`, and stay within every `fence` and `corridor`.
-Every zone is a polygon between two altitudes; a cylinder becomes a polygon of 24 corners around it.
-"""
-
-import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.outlines import Outlines, is_near
-from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.registry import ZONES, File, Files
 
 ROUND = 24
+"""Number of corners of the polygon around a circle."""
 CORNERS_MAX = 1000
-EARTH_M = 6_378_137.0
-"""Equatorial radius of the earth, WGS 84 [m]."""
-METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
-"""Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
-latter is less because degrees are projected onto a plane."""
-NORTH_MAX = 85.0
-CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
-"""The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
-Frame = Callable[[Any], Array]
-"""Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
-_NOWHERE: Array = np.zeros((0, 2))
+"""Largest number of corners of all zones together."""
 
 
 class Zone(NamedTuple):
@@ -208,219 +186,7 @@ def _facing(points: Array, places: Array, at: Indices) -> Planes:
     return Planes(at[apart], off[apart] / away[apart, None], places[apart], away[apart])
 
 
-# -- texts and files of zones ------------------------------------------------------------------
-
-
-def parse(text: str, axes: int, files: Files = ()) -> Zones:
-    """Parse a text of zones; an empty text has none.
-
-    Args:
-        axes: number of axes of the flight.
-        files: files that the text names, with their contents.
-
-    Raises:
-        GrammarError: a part of the text is invalid.
-    """
-    zones: list[Zone] = []
-    for call in ZONES.calls(text):
-        try:
-            if any(not isinstance(each, str) and abs(each) > METRES_MAX for each in call.values):
-                raise ValueError(f"numbers of at most {METRES_MAX:g} m")
-            parsed: list[Zone] = ZONES.make(call, files)
-        except ValueError as error:
-            raise GrammarError(call.text, str(error)) from None
-        zones += [zone if zone.name else zone._replace(name=call.text) for zone in parsed]
-    if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
-        raise GrammarError(f"{text[:40]}…", f"at most {CORNERS_MAX} corners of all zones")
-    for zone in zones:
-        if axes < 3 and (zone.low_m, zone.high_m) != (-math.inf, math.inf):
-            raise GrammarError(zone.name, "no heights with model.axes = 2")
-    return Zones(zones)
-
-
-@ZONES
-def box(x0: float, x1: float, y0: float, y1: float, *heights: float) -> list[Zone]:
-    """Box to keep out of, without vertical limits or between two altitudes."""
-    if not (x0 < x1 and y0 < y1):
-        raise ValueError("box(x0, x1, y0, y1), or with z0, z1: from less to more")
-    return [_between(_corners(x0, x1, y0, y1), heights)]
-
-
-@ZONES
-def cylinder(x: float, y: float, radius: float, *heights: float) -> list[Zone]:
-    """Cylinder to keep out of, without vertical limits or between two altitudes."""
-    if radius <= 0.0:
-        raise ValueError("cylinder(x, y, radius) with a radius above 0")
-    return [_between(_around(x, y, radius), heights)]
-
-
-def _between(corners: Array, heights: Sequence[float]) -> Zone:
-    if len(heights) not in (0, 2) or not all(map(float.__lt__, heights[::2], heights[1::2])):
-        raise ValueError("two heights at the end, from less to more, or none")
-    low, high = heights or (-math.inf, math.inf)
-    return Zone("", corners, low, high)
-
-
-@ZONES
-def polygon(*corners: float) -> list[Zone]:
-    """Polygon to keep out of: x, y of each corner."""
-    return [Zone("", _ring(_points(corners, 3, "polygon")))]
-
-
-@ZONES
-def fence(*corners: float) -> list[Zone]:
-    """Polygon to stay within: x, y of each corner, or x0, x1, y0, y1 of a rectangle."""
-    if len(corners) != 4:
-        return [Zone("", _ring(_points(corners, 3, "fence")), is_fence=True)]
-    x0, x1, y0, y1 = corners
-    if not (x0 < x1 and y0 < y1):
-        raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
-    return [Zone("", _corners(x0, x1, y0, y1), is_fence=True)]
-
-
-@ZONES
-def corridor(width: float, *middle: float) -> list[Zone]:
-    """Corridor to stay within: its width, and x, y of each point of its centre line."""
-    points = _points(middle, 2, "corridor")
-    way = np.diff(points, axis=0)
-    long = np.linalg.norm(way, axis=1, keepdims=True)
-    if width <= 0.0 or (long < 1e-6).any():
-        raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
-    across = np.stack([-way[:, 1], way[:, 0]], axis=1) / long
-    # Mitre joints: the sides of two segments meet on the bisector of their angle.
-    ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])
-    square = (ends**2).sum(axis=1, keepdims=True)
-    if (square[1:-1] < 0.1).any():
-        raise ValueError("a corridor without a turn back")
-    ends[1:-1] *= 2.0 / square[1:-1]
-    sides = [points + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
-    return [Zone("", np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
-
-
-@ZONES
-def geojson(file: File) -> list[Zone]:
-    """Zones in a GeoJSON file, see docs/together.md."""
-    try:
-        collection = json.loads(file.content)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"a GeoJSON file ({error})") from None
-    zones: list[Zone] = []
-    corners = 0
-    for zone in _features(file.name.rpartition("/")[2], collection):
-        zones.append(zone)
-        corners += len(zone.corners)
-        if corners > CORNERS_MAX:  # checking a ring takes quadratic time
-            raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
-    if not zones:
-        raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
-    return zones
-
-
-def _features(file: str, collection: Any) -> Iterator[Zone]:
-    """Zones of a FeatureCollection.
-
-    Coordinates are degrees as in RFC 7946, and the collection's member `origin` has longitude and
-    latitude of the scenario's origin. Instead, a member `"units": "m"` makes coordinates metres.
-    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and `radius_m`
-    for a Point.
-
-    Raises:
-        ValueError: the collection is invalid, or too large.
-        GrammarError: a feature is invalid; the message names it and the expected form.
-    """
-    whole = isinstance(collection, dict) and collection.get("type") == "FeatureCollection"
-    if not (whole and isinstance(collection.get("features"), list)):
-        raise ValueError("a GeoJSON file with a FeatureCollection")
-    placed, corners = _frame(collection), 0
-    for i, feature in enumerate(collection["features"]):
-        try:
-            for zone in _feature(file, i, feature, placed):
-                yield zone
-                corners += len(zone.corners)
-                if corners > CORNERS_MAX:
-                    return  # `geojson` raises
-        except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
-            said = isinstance(error, ValueError)
-            expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
-            raise GrammarError(f"{file}: feature {i + 1}", expected) from None
-
-
-def _frame(collection: dict[str, Any]) -> Frame:
-    """Function from coordinates to metres east and north of the scenario's origin.
-
-    Raises:
-        ValueError: the unit or the origin of the coordinates is missing or invalid.
-    """
-    crs, units, origin = collection.get("crs"), collection.get("units"), collection.get("origin")
-    if crs not in (None, CRS84):
-        raise ValueError(f"no crs, for RFC 7946 has degrees of WGS 84, got {str(crs)[:80]}")
-    if units not in (None, "m"):
-        raise ValueError(f'"units": "m" or none, got {str(units)[:80]!r}')
-    if (units is None) == (origin is None):
-        got = "neither" if origin is None else "both"
-        raise ValueError(
-            'a member "origin" with the longitude and latitude of the scenario\'s origin, if '
-            f'coordinates are degrees, or "units": "m" if they are metres; got {got}'
-        )
-    if origin is None:
-        return lambda points: _near(_places(points), METRES_MAX)
-    if not (isinstance(origin, list) and len(origin) == 2):
-        raise ValueError('"origin": [longitude, latitude]')
-    east, north = map(_number, origin)
-    if not (abs(east) <= 180.0 and abs(north) <= NORTH_MAX):
-        raise ValueError(f'"origin": [longitude, latitude], up to {NORTH_MAX:g} degrees north')
-    return lambda points: _local(_places(points), east, north)
-
-
-def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
-    """Zones of the feature with index i.
-
-    Raises:
-        ValueError: a value is invalid.
-        KeyError, TypeError, AttributeError, IndexError: the feature does not have the structure
-            of GeoJSON.
-    """
-    properties, geometry = feature.get("properties") or {}, feature["geometry"]
-    kind = None if geometry is None else geometry["type"]
-    if kind not in ("Polygon", "MultiPolygon", "Point"):
-        raise ValueError(f"a Polygon, a MultiPolygon or a Point with radius_m, not a {kind}")
-    low = _number(properties.get("low_m", -math.inf), "low_m")
-    high = _number(properties.get("high_m", math.inf), "high_m")
-    if not low < high:
-        raise ValueError(f"low_m below high_m, got {low:g} and {high:g}")
-    role = properties.get("kind", "keep_out")
-    if role not in ("keep_out", "fence"):
-        raise ValueError(f"the property kind to be keep_out or fence, got {str(role)[:80]!r}")
-    is_fence = role == "fence"
-    zone = Zone(f"{file}: {properties.get('name', f'feature {i + 1}')}", _NOWHERE, low, high)
-    coordinates = geometry["coordinates"]
-    if kind == "Point":
-        ((x, y),) = placed([coordinates]).tolist()
-        if "radius_m" not in properties:
-            known = ", ".join(map(str, properties))[:80] or "no properties"
-            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
-        radius = _number(properties["radius_m"], "radius_m")
-        if not 0.0 < radius <= METRES_MAX:
-            raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")
-        yield zone._replace(corners=_around(x, y, radius), is_fence=is_fence)
-        return
-    parts = [coordinates] if kind == "Polygon" else coordinates
-    if is_fence and len(parts) > 1:
-        raise ValueError("one polygon: no vehicle can stay within several separate fences")
-    if not (isinstance(parts, list) and parts and all(parts)):
-        raise ValueError("coordinates, got none")
-    for rings in parts:
-        # A hole in a fence is a zone to keep out of. Other holes are ignored: they cannot be
-        # entered.
-        if len(rings) > 1 and not is_fence:
-            zone = zone._replace(name=f"{zone.name}, with its holes")
-        for number, points in enumerate(rings if is_fence else rings[:1]):
-            corners = _ring(placed(points))
-            name = f"{zone.name}, hole {number}" if number else zone.name
-            yield zone._replace(name=name, corners=corners, is_fence=is_fence and number == 0)
-
-
-def _ring(places: Array) -> Array:
+def ring(places: Array) -> Array:
     """Corners of a polygon's ring, without a last point that repeats the first; of either winding.
 
     Raises:
@@ -448,65 +214,8 @@ def _crosses_itself(corners: Array) -> bool:
     return bool((parted & parted.T).any())
 
 
-def _number(given: Any, key: str = "origin") -> float:
-    """Value of a member as a number; raises ValueError for a text, a truth value, NaN or anything
-    else.
-    """
-    if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
-        raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
-    return float(given)
-
-
-def _places(points: Any) -> Array:
-    """Coordinates as in the file; shape (n, 2). Raises ValueError if they are invalid or have
-    heights.
-    """
-    if not (isinstance(points, list) and points):
-        raise ValueError("coordinates, got none")
-    for point in points:
-        if not (isinstance(point, list) and len(point) in (2, 3)):
-            raise ValueError(f"coordinates of two numbers, got {str(point)[:80]}")
-        if any(_number(each, "coordinates") for each in point[2:]):
-            raise ValueError("no heights in its coordinates: they are the properties low_m, high_m")
-    return np.array([[_number(each, "coordinates") for each in point[:2]] for point in points])
-
-
-def _local(degrees: Array, east: float, north: float) -> Array:
-    """Metres east and north of the origin, from longitude and latitude [degrees]; shape (n, 2).
-
-    A degree of longitude has its length at the mean of the two latitudes, as in ArduPilot.
-
-    Raises:
-        ValueError: a coordinate is out of range.
-    """
-    longitude, latitude = degrees.T
-    if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
-        raise ValueError("coordinates of longitude and latitude")
-    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # works across the antimeridian
-    degree = math.radians(1.0) * EARTH_M
-    scale = np.cos(np.radians((latitude + north) / 2.0))
-    return _near(
-        np.stack([degree * scale * away, degree * (latitude - north)], axis=1), DEGREES_MAX_M
-    )
-
-
-def _near(places: Array, most_m: float) -> Array:
-    if not (np.abs(places) <= most_m).all():
-        raise ValueError(f"coordinates of at most {most_m:g} m from the origin")
-    return places
-
-
-def _corners(x0: float, x1: float, y0: float, y1: float) -> Array:
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def _around(x: float, y: float, radius: float) -> Array:
+def around(x: float, y: float, radius: float) -> Array:
+    """Corners of a polygon around a circle [m]; shape (ROUND, 2)."""
     angle = 2.0 * np.pi * np.arange(ROUND) / ROUND
     out = radius / math.cos(math.pi / ROUND)
     return np.array([x, y]) + out * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _points(given: Sequence[float], least: int, name: str) -> Array:
-    if len(given) % 2 or len(given) < 2 * least:
-        raise ValueError(f"{name} with at least {least} points: x, y, x, y, …")
-    return np.array(given).reshape(-1, 2)

@@ -23,9 +23,8 @@ from skytether.shared.base import kernel
 from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading
+from skytether.shared.scenario import plans, reading, tracks
 from skytether.shared.scenario.mission import Mission
-from skytether.shared.scenario.mission import mission as read_mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record
@@ -36,6 +35,8 @@ from skytether.sim import flight as sim
 
 VEHICLES = 20
 """Default number of vehicles."""
+TRACKS = (".csv", ".zip", ".plan")
+"""Ends of the names of files with timed points."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
@@ -49,8 +50,11 @@ class FleetOptions(ScenarioOptions):
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a CSV file with
-    the columns vehicle, t, x, y (and z), the format of light shows."""
+    """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
+    goals: CSV with the columns vehicle, t, x, y (and z), or a .plan of QGroundControl."""
+    show: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Show in place of a scenario: timed paths in a CSV file, or one file a vehicle in a folder or
+    zip, as of Skybrush, Crazyswarm or MAVSDK."""
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Number of vehicles; by default 20, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -188,32 +192,39 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """Command line in which `--mission` became the scenario, with flags from its table of goals.
+    """Command line in which `--mission` or `--show` became the scenario, with flags for its file.
 
     Raises:
-        CommandError: a scenario is given as well, or the file is no table of goals.
+        CommandError: a scenario is given as well, or the file is no file of tracks.
     """
     missions, rest = plugins.flag_values(argv, "--mission")
-    if "--mission" in rest:
-        raise CommandError("--mission: expected a name or a file", command.CONFIGURATION)
-    if not missions:
+    shows, rest = plugins.flag_values(rest, "--show")
+    for flag in ("--mission", "--show"):
+        if flag in rest:
+            raise CommandError(f"{flag}: expected a name or a file", command.CONFIGURATION)
+    if not (missions or shows):
         return rest
-    mission = missions[-1]
+    flag, file = ("--show", shows[-1]) if shows else ("--mission", missions[-1])
+    other = missions[-1:] if shows else []
     if rest and not rest[0].startswith("-"):
-        said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
+        other = rest[:1]
+    if other:
+        said = f"{flag}: got {other[0]} as well, expected one of the two"
         raise CommandError(said, command.CONFIGURATION)
-    if not mission.endswith(".csv"):
-        return [mission, *rest]
+    if not shows and not (Path(file).suffix in TRACKS or Path(file).is_dir()):
+        return [file, *rest]
     try:
-        with Path(mission).open(encoding="utf-8") as table:
-            axes = 3 if "z" in table.readline().strip().split(",") else 2
-        (read,) = reading.files_of("reference.file", mission)
-        lasts_s = read_mission(read.content, axes).lasts_s
-    except (OSError, ValueError) as error:
-        raise CommandError(f"--mission: {mission}: {error}", command.CONFIGURATION) from None
-    shape = ["--reference.shape", "mission", "--reference.file", mission]
+        (read,) = reading.files_of("reference.file", file)
+        axes = tracks.axes_of(read.content)
+        found = tracks.tracks(read.content, axes, (0.0, 0.0))
+        is_fenced = file.endswith(".plan") and plans.has_fence(read.content)
+    except ValueError as error:
+        raise CommandError(f"{flag}: {file}: {error}", command.CONFIGURATION) from None
+    lasts_s = max(times_s[-1] for times_s, _ in found.values())
+    shape = ["--reference.shape", flag.removeprefix("--"), "--reference.file", file]
+    fence = ["--mission.zones", f'plan("{file}")'] if is_fenced else []
     flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
-    return ["swap", *shape, *flown, *rest]
+    return ["swap", *shape, *fence, *flown, *rest]
 
 
 def _virtually(

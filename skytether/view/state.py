@@ -21,7 +21,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
@@ -512,7 +512,7 @@ class State:
     def kept(self) -> Zones:
         """Zones of a mission; none where their file is on another machine."""
         try:
-            return zones.parse(
+            return zone_texts.parse(
                 self.zones, self.scenario.model.axes, reading.files_of("mission.zones", self.zones)
             )
         except (ConfigError, GrammarError):

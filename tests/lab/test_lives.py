@@ -2,11 +2,11 @@
 
 from lives import Death, Lives
 from skytether.shared.core.events import InZone
-from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.schema import Scenario
 
 BOX = "box(-1.5, 1.5, -1.5, 1.5)"
-CENTRE = zones.parse(BOX, 2)
+CENTRE = zone_texts.parse(BOX, 2)
 
 
 def swap() -> Scenario:
@@ -35,5 +35,5 @@ def test_a_vehicle_found_at_rest_in_a_zone_is_told_and_led_out() -> None:
     flight.fly(45.0)
     told = [event for _, _, event in flight.events if isinstance(event, InZone)]
     assert told
-    assert flight.inside_s(zones.parse("box(-2, 2, -2, 2)", 2), since_s=40.0) == 0.0
+    assert flight.inside_s(zone_texts.parse("box(-2, 2, -2, 2)", 2), since_s=40.0) == 0.0
     assert flight.least_m() > 0.5

@@ -42,7 +42,7 @@ from skytether.shared.core.events import ChangeRefused, SessionEnded
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
-from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.schema import Scenario
@@ -142,7 +142,7 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
     """Under inputs that leave a tenth of the bound to the regulator aboard."""
     terms = scenario(4).terms()
     found = TrajectoryQP(terms, 0.6, 0.0).solve(
-        np.zeros((1, 2)), np.array([velocity]), np.array(goal)
+        np.zeros((1, 2)), np.array([velocity]), np.tile(goal, (INTERVALS, 1))
     )
     assert found is not None
     position, v = found
@@ -167,8 +167,9 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
     terms = reading.load(name).terms()
     axes, plan = terms.axes, TrajectoryQP(terms, 0.6, speed_mps)
     p, v = np.array([[0.3, -2.0, 1.0][:axes]]), np.array([velocity[:axes]])
-    found = plan.solve(p, v, np.array(goal[:axes]))
-    x = plan.solver.solve(*plan.problem(p[0], v[0], np.array(goal[:axes]), None), axes)
+    targets = np.tile(goal[:axes], (INTERVALS, 1))
+    found = plan.solve(p, v, targets)
+    x = plan.solver.solve(*plan.problem(p[0], v[0], targets, None), axes)
     assert (found is None) == (x is None)
     if found is None or x is None:
         return
@@ -779,7 +780,7 @@ def test_a_zone_that_is_drawn_in_flight() -> None:
     swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
     drawn = [(3.0, {"mission.zones": zone})]
     flown = flight.fly(swaps, vehicles=2, changes=drawn)
-    assert clear_m(flown, zones.parse(zone, 2)) > 0.0
+    assert clear_m(flown, zone_texts.parse(zone, 2)) > 0.0
     assert max(left_m(flown, swaps)) < 0.3
     over = [
         (1.0, {"mission.zones": zone}),
@@ -878,7 +879,7 @@ def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
     rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
     home, way = rng.uniform(-3, 3, axes), rng.uniform(-3, 3, (3, axes))
     others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
-    kept = zones.parse("fence(-4, 4, -4, 4) & box(-1, 1, 1, 2)", axes)
+    kept = zone_texts.parse("fence(-4, 4, -4, 4) & box(-1, 1, 1, 2)", axes)
     found = yielding.place_to_yield(
         home, way, others, apart_m, scale, kept, Routes(kept, room_m), room_m
     )
@@ -917,7 +918,7 @@ def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
 
 def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
     """Vehicles at rest may be nearer than plans keep. Ablation: no place would be found for it."""
-    free = zones.Zones([])
+    free = Zones([])
     home, way = np.array([0.91, 0.0]), np.array([[0.0, 0.0], [5.0, 0.0]])
 
     def place() -> Array | None:
@@ -1151,9 +1152,9 @@ def test_a_mission_is_a_table_of_goals(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("vehicle,x,y\n1,0,0\n", "expected the columns vehicle, t, x, y"),
+        ("vehicle,x,y\n1,0,0\n", "expected the columns t, x, y"),
         ("vehicle,t,x,y\n1,1,0,0\n", "line 2: expected t = 0 as the first time, got 1"),
-        ("vehicle,t,x,y\n0,0,0,0\n", "column vehicle: expected numbers from 1"),
+        ("vehicle,t,x,y\n0,0,0,0\n", "line 2: vehicle: expected numbers from 1"),
         ("vehicle,t,x,y\n1,0,nan,0\n", "finite numbers"),
         ("vehicle,t,x,y\n1,0,1e9,0\n", "from the origin"),
     ],

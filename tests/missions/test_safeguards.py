@@ -11,7 +11,7 @@ from skytether.server.missions.separation import too_near
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.motion import SPACING, Motion, resting
-from skytether.shared.scenario import zones
+from skytether.shared.scenario import zone_texts
 from skytether.shared.wire.protocol import NO_HORIZON
 from two_vehicles import DT_S, alone, planned, ready, scenario
 
@@ -111,7 +111,7 @@ def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
 
 def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
     made = ready()
-    made.change_zones(zones.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
+    made.change_zones(zone_texts.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
     way = np.stack([np.linspace(4.0, 0.0, 41), np.zeros(41)], axis=1)
     assert made._enters_zone(way)
     assert not made._enters_zone(way * [-1.0, 1.0] + [8.0, 0.0])
@@ -200,7 +200,7 @@ def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() 
     made.hear(0, 100, NO_HORIZON, 4.0)
     made.hear(1, 100, 70, -4.0)
     made.align(101)
-    assert "vehicle 2" in made.objection(zones.parse("cylinder(20, 20, 1)", 2))
+    assert "vehicle 2" in made.objection(zone_texts.parse("cylinder(20, 20, 1)", 2))
 
 
 def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
@@ -208,7 +208,7 @@ def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
     made = ready()
     made.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
     made.align(165)
-    zone = zones.parse("cylinder(3.4, 0, 0.3)", 2)
+    zone = zone_texts.parse("cylinder(3.4, 0, 0.3)", 2)
     made.state.rows.late[0] = 0.0
     assert not made.objection(zone)
     made.state.rows.late[0] = 60.0
@@ -272,8 +272,8 @@ def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
 def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
     made = ready()
     made.state.rows.late[0] = late
-    assert not made.objection(zones.parse("cylinder(0, 9, 0.5)", 2))
-    assert "vehicle 1 hovers in" in made.objection(zones.parse("cylinder(4, 0, 0.5)", 2))
+    assert not made.objection(zone_texts.parse("cylinder(0, 9, 0.5)", 2))
+    assert "vehicle 1 hovers in" in made.objection(zone_texts.parse("cylinder(4, 0, 0.5)", 2))
 
 
 @pytest.mark.parametrize("late", [0.0, 1e11])

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.mission import Mission, mission
+from skytether.shared.scenario.mission import Mission
+from skytether.shared.scenario.tracks import tracks
 
 Goals = dict[int, tuple[Array, Array]]
 MANY = 20_000
@@ -50,6 +51,30 @@ def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
     assert Mission(turns, 2, 1).nearest(1.0, 1.0) == (1, 2, 4.0, 0.0)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_paths_that_come_too_near_are_found_between_their_points(seed: int) -> None:
+    rng, grid_s = np.random.default_rng(seed), np.linspace(0.0, 12.0, 2401)
+    for _ in range(10):
+        goals: Goals = {}
+        for number in range(1, int(rng.integers(2, 6))):
+            times_s = np.append(0.0, np.sort(rng.choice(10, rng.integers(0, 4), replace=False) + 1))
+            goals[number] = times_s, rng.uniform(-3.0, 3.0, (len(times_s), 3))
+        apart_m, height = rng.uniform(0.1, 1.5), rng.choice([1.0, 0.5, 0.0])
+        show = Mission(goals, 3, 1, is_show=True)
+        places = [show.of(n)(grid_s)[..., 0] * [1.0, 1.0, height] for n in goals]
+        away_m = [np.linalg.norm(a - b, axis=1) for a, b in combinations(places, 2)]
+        least_m = float(np.min(away_m, initial=np.inf))
+        found = show.nearest(apart_m, height)
+        # On the grid a path is at most 2 · 3 √3 · 2 m/s · 2.5 ms from where it is nearest.
+        assert (found is not None) == (least_m < apart_m) or abs(least_m - apart_m) < 0.06
+        if found:
+            one, other, at_s, found_m = found
+            a, b = (show.of(n)(np.array(at_s))[:, 0] * [1.0, 1.0, height] for n in (one, other))
+            assert np.linalg.norm(a - b) == pytest.approx(found_m, abs=1e-9)
+            early = grid_s < at_s - 1.0
+            assert not any((each[early] < apart_m).any() for each in away_m) or found_m < apart_m
+
+
 def grid(vehicles: int) -> Array:
     """Places on a square grid of 1 m."""
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
@@ -59,7 +84,7 @@ def test_many_vehicles_are_checked_in_proportion() -> None:
     lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
     table = "\n".join(["vehicle,t,x,y", *lines]).encode()
     before = resource.getrusage(resource.RUSAGE_SELF)
-    read = mission(table, 2)
+    read = Mission(tracks(table, 2), 2, 1)
     assert read.nearest(0.99, 1.0) is None
     assert read.nearest(1.01, 1.0) == (1, 2, 0.0, 1.0)
     heap = Mission({i + 1: (np.zeros(1), np.zeros((1, 2))) for i in range(MANY)}, 2, 1)
@@ -77,5 +102,5 @@ def test_many_vehicles_are_checked_in_proportion() -> None:
 def test_numbers_of_vehicles_are_those_that_fly() -> None:
     """The link has two bytes for them."""
     for number in (0, 65_536, 1.5):
-        with pytest.raises(ValueError, match="column vehicle: expected numbers"):
-            mission(f"vehicle,t,x,y\n{number},0,0,0\n".encode(), 2)
+        with pytest.raises(ValueError, match="line 2: vehicle: expected numbers"):
+            tracks(f"vehicle,t,x,y\n{number},0,0,0\n".encode(), 2)

@@ -1,6 +1,5 @@
 """Desired trajectories: where they are, how fast, when they come round, and what a file may say."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -194,66 +193,6 @@ def test_a_target_that_turns_now_and_then_flies_straight_in_between() -> None:
     assert turned.sum() == pytest.approx(3000.0 / 4.0, rel=0.1)
     assert (changes[turned] != 0.0).all()  # on both axes at once
     assert (changes**2).sum() / (2 * 3000.0) == pytest.approx(0.3**2, rel=0.1)
-
-
-def test_file_is_flown_in_straight_lines() -> None:
-    desired = reference.from_csv(b"note,t,x,y,z\na,0,1,2,3\nb,2,5,2,1\nc,3,5,0,1\n", 3)
-    assert sample(desired, 0.5) == ([2.0, 2.0, 2.5], [2.0, 0.0, -1.0])
-    assert sample(desired, 2.5) == ([5.0, 1.0, 1.0], [0.0, -2.0, 0.0])
-    assert sample(desired, 3.0) == ([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])
-
-
-def test_file_for_space_can_be_flown_in_the_plane() -> None:
-    desired = reference.from_csv(b"t,x,y,z\n0,0,0,9\n1,2,4,9\n", 2)
-    assert sample(desired, 0.5) == ([1.0, 2.0], [2.0, 4.0])
-
-
-COLUMNS = "line 1: expected the columns t, x, y, got "
-TWO = "expected at least two lines of finite numbers"
-BAD_FILES = [
-    ("", COLUMNS + "nothing"),
-    ("t,x\n0,0\n1,1\n", COLUMNS + "'t', 'x'"),
-    ("t;x;y\n0;0;0\n1;1;1\n", COLUMNS + "'t;x;y'"),
-    ("0,0,0\n1,1,1\n", COLUMNS + "'0', '0', '0'"),
-    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 finite numbers, got 1, one, 1"),
-    # Empty lines count too: the line named is the one that an editor shows.
-    ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 finite numbers, got 1, one, 1"),
-    ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 finite numbers, got 1, 1, nothing"),
-    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 finite numbers, got 1, nothing, 1"),
-    ("t,x,y\n0.1,0,0\n1,1,1\n", "line 2: expected t = 0 as the first time, got 0.1"),
-    ("t,x,y\n0,0,0\n\n2,1,1\n1,2,2\n", "line 5: expected t above 2, got 1"),
-    ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", "line 4: expected t above 1, got 1"),
-    ("t,x,y\n", TWO),
-    ("t,x,y\n0,0,0\n", TWO),
-    ("t,x,y\n0,0,0\n1,nan,1\n", "line 3: expected 3 finite numbers, got 1, nan, 1"),
-    ("t,x,y\n0,0,0\ninf,1,1\n", "line 3: expected 3 finite numbers, got inf, 1, 1"),
-    ("t,x,y\n0,0,0\n1,1e999,1\n", "line 3: expected 3 finite numbers, got 1, 1e999, 1"),
-]
-
-
-def test_a_header_may_have_spaces_and_a_byte_order_mark() -> None:
-    flown = reference.from_csv(b"\xef\xbb\xbft , x , y \n0,0,0\n1,2,4\n", 2)
-    assert sample(flown, 0.5) == ([1.0, 2.0], [2.0, 4.0])
-
-
-def test_text_in_another_encoding_is_named_with_its_line() -> None:
-    with pytest.raises(ValueError, match=r"^line 2: expected text in UTF-8$"):
-        reference.from_csv(b"t,x,y\n0,0,\xff\n", 2)
-
-
-@pytest.mark.parametrize(("text", "message"), BAD_FILES)
-def test_bad_file_says_what_is_wrong(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        reference.from_csv(text.encode(), 2)
-
-
-@pytest.mark.parametrize("lines_before", [0, 1, 2])
-def test_file_that_is_no_table_is_refused_in_words(lines_before: int) -> None:
-    """Somebody's JSON in one long line, as the header or below it."""
-    text = "".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n"
-    line = lines_before + 1
-    with pytest.raises(ValueError, match=rf"^line {line}: field larger than field limit"):
-        reference.from_csv(text.encode(), 2)
 
 
 def test_scenario_with_a_bad_file_names_key_file_and_line(tmp_path: Path) -> None:

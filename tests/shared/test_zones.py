@@ -13,9 +13,10 @@ from helpers import packaged, refusal
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading, zones
+from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.reading import ConfigError
+from skytether.shared.scenario.zone_files import CRS84
 from skytether.shared.scenario.zones import Zones
 from two_vehicles import with_goals
 
@@ -29,7 +30,7 @@ place = st.floats(-6.0, 6.0)
 def away_m(text: str, *points: tuple[float, ...]) -> list[float]:
     """Distance of points from what is forbidden [m]."""
     given = np.array(points)
-    kept = zones.parse(text, given.shape[1])
+    kept = zone_texts.parse(text, given.shape[1])
     found: list[float] = kept.clearance(given).min(axis=1).tolist()
     return found
 
@@ -69,7 +70,7 @@ def test_a_cylinder_lies_within_its_corners() -> None:
 def test_a_straight_piece_is_no_nearer_than_it_says(
     x0: float, y0: float, x1: float, y1: float, text: str
 ) -> None:
-    kept, ends = zones.parse(text, 2), np.array([[x0, y0], [x1, y1]])
+    kept, ends = zone_texts.parse(text, 2), np.array([[x0, y0], [x1, y1]])
     share = np.linspace(0.0, 1.0, 201)[:, None]
     points = ends[0] + share * (ends[1] - ends[0])
     least = float(kept.clearance(points).min())
@@ -97,7 +98,7 @@ def test_straight_pieces_in_space(
     """A piece is near if one of its points is. One that is not level may be taken for nearer, as if
     it were at all of its heights at once.
     """
-    kept, given = zones.parse(text, 3), np.array(ends)
+    kept, given = zone_texts.parse(text, 3), np.array(ends)
     level = given.copy()
     level[:, 2] = given[0, 2]
     share = np.linspace(0.0, 1.0, 201)[:, None]
@@ -111,7 +112,7 @@ def test_straight_pieces_in_space(
 
 @given(place, place, st.floats(0.05, 0.3), st.sampled_from([BOX, U, FENCE, f"{BOX} & {FENCE}"]))
 def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, text: str) -> None:
-    kept, point = zones.parse(text, 2), np.array([[x, y]])
+    kept, point = zone_texts.parse(text, 2), np.array([[x, y]])
     if kept.clearance(point).min() < room_m:
         return
     planes = kept.planes(point, np.array([20.0]))
@@ -124,7 +125,7 @@ def test_a_point_fulfils_its_own_half_planes(x: float, y: float, room_m: float, 
 
 
 def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
-    kept = zones.parse("box(0, 1, 0, 1, 2, 3) & fence(-5, 5, -5, 5)", 3)
+    kept = zone_texts.parse("box(0, 1, 0, 1, 2, 3) & fence(-5, 5, -5, 5)", 3)
     points = np.array([[0.5, 0.5, 1.0], [0.5, 0.5, 9.0]])
     assert kept.clearance(points)[:, 0].tolist() == [1.0, 6.0]
     raised = kept.to_the_sky()
@@ -155,13 +156,13 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
 )
 def test_what_is_no_zone_is_told(text: str, said: str) -> None:
     with pytest.raises(GrammarError) as refused:
-        zones.parse(text, 2)
+        zone_texts.parse(text, 2)
     assert said in str(refused.value)
 
 
-def parsed(text: str, axes: int = 2) -> zones.Zones:
+def parsed(text: str, axes: int = 2) -> Zones:
     """Zones of a text and its files."""
-    return zones.parse(text, axes, reading.files_of("mission.zones", text))
+    return zone_texts.parse(text, axes, reading.files_of("mission.zones", text))
 
 
 def geojson(features: Any, **more: Any) -> str:
@@ -217,7 +218,7 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
         (json.dumps({"features": []}), "FeatureCollection"),
         (json.dumps(MEMBER), "FeatureCollection"),
         (geojson([]), "a GeoJSON file with a Polygon"),
-        (geojson([polygon(SQUARE)], units=None), 'a member "origin" with the longitude'),
+        (geojson([polygon(SQUARE)], units=None), "reference.origin, the latitude and longitude"),
         (geojson([polygon(SQUARE)], units="m", origin=[10, 50]), "got both"),
         (geojson([polygon(SQUARE)], units="ft"), '"units": "m" or none, got \'ft\''),
         (geojson([polygon(SQUARE)], origin=[10]), '"origin": [longitude, latitude]'),
@@ -280,7 +281,7 @@ def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -
     expected = corners(square, [0.0, 0.0])
     assert expected[1] == pytest.approx([111.319491, 0.0])
     assert corners([*square, square[0]], [0.0, 0.0]) == expected
-    assert corners([[*point, 0.0] for point in square], [0, 0], crs=zones.CRS84) == expected
+    assert corners([[*point, 0.0] for point in square], [0, 0], crs=CRS84) == expected
     assert sorted(corners(square[::-1], [0.0, 0.0])) == sorted(expected)
     east = [[-179.9995, y] if x else [179.9995, y] for x, y in square]
     assert corners(east, [179.9995, 0.0]) == expected
@@ -302,8 +303,8 @@ def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
     """By the even-odd rule a vehicle would be free within what is enclosed twice."""
     star = "polygon(0, 10, -6, -8, 9.5, 3, -9.5, 3, 6, -8)"
     with pytest.raises(GrammarError, match="does not cross itself"):
-        zones.parse(star, 2)
-    zones.parse(U, 2)
+        zone_texts.parse(star, 2)
+    zone_texts.parse(U, 2)
 
 
 @pytest.mark.parametrize(
@@ -362,7 +363,7 @@ def length_m(way: Array) -> float:
     ],
 )
 def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) -> None:
-    kept, begin = zones.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
+    kept, begin = zone_texts.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
     way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
     assert len(way) > 2
     assert not comes_near(kept, way, 0.2 - 1e-6)
@@ -370,7 +371,7 @@ def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) 
 
 
 def test_where_there_is_no_way() -> None:
-    kept = zones.parse("fence(-5, 5, -5, 5) & box(-0.5, 0.5, -5, 5)", 2)
+    kept = zone_texts.parse("fence(-5, 5, -5, 5) & box(-0.5, 0.5, -5, 5)", 2)
     routes = Routes(kept, 0.2)
     begin, goal = np.array([-3.0, 0.0]), np.array([3.0, 0.0])
     assert routes.way(begin, goal).tolist() == [[3.0, 0.0]]

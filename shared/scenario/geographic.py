@@ -1,0 +1,84 @@
+"""Coordinates of the globe: longitudes and latitudes, and metres from a scenario's origin."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from skytether.shared.law.model import Array
+
+EARTH_M = 6_378_137.0
+"""Equatorial radius of the earth, WGS 84 [m]."""
+METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
+"""Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
+latter is less because degrees are projected onto a plane."""
+NORTH_MAX = 85.0
+"""Largest latitude [degrees]."""
+Origin = tuple[float, ...]
+"""Latitude and longitude of a scenario's origin [degrees]; empty: not known."""
+
+
+def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
+    """Origin from two members of a file; raises ValueError if they are none.
+
+    Args:
+        form: how the file writes it, for the message.
+    """
+    origin = number(latitude), number(longitude)
+    if not (abs(origin[0]) <= NORTH_MAX and abs(origin[1]) <= 180.0):
+        raise ValueError(f"{form}, up to {NORTH_MAX:g} degrees north or south")
+    return origin
+
+
+def number(given: Any, key: str = "origin") -> float:
+    """Value of a member as a number; raises ValueError for a text, a truth value, NaN or anything
+    else.
+    """
+    if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
+        raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
+    return float(given)
+
+
+def coordinates(points: Any) -> Array:
+    """Coordinates as in the file; shape (n, 2). Raises ValueError if they are invalid or have
+    heights.
+    """
+    if not (isinstance(points, list) and points):
+        raise ValueError("coordinates, got none")
+    for point in points:
+        if not (isinstance(point, list) and len(point) in (2, 3)):
+            raise ValueError(f"coordinates of two numbers, got {str(point)[:80]}")
+        if any(number(each, "coordinates") for each in point[2:]):
+            raise ValueError("no heights in its coordinates: they are the properties low_m, high_m")
+    return np.array([[number(each, "coordinates") for each in point[:2]] for point in points])
+
+
+def local(degrees: Array, origin: Origin) -> Array:
+    """Metres east and north of the origin, from longitude and latitude [degrees]; shape (n, 2).
+
+    A degree of longitude has its length at the mean of the two latitudes, as in ArduPilot.
+
+    Raises:
+        ValueError: a coordinate is out of range, or the origin is not known.
+    """
+    if not origin:
+        raise ValueError(
+            "reference.origin, the latitude and longitude of the scenario's origin: the file's "
+            "coordinates are degrees"
+        )
+    north, east = origin
+    longitude, latitude = degrees.T
+    if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
+        raise ValueError("coordinates of longitude and latitude")
+    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # works across the antimeridian
+    degree = math.radians(1.0) * EARTH_M
+    scale = np.cos(np.radians((latitude + north) / 2.0))
+    return within(
+        np.stack([degree * scale * away, degree * (latitude - north)], axis=1), DEGREES_MAX_M
+    )
+
+
+def within(places: Array, most_m: float) -> Array:
+    if not (np.abs(places) <= most_m).all():
+        raise ValueError(f"coordinates of at most {most_m:g} m from the origin")
+    return places

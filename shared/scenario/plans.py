@@ -1,0 +1,193 @@
+"""Plans of QGroundControl (`.plan`): the geofence as zones, and the mission as a timed route.
+
+Coordinates are degrees; the scenario's origin is `reference.origin`, or else the planned home.
+"""
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.geographic import METRES_MAX, Origin, check_origin, local, number
+from skytether.shared.scenario.grammar import GrammarError
+from skytether.shared.scenario.registry import File
+from skytether.shared.scenario.zones import CORNERS_MAX, ROUND, Zone, around, ring
+
+WAYPOINT, LOITER_TIME, RETURN, LAND, TAKEOFF, SPEED = 16, 19, 20, 21, 22, 178
+"""MAV_CMD of the items that are flown."""
+STILL = frozenset(
+    (93, 195, 197, 201, 203, 204, 205, 206, 214, 530, 531, 532, 2000, 2001, 2500, 2501)
+)
+"""MAV_CMD of items that do not move the vehicle: cameras, gimbals, delays of photos."""
+ITEMS_MAX = 10_000
+"""Largest number of items of a mission."""
+FRAMES = {0: "above the sea", 3: "above home"}
+"""MAV_FRAME of altitudes that can be flown."""
+WRONG = (KeyError, TypeError, AttributeError, IndexError)
+"""Errors of Python where a file has not the structure of a plan."""
+
+
+class Home(NamedTuple):
+    """Origin of a plan's coordinates."""
+
+    origin: Origin
+    altitude_m: float
+    """Altitude of the planned home above the sea [m]."""
+
+    def local(self, latitude: Any, longitude: Any) -> Array:
+        """Metres east and north [m]; shape (2,)."""
+        place = np.array([[number(longitude, "longitude"), number(latitude, "latitude")]])
+        return local(place, self.origin)[0]
+
+
+def fences(file: File) -> list[Zone]:
+    """Zones of a plan's geofence.
+
+    Raises:
+        ValueError: it is no plan, or has no geofence.
+        GrammarError: a part is invalid; the message names it and the expected form.
+    """
+    plan, home = _plan(file.content, file.origin)
+    name, fence, zones = file.name.rpartition("/")[2], plan.get("geoFence") or {}, list[Zone]()
+    for kind in ("polygons", "circles"):
+        for i, part in enumerate(fence.get(kind) or []):
+            title = f"{name}: {kind[:-1]} {i + 1} of the geofence"
+            try:
+                is_fence = bool(part["inclusion"])
+                corners = (_polygon if kind == "polygons" else _circle)(part, home)
+            except ValueError as error:
+                raise GrammarError(title, str(error)) from None
+            except WRONG:
+                raise GrammarError(title, "inclusion, and corners or a centre and radius") from None
+            zones.append(Zone(title, corners, is_fence=is_fence))
+            if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
+                raise ValueError(f"a geofence of at most {CORNERS_MAX} corners")
+    if not zones:
+        raise ValueError("a plan with a geofence")
+    return zones
+
+
+def _polygon(part: Any, home: Home) -> Array:
+    points = part["polygon"][: CORNERS_MAX + 1]
+    return ring(np.array([home.local(*point) for point in points]))
+
+
+def _circle(part: Any, home: Home) -> Array:
+    """Corners around a circle to keep out of, or within a circle to stay within."""
+    centre = home.local(*part["circle"]["center"])
+    radius = number(part["circle"]["radius"], "radius")
+    if not 0.0 < radius <= METRES_MAX:
+        raise ValueError(f"radius above 0, at most {METRES_MAX:g}")
+    x, y = centre.tolist()
+    if part["inclusion"]:
+        radius *= math.cos(math.pi / ROUND)
+    return around(x, y, radius)
+
+
+def has_fence(content: bytes) -> bool:
+    """Whether a plan has a geofence; raises ValueError if it is no plan."""
+    plan, _ = _plan(content, ())
+    fence = plan.get("geoFence") or {}
+    return bool(fence.get("polygons") or fence.get("circles"))
+
+
+def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
+    """Mission of a plan for one vehicle: times [s; shape (n,)] and places [m; shape (n, axes)].
+
+    The vehicle flies straight from place to place, at the plan's speed, and holds where an item
+    says so. It starts at the planned home, and ends where it would land.
+
+    Raises:
+        ValueError: it is no plan, or an item cannot be flown; the message names it.
+    """
+    plan, home = _plan(content, origin)
+    mission = plan.get("mission")
+    if not (isinstance(mission, dict) and mission.get("items")):
+        raise ValueError("a plan with mission items")
+    speed_mps = number(mission.get("hoverSpeed", 0.0), "hoverSpeed")
+    start = np.zeros(3)
+    start[:2] = home.local(*mission["plannedHomePosition"][:2])
+    times, places = [0.0], [start]
+    for count, item in enumerate(_items(mission["items"]), start=1):
+        try:
+            if count > ITEMS_MAX:
+                raise ValueError(f"at most {ITEMS_MAX} items")
+            command, params = int(item["command"]), [*item["params"], *[None] * 7][:7]
+            if command in STILL:
+                continue
+            if command == SPEED:
+                speed_mps = number(params[1], "speed")
+                continue
+            hold_s = (
+                number(params[0] or 0.0, "hold time") if command in (WAYPOINT, LOITER_TIME) else 0.0
+            )
+            place = _place(command, item, params, places[-1], start, home)
+        except ValueError as error:
+            raise ValueError(f"mission item {count}: {error}") from None
+        except WRONG:
+            raise ValueError(f"mission item {count}: expected a command and its params") from None
+        away_m = float(np.linalg.norm(place - places[-1]))
+        if away_m and not 0.0 < speed_mps <= 1e3:
+            raise ValueError(f"mission item {count}: hoverSpeed above 0, got {speed_mps:g}")
+        for wait_s, at in ((away_m / speed_mps if away_m else 0.0, place), (hold_s, place)):
+            if wait_s > 0.0:
+                times.append(times[-1] + wait_s)
+                places.append(at)
+    return np.array(times), np.array(places)[:, :axes]
+
+
+def _items(items: Any, depth: int = 0) -> Iterator[Any]:
+    """Simple items of a mission; those of a survey or corridor scan are within its complex item."""
+    for i, item in enumerate(items):
+        if not isinstance(item, dict) or item.get("type") == "SimpleItem":
+            yield item
+            continue
+        inner = item.get("TransectStyleComplexItem") or {}
+        if depth or not inner.get("Items"):
+            kind = str(item.get("complexItemType"))[:40]
+            expected = "expected a simple item, a survey or a corridor scan"
+            raise ValueError(f"mission item {i + 1}: {expected}, got {kind}")
+        yield from _items(inner["Items"], depth + 1)
+
+
+def _place(
+    command: int, item: Any, params: list[Any], before: Array, start: Array, home: Home
+) -> Array:
+    """Place to which an item leads [m]; shape (3,)."""
+    place = before.copy()
+    if command == RETURN:
+        place[:2] = start[:2]
+        return place
+    if command not in (WAYPOINT, LOITER_TIME, LAND, TAKEOFF):
+        known = "a waypoint, take-off, landing, return or speed"
+        raise ValueError(f"expected {known}, got MAV_CMD {command}")
+    if params[4] or params[5]:
+        place[:2] = home.local(params[4], params[5])
+    if command != LAND:
+        frame = item.get("frame")
+        if frame not in FRAMES:
+            known = " or ".join(FRAMES.values())
+            raise ValueError(f"expected an altitude {known}, got one of frame {frame}")
+        place[2] = number(params[6], "altitude") - (home.altitude_m if frame == 0 else 0.0)
+    return place
+
+
+def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
+    """A plan, and the origin of its coordinates; raises ValueError if it is none."""
+    try:
+        plan = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"a QGroundControl plan ({error})") from None
+    if not isinstance(plan, dict) or plan.get("fileType") != "Plan":
+        raise ValueError('a QGroundControl plan, with "fileType": "Plan"')
+    try:
+        latitude, longitude, altitude_m = plan["mission"]["plannedHomePosition"]
+    except (*WRONG, ValueError):
+        raise ValueError("a plan with plannedHomePosition: latitude, longitude, altitude") from None
+    form = '"plannedHomePosition": [latitude, longitude, altitude]'
+    return plan, Home(
+        origin or check_origin(latitude, longitude, form), number(altitude_m, "altitude of home")
+    )

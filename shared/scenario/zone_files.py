@@ -1,0 +1,218 @@
+"""Zones in GeoJSON and KML files."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.geographic import (
+    METRES_MAX,
+    Origin,
+    check_origin,
+    coordinates,
+    local,
+    number,
+    within,
+)
+from skytether.shared.scenario.grammar import GrammarError
+from skytether.shared.scenario.registry import File
+from skytether.shared.scenario.zones import CORNERS_MAX, Zone, around, ring
+
+CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+"""The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
+Frame = Callable[[Any], Array]
+"""Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
+SHAPES = ("Polygon", "Point", "LineString", "LinearRing", "Track", "Model")
+"""Geometries that a placemark of a KML file may have."""
+_NOWHERE: Array = np.zeros((0, 2))
+
+
+def geojson(file: File) -> list[Zone]:
+    """Zones in a GeoJSON file, see docs/together.md."""
+    try:
+        collection = json.loads(file.content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"a GeoJSON file ({error})") from None
+    zones: list[Zone] = []
+    corners = 0
+    for zone in _features(file.name.rpartition("/")[2], collection, file.origin):
+        zones.append(zone)
+        corners += len(zone.corners)
+        if corners > CORNERS_MAX:  # checking a ring takes quadratic time
+            raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
+    if not zones:
+        raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
+    return zones
+
+
+def kml(file: File, *, is_fence: bool) -> list[Zone]:
+    """Zones of the polygons in a KML file; of a hole, see `geojson`.
+
+    Raises:
+        ValueError: it is no KML file.
+        GrammarError: a placemark is invalid; the message names it and the expected form.
+    """
+    if b"<!DOCTYPE" in file.content or b"<!ENTITY" in file.content:
+        raise ValueError("a KML file without a document type or entities")
+    try:
+        root = ElementTree.fromstring(file.content)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise ValueError(f"a KML file ({error}); a KMZ has to be unpacked") from None
+    zones, name = list[Zone](), file.name.rpartition("/")[2]
+    for i, placemark in enumerate(_below(root, "Placemark")):
+        title = f"{name}: {_text(placemark, 'name') or f'placemark {i + 1}'}"
+        try:
+            zones += _placemark(title, placemark, file.origin, is_fence=is_fence)
+        except ValueError as error:
+            raise GrammarError(title, str(error)) from None
+        if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
+            raise ValueError(f"a KML file of at most {CORNERS_MAX} corners")
+    if not zones:
+        raise ValueError("a KML file with a Polygon in a Placemark")
+    return zones
+
+
+def _placemark(
+    name: str, placemark: ElementTree.Element, origin: Origin, *, is_fence: bool
+) -> Iterator[Zone]:
+    other = next((each for each in SHAPES[1:] for _ in _bare(placemark, each)), "")
+    if other:
+        raise ValueError(f"a Polygon, not a {other}")
+    for polygon in _below(placemark, "Polygon"):
+        for kind in ("outerBoundaryIs", "innerBoundaryIs") if is_fence else ("outerBoundaryIs",):
+            for border in _below(polygon, kind):
+                corners = ring(local(_coordinates(_text(border, "coordinates")), origin))
+                within_it = is_fence and kind == "outerBoundaryIs"
+                yield Zone(name, corners, is_fence=within_it)
+
+
+def _bare(placemark: ElementTree.Element, kind: str) -> Iterator[ElementTree.Element]:
+    """Geometries of a kind in a placemark, but for the rings of its polygons."""
+    rings = {id(each) for polygon in _below(placemark, "Polygon") for each in polygon.iter()}
+    return (each for each in _below(placemark, kind) if id(each) not in rings)
+
+
+def _coordinates(text: str) -> Array:
+    """Longitudes and latitudes in a KML text such as `8.54,47.39,0 8.55,47.39,0`."""
+    points = [point.split(",") for point in text.split()]
+    for point in points:
+        if len(point) not in (2, 3) or float((point[2:] or ["0"])[0]):
+            raise ValueError(f"longitude,latitude without heights, got {','.join(point)[:80]}")
+    return coordinates([[float(each) for each in point[:2]] for point in points])
+
+
+def _below(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Element]:
+    """Elements with a tag, of any namespace, below an element."""
+    return (each for each in element.iter() if str(each.tag).rpartition("}")[2] == tag)
+
+
+def _text(element: ElementTree.Element, tag: str) -> str:
+    return next(((each.text or "").strip() for each in _below(element, tag)), "")
+
+
+def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
+    """Zones of a FeatureCollection.
+
+    Coordinates are degrees as in RFC 7946; the scenario's origin is `reference.origin`, or the
+    collection's member `origin` (longitude and latitude). Instead, a member `"units": "m"` makes
+    coordinates metres.
+    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and `radius_m`
+    for a Point.
+
+    Raises:
+        ValueError: the collection is invalid, or too large.
+        GrammarError: a feature is invalid; the message names it and the expected form.
+    """
+    whole = isinstance(collection, dict) and collection.get("type") == "FeatureCollection"
+    if not (whole and isinstance(collection.get("features"), list)):
+        raise ValueError("a GeoJSON file with a FeatureCollection")
+    placed, corners = _frame(collection, origin), 0
+    for i, feature in enumerate(collection["features"]):
+        try:
+            for zone in _feature(file, i, feature, placed):
+                yield zone
+                corners += len(zone.corners)
+                if corners > CORNERS_MAX:
+                    return  # `geojson` raises
+        except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+            said = isinstance(error, ValueError)
+            expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
+            raise GrammarError(f"{file}: feature {i + 1}", expected) from None
+
+
+def _frame(collection: dict[str, Any], known: Origin) -> Frame:
+    """Function from coordinates to metres east and north of the scenario's origin.
+
+    Args:
+        known: `reference.origin`, which counts more than the collection's member.
+
+    Raises:
+        ValueError: the unit or the origin of the coordinates is missing or invalid.
+    """
+    crs, units, origin = collection.get("crs"), collection.get("units"), collection.get("origin")
+    if crs not in (None, CRS84):
+        raise ValueError(f"no crs, for RFC 7946 has degrees of WGS 84, got {str(crs)[:80]}")
+    if units not in (None, "m"):
+        raise ValueError(f'"units": "m" or none, got {str(units)[:80]!r}')
+    if units is not None and origin is not None:
+        raise ValueError('a member "origin" for degrees or "units": "m" for metres, got both')
+    if units is not None:
+        return lambda points: within(coordinates(points), METRES_MAX)
+    if known or origin is None:
+        return lambda points: local(coordinates(points), known)
+    if not (isinstance(origin, list) and len(origin) == 2):
+        raise ValueError('"origin": [longitude, latitude]')
+    own = check_origin(origin[1], origin[0], '"origin": [longitude, latitude]')
+    return lambda points: local(coordinates(points), own)
+
+
+def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
+    """Zones of the feature with index i.
+
+    Raises:
+        ValueError: a value is invalid.
+        KeyError, TypeError, AttributeError, IndexError: the feature does not have the structure
+            of GeoJSON.
+    """
+    properties, geometry = feature.get("properties") or {}, feature["geometry"]
+    kind = None if geometry is None else geometry["type"]
+    if kind not in ("Polygon", "MultiPolygon", "Point"):
+        raise ValueError(f"a Polygon, a MultiPolygon or a Point with radius_m, not a {kind}")
+    low = number(properties.get("low_m", -math.inf), "low_m")
+    high = number(properties.get("high_m", math.inf), "high_m")
+    if not low < high:
+        raise ValueError(f"low_m below high_m, got {low:g} and {high:g}")
+    role = properties.get("kind", "keep_out")
+    if role not in ("keep_out", "fence"):
+        raise ValueError(f"the property kind to be keep_out or fence, got {str(role)[:80]!r}")
+    is_fence = role == "fence"
+    zone = Zone(f"{file}: {properties.get('name', f'feature {i + 1}')}", _NOWHERE, low, high)
+    coordinates = geometry["coordinates"]
+    if kind == "Point":
+        ((x, y),) = placed([coordinates]).tolist()
+        if "radius_m" not in properties:
+            known = ", ".join(map(str, properties))[:80] or "no properties"
+            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
+        radius = number(properties["radius_m"], "radius_m")
+        if not 0.0 < radius <= METRES_MAX:
+            raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")
+        yield zone._replace(corners=around(x, y, radius), is_fence=is_fence)
+        return
+    parts = [coordinates] if kind == "Polygon" else coordinates
+    if is_fence and len(parts) > 1:
+        raise ValueError("one polygon: no vehicle can stay within several separate fences")
+    if not (isinstance(parts, list) and parts and all(parts)):
+        raise ValueError("coordinates, got none")
+    for rings in parts:
+        # A hole in a fence is a zone to keep out of. Other holes are ignored: they cannot be
+        # entered.
+        if len(rings) > 1 and not is_fence:
+            zone = zone._replace(name=f"{zone.name}, with its holes")
+        for hole, points in enumerate(rings if is_fence else rings[:1]):
+            corners = ring(placed(points))
+            name = f"{zone.name}, hole {hole}" if hole else zone.name
+            yield zone._replace(name=name, corners=corners, is_fence=is_fence and not hole)

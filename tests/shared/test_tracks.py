@@ -1,0 +1,273 @@
+"""Tracks from tables and files of other programs."""
+
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import reading, tracks
+from skytether.shared.scenario.reference import Reference
+
+ORIGIN = (47.0, 8.0)
+DEGREE_M = 111_319.49
+"""Length of a degree of latitude [m]."""
+
+
+def sample(desired: Reference, at_s: float) -> tuple[list[float], list[float]]:
+    state = desired(np.array(at_s))
+    return state[:, 0].tolist(), state[:, 1].tolist()
+
+
+def zipped(**files: str) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(name.replace("_", " ") + ".csv", text)
+    return content.getvalue()
+
+
+def test_file_is_flown_in_straight_lines() -> None:
+    desired = tracks.path(b"note,t,x,y,z\na,0,1,2,3\nb,2,5,2,1\nc,3,5,0,1\n", 3)
+    assert sample(desired, 0.5) == ([2.0, 2.0, 2.5], [2.0, 0.0, -1.0])
+    assert sample(desired, 2.5) == ([5.0, 1.0, 1.0], [0.0, -2.0, 0.0])
+    assert sample(desired, 3.0) == ([5.0, 0.0, 1.0], [0.0, 0.0, 0.0])
+
+
+def test_file_for_space_can_be_flown_in_the_plane() -> None:
+    desired = tracks.path(b"t,x,y,z\n0,0,0,9\n1,2,4,9\n", 2)
+    assert sample(desired, 0.5) == ([1.0, 2.0], [2.0, 4.0])
+
+
+COLUMNS = (
+    "line 1: expected the columns t, x, y; or t, lat, lon; or Time [msec], x [m], y [m]; or "
+    "t, px, py; got "
+)
+BAD_FILES = [
+    ("", COLUMNS + "nothing"),
+    ("t,x\n0,0\n1,1\n", COLUMNS + "'t', 'x'"),
+    ("t;x;y\n0;0;0\n1;1;1\n", COLUMNS + "'t;x;y'"),
+    ("0,0,0\n1,1,1\n", COLUMNS + "'0', '0', '0'"),
+    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 finite numbers, got 1, one, 1"),
+    # Empty lines count too: the line named is the one that an editor shows.
+    ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 finite numbers, got 1, one, 1"),
+    ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 finite numbers, got 1, 1, nothing"),
+    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 finite numbers, got 1, nothing, 1"),
+    ("t,x,y\n0.1,0,0\n1,1,1\n", "line 2: expected t = 0 as the first time, got 0.1"),
+    ("t,x,y\n0,0,0\n\n2,1,1\n1,2,2\n", "line 5: expected t above 2, got 1"),
+    ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", "line 4: expected t above 1, got 1"),
+    ("t,x,y\n", "expected at least one line of numbers"),
+    ("t,x,y\n0,0,0\n", "expected at least two points"),
+    ("t,x,y,vehicle\n0,0,0,0\n", "line 2: vehicle: expected numbers from 1 to 65535"),
+    ("t,x,y,vehicle\n0,0,0,1\n1,0,0,1.5\n", "line 3: vehicle: expected numbers from 1 to 65535"),
+    (
+        "t,x,y,vehicle\n0,0,0,1\n0,0,3,2\n",
+        "expected one vehicle, got 2; with reference.shape = mission or show it is flown",
+    ),
+    (
+        "t,lat,lon\n0,47,8\n1,47,8\n",
+        (
+            "reference.origin, the latitude and longitude of the "
+            "scenario's origin: the file's coordinates are degrees"
+        ),
+    ),
+    (
+        "duration,x^0\n1,0\n",
+        (
+            "line 1: expected the columns duration, x^0, x^1, x^2, x^3, x^4, x^5, "
+            "x^6, x^7, y^0, y^1, y^2, y^3, y^4, y^5, y^6, y^7, got 'duration', 'x^0'"
+        ),
+    ),
+    ("t,x,y\n0,0,0\n1,nan,1\n", "line 3: expected 3 finite numbers, got 1, nan, 1"),
+    ("t,x,y\n0,0,0\ninf,1,1\n", "line 3: expected 3 finite numbers, got inf, 1, 1"),
+    ("t,x,y\n0,0,0\n1,1e999,1\n", "line 3: expected 3 finite numbers, got 1, 1e999, 1"),
+]
+
+
+def test_a_header_may_have_spaces_and_a_byte_order_mark() -> None:
+    flown = tracks.path(b"\xef\xbb\xbft , x , y \n0,0,0\n1,2,4\n", 2)
+    assert sample(flown, 0.5) == ([1.0, 2.0], [2.0, 4.0])
+
+
+def test_text_in_another_encoding_is_named_with_its_line() -> None:
+    with pytest.raises(ValueError, match=r"^line 2: expected text in UTF-8$"):
+        tracks.path(b"t,x,y\n0,0,\xff\n", 2)
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_FILES)
+def test_bad_file_says_what_is_wrong(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        tracks.path(text.encode(), 2)
+
+
+@pytest.mark.parametrize("lines_before", [1, 2])
+def test_file_that_is_no_table_is_refused_in_words(lines_before: int) -> None:
+    """Somebody's JSON in one long line, as the header or below it."""
+    text = "".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n"
+    line = lines_before + 1
+    with pytest.raises(ValueError, match=rf"^line {line}: field larger than field limit"):
+        tracks.path(text.encode(), 2)
+
+
+def only(found: tracks.Tracks) -> tuple[list[float], Array]:
+    (number,) = found
+    assert number == 1
+    return found[1][0].tolist(), found[1][1]
+
+
+def test_a_skybrush_table_is_in_milliseconds() -> None:
+    text = "Time [msec],x [m],y [m],z [m],Red,Green,Blue\n0,1,2,0,255,0,0\n500,1,2,3.5,0,0,255\n"
+    times_s, points_m = only(tracks.tracks(text.encode(), 3))
+    assert times_s == [0.0, 0.5]
+    assert points_m.tolist() == [[1.0, 2.0, 0.0], [1.0, 2.0, 3.5]]
+
+
+def test_a_mavsdk_table_is_north_east_down() -> None:
+    text = "idx,t,px,py,pz,vx,vy,vz,yaw\n0,0,5,-2,0,0,0,0,0\n1,0.5,6,-2,-10,0,0,0,0\n"
+    _, points_m = only(tracks.tracks(text.encode(), 3))
+    assert points_m.tolist() == [[-2.0, 5.0, 0.0], [-2.0, 6.0, 10.0]]
+
+
+def test_a_table_of_the_globe_is_metres_from_the_origin() -> None:
+    text = "t,lat,lon,alt\n0,47,8,0\n9,47.001,8.001,30\n"
+    _, points_m = only(tracks.tracks(text.encode(), 3, ORIGIN))
+    east_m = 0.001 * DEGREE_M * np.cos(np.radians(47.0005))
+    assert points_m[0].tolist() == [0.0, 0.0, 0.0]
+    assert points_m[1] == pytest.approx([east_m, 0.001 * DEGREE_M, 30.0], abs=0.01)
+
+
+def polynomials(*pieces: tuple[float, list[float], list[float]]) -> bytes:
+    names = [f"{axis}^{power}" for axis in "xyz" for power in range(8)]
+    rows = [
+        [length_s, *x, *[0.0] * (8 - len(x)), *y, *[0.0] * (8 - len(y)), *[0.0] * 8]
+        for length_s, x, y in pieces
+    ]
+    lines = [",".join(["duration", *names]), *(",".join(map(str, row)) for row in rows)]
+    return "\n".join(lines).encode()
+
+
+def test_a_crazyswarm_table_is_flown_along_its_polynomials() -> None:
+    """x = t² for 2 s, then 4 + 4 t for 1 s; y = t³ and then rest at 8."""
+    text = polynomials((2.0, [0, 0, 1], [0, 0, 0, 1]), (1.0, [4, 4], [8]))
+    times_s, points_m = only(tracks.tracks(text, 3))
+    assert times_s == pytest.approx(np.arange(61) / 20)
+    first = np.arange(41) / 20
+    assert points_m[:41, 0] == pytest.approx(first**2)
+    assert points_m[:41, 1] == pytest.approx(first**3)
+    assert points_m[-1] == pytest.approx([8.0, 8.0, 0.0])
+    position, velocity = sample(tracks.path(text, 2), 2.52)
+    assert position == pytest.approx([6.08, 8.0])
+    assert velocity == pytest.approx([4.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("pieces", "said"),
+    [
+        ([(0.0, [1.0], [1.0])], "line 2: duration: expected more than 0"),
+        ([(1.0, [1.0], [1.0]), (-1.0, [1.0], [1.0])], "line 3: duration: expected more than 0"),
+        ([(1e9, [1.0], [1.0])], "duration: expected at most 50000 s together"),
+        (
+            [(100.0, [0, 0, 0, 0, 0, 0, 0, 1e300], [0.0])],
+            "expected at most 1e+06 m from the origin",
+        ),
+    ],
+)
+def test_polynomials_that_cannot_be_flown_are_refused(pieces: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+        tracks.tracks(polynomials(*pieces), 3)
+
+
+def test_a_zip_has_a_vehicle_a_file_in_the_order_of_their_numbers() -> None:
+    files = {f"Drone_{n}": f"t,x,y\n0,{n},0\n1,{n},1\n" for n in (10, 2, 1)}
+    found = tracks.tracks(zipped(**files), 2)
+    assert {number: points[0, 0] for number, (_, points) in found.items()} == {1: 1, 2: 2, 3: 10}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (zipped(), "expected CSV files, at most 65535 with 64 MB together, got 0"),
+        (zipped(a="t,x,y\n1,0,0\n"), "a.csv: line 2: expected t = 0 as the first time, got 1"),
+        (zipped(a="vehicle,t,x,y\n1,0,0,0\n2,0,9,0\n"), "a.csv: expected one vehicle a file"),
+        (b"PK\x03\x04nothing", "expected a zip that can be read (File is not a zip file)"),
+        (zipped(a="t,x,y\n" + "0,0,0\n" * 11_000_000), "got 1"),
+    ],
+    ids=["empty", "late", "two", "torn", "bomb"],
+)
+def test_a_zip_that_cannot_be_flown_is_refused(content: bytes, said: str) -> None:
+    with pytest.raises(ValueError, match=f"{re.escape(said)}$"):
+        tracks.tracks(content, 2)
+
+
+def test_a_folder_is_read_like_a_zip(tmp_path: Path) -> None:
+    for number in (1, 2):
+        (tmp_path / f"cf{number}.csv").write_text(f"t,x,y\n0,{3 * number},0\n9,{3 * number},2\n")
+    (tmp_path / "notes.txt").write_text("no table")
+    it = tmp_path / "it.toml"
+    it.write_text('extends = "swap"\nreference.shape = "show"\nreference.file = "."\n')
+    scenario = reading.load(str(it))
+    assert scenario.make_reference(2)(np.array(4.5))[:, 0].tolist() == [6.0, 1.0]
+    assert scenario.terms() == reading.load(str(it)).terms()
+
+
+def item(command: int, *params: Any, frame: int = 3) -> dict[str, Any]:
+    filled = [*params, *[0] * (7 - len(params))]
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": filled}
+
+
+def plan(*items: Any, **mission: Any) -> bytes:
+    own = {"plannedHomePosition": [*ORIGIN, 400.0], "hoverSpeed": 5, "items": items, **mission}
+    return json.dumps({"fileType": "Plan", "mission": own}).encode()
+
+
+NORTH = 47.0 + 100.0 / DEGREE_M
+"""Latitude 100 m north of the origin [degrees]."""
+
+
+def test_a_plan_is_flown_from_place_to_place_at_its_speed() -> None:
+    survey = {
+        "type": "ComplexItem",
+        "complexItemType": "survey",
+        "TransectStyleComplexItem": {"Items": [item(16, 0, 0, 0, 0, 47.0, 8.0, 20), item(206, 9)]},
+    }
+    flown = plan(
+        item(22, 0, 0, 0, None, 0, 0, 20),
+        item(16, 3, 0, 0, None, NORTH, 8.0, 420, frame=0),
+        item(178, 1, 10, -1),
+        survey,
+        item(20),
+    )
+    times_s, points_m = only(tracks.tracks(flown, 3))
+    assert times_s == pytest.approx([0.0, 4.0, 24.0, 27.0, 37.0], abs=0.01)
+    home, over, north = [0, 0, 0], [0, 0, 20], [0, 100, 20]
+    assert points_m == pytest.approx(np.array([home, over, north, north, over]), abs=0.01)
+
+
+def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
+    _, points_m = only(tracks.tracks(plan(item(16, 0, 0, 0, 0, NORTH, 8.0, 9)), 3, (NORTH, 8.0)))
+    assert points_m == pytest.approx(np.array([[0, -100, 0], [0, 0, 9]]), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b'{"fileType":"Rally"}', 'a QGroundControl plan, with "fileType": "Plan"'),
+        (b"{", "a QGroundControl plan ("),
+        (plan(), "a plan with mission items"),
+        (plan(item(16, 0, 0, 0, 0, 47, 8, 9, frame=10)), "got one of frame 10"),
+        (plan(item(84, 0, 0, 0, 0, 47, 8, 9)), "mission item 1: expected a waypoint, "),
+        (plan(item(16, 0, 0, 0, 0, "n", 8, 9)), "mission item 1: latitude a number, got 'n'"),
+        (plan(item(16, 0, 0, 0, 0, 57, 8, 9)), "mission item 1: coordinates of at most"),
+        (plan(item(16, 0, 0, 0, 0, NORTH, 8, 9), hoverSpeed=0), "hoverSpeed above 0, got 0"),
+        (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "fwLandingPattern"),
+        (plan(item(16), plannedHomePosition=[1]), "a plan with plannedHomePosition"),
+    ],
+)
+def test_a_plan_that_cannot_be_flown_is_refused(content: bytes, said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        tracks.tracks(content, 3)
