@@ -52,18 +52,19 @@ class TableForm(NamedTuple):
     """Time and three coordinates, the last for flights with three axes."""
     tick_s: float
     """Unit of the time [s]."""
-    place: Callable[[Array, Origin], Array]
+    place: Callable[[Array, Origin | None], Array]
 
 
-def _east_north_up(coordinates: Array, _: Origin) -> Array:
+def _east_north_up(coordinates: Array, _: Origin | None) -> Array:
     return coordinates
 
 
-def _from_ned(coordinates: Array, _: Origin) -> Array:
+def _from_ned(coordinates: Array, _: Origin | None) -> Array:
     return np.concatenate([coordinates[:, 1::-1], -coordinates[:, 2:]], axis=1)
 
 
-def _from_globe(coordinates: Array, origin: Origin) -> Array:
+def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
+    origin = tuple(coordinates[0, :2].tolist()) if origin is None else origin
     return np.concatenate([local(coordinates[:, 1::-1], origin), coordinates[:, 2:]], axis=1)
 
 
@@ -75,11 +76,11 @@ FORMS = (
 )
 
 
-def tracks(content: bytes, axes: int, origin: Origin = ()) -> Tracks:
+def tracks(content: bytes, axes: int, origin: Origin | None = ()) -> Tracks:
     """Tracks in a file, of one of the kinds above.
 
     Args:
-        origin: latitude and longitude of the scenario's origin [degrees].
+        origin: latitude and longitude of the scenario's origin [degrees]; None: any.
 
     Raises:
         ValueError: the file is invalid; says what and where.
@@ -87,7 +88,7 @@ def tracks(content: bytes, axes: int, origin: Origin = ()) -> Tracks:
     if content.startswith(b"PK"):
         found = _zip(content, axes, origin)
     elif content.lstrip()[:1] == b"{":
-        found = {1: plans.route(content, axes, origin)}
+        found = {1: plans.route(content, axes, origin or ())}
     else:
         found = _table(content, axes, origin)
     if not all((np.abs(points_m) <= FAR_M).all() for _, points_m in found.values()):
@@ -111,6 +112,15 @@ def path(content: bytes, axes: int, origin: Origin = ()) -> Reference:
     return timed_path(times_s, points_m)
 
 
+def lasts_s(content: bytes, axes: int) -> float:
+    """Time of the last point in a file, wherever the scenario's origin is [s].
+
+    Raises:
+        ValueError: the file is invalid; says what and where.
+    """
+    return float(max(times_s[-1] for times_s, _ in tracks(content, axes, None).values()))
+
+
 def axes_of(content: bytes) -> int:
     """Number of axes of a file: 3 if its points have heights."""
     head = content[:4096].partition(b"\n")[0].decode("utf-8-sig", "replace")
@@ -119,7 +129,7 @@ def axes_of(content: bytes) -> int:
     return 2 if flat else 3
 
 
-def _table(content: bytes, axes: int, origin: Origin) -> Tracks:
+def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     """Tracks in a table, with a column `vehicle` or of one vehicle."""
     header = _header(content)
     if "duration" in header:
@@ -175,7 +185,7 @@ def _polynomials(content: bytes, axes: int) -> tuple[Array, Array]:
     return np.concatenate(times), np.concatenate(points)
 
 
-def _zip(content: bytes, axes: int, origin: Origin) -> Tracks:
+def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     """Tracks of the CSV files in a zip, one vehicle each, in the natural order of their names."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

@@ -164,7 +164,9 @@ def fleet(argv: Sequence[str]) -> None:
     if options.figure:
         figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
-    title = f"{vehicles} vehicles, {options.scenario}, {where}, seed {options.config.seed}"
+    name = Path(options.config.reference.file).name or options.scenario
+    count = f"{vehicles} vehicle{'s' * (vehicles != 1)}"
+    title = f"{count}, {name}, {where}, seed {options.config.seed}"
     terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
@@ -214,13 +216,12 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     if not shows and not (Path(file).suffix in TRACKS or Path(file).is_dir()):
         return [file, *rest]
     try:
-        (read,) = reading.files_of("reference.file", file)
+        (read,) = reading.files_of(flag, file)
         axes = tracks.axes_of(read.content)
-        found = tracks.tracks(read.content, axes, (0.0, 0.0))
+        lasts_s = tracks.lasts_s(read.content, axes)
         is_fenced = file.endswith(".plan") and plans.has_fence(read.content)
     except ValueError as error:
         raise CommandError(f"{flag}: {file}: {error}", command.CONFIGURATION) from None
-    lasts_s = max(times_s[-1] for times_s, _ in found.values())
     shape = ["--reference.shape", flag.removeprefix("--"), "--reference.file", file]
     fence = ["--mission.zones", f'plan("{file}")'] if is_fenced else []
     flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]

@@ -183,6 +183,57 @@ def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None
     assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
 
 
+def test_a_show_is_flown_from_a_folder_of_skybrush(tmp_path: Path) -> None:
+    folder = tmp_path / "show"
+    folder.mkdir()
+    for n, y in ((1, 0.0), (2, 3.0)):
+        rows = [f"{t * 1000},{max(t - 6, 0)},{y},2,255,0,0" for t in range(15)]
+        rows = ["Time [msec],x [m],y [m],z [m],Red,Green,Blue", *rows]
+        (folder / f"Drone {n}.csv").write_text("\n".join(rows))
+    shown = fleet_command(tmp_path, "--show", str(folder), "--virtual")
+    assert (shown["vehicles"], shown["duration_s"]) == (2, 44.0)
+    assert shown["rmse_xy"][2] < 0.2
+    assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_plan_is_flown_within_its_geofence(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def plan(east: float) -> str:
+        item = {
+            "type": "SimpleItem",
+            "command": 16,
+            "frame": 3,
+            "params": [0, 0, 0, 0, 47, east, 2],
+        }
+        corners = [[46.9999, 7.9999], [46.9999, 8.0002], [47.0001, 8.0002], [47.0001, 7.9999]]
+        mission = {"plannedHomePosition": [47, 8, 0], "hoverSpeed": 1, "items": [item]}
+        fence = {"polygons": [{"inclusion": True, "polygon": corners}]}
+        file = tmp_path / "site.plan"
+        file.write_text(json.dumps({"fileType": "Plan", "mission": mission, "geoFence": fence}))
+        return str(file)
+
+    flown = fleet_command(tmp_path, "--mission", plan(8.0001), "--virtual", "--duration", "20")
+    assert flown["vehicles"] == 1
+    line = refused(["fleet", "--mission", plan(8.0003), "--virtual"], capfd)
+    assert "mission.zones: got site.plan: polygon 1 of the geofence, expected a fence" in line
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--show", "it.csv", "--mission", "swap"], "--show: got swap as well"),
+        (["demo", "--show", "it.csv"], "--show: got demo as well"),
+        (["--show"], "--show: expected a name or a file"),
+        (["--show", "it.csv"], "--show: got 'it.csv', expected a file that can be read"),
+    ],
+)
+def test_a_show_beside_something_else_is_refused(
+    argv: list[str], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert refused(["fleet", *argv], capfd).startswith(f"fleet: {said}")
+
+
 def test_a_mission_that_cannot_be_read_is_refused_in_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

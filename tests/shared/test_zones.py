@@ -1,6 +1,7 @@
 """Zones: what a scenario writes, how far points are from them, and ways around."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -377,3 +378,110 @@ def test_where_there_is_no_way() -> None:
     assert routes.way(begin, goal).tolist() == [[3.0, 0.0]]
     assert not routes.reaches(begin, goal)
     assert Routes(Zones(), 0.2).reaches(begin, goal)
+
+
+def placemark(*parts: str, name: str = "roof") -> str:
+    return f"<Placemark><name>{name}</name>{''.join(parts)}</Placemark>"
+
+
+def polygon_of(*rings: str) -> str:
+    kinds = ["outerBoundaryIs", *["innerBoundaryIs"] * (len(rings) - 1)]
+    borders = [
+        f"<{kind}><LinearRing><coordinates>{ring}</coordinates></LinearRing></{kind}>"
+        for kind, ring in zip(kinds, rings, strict=True)
+    ]
+    return f"<Polygon>{''.join(borders)}</Polygon>"
+
+
+OUTER = "8,47,0 8.01,47,0 8.01,47.01,0 8,47.01,0 8,47,0"
+INNER = "8.002,47.002 8.004,47.002 8.004,47.004"
+
+
+def kml(tmp_path: Path, text: str, kind: str = "") -> Zones:
+    file = tmp_path / "area.kml"
+    file.write_text(
+        f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{text}</Document></kml>'
+    )
+    (read,) = reading.files_of("mission.zones", f'kml("{file}")')
+    return zone_texts.parse(f'kml("{file}"{kind})', 2, (read._replace(origin=(47.0, 8.0)),))
+
+
+def test_polygons_of_a_kml_file_are_kept_out_of_or_stayed_within(tmp_path: Path) -> None:
+    text = placemark(polygon_of(OUTER, INNER)) + placemark(polygon_of(INNER), name="pond")
+    out = kml(tmp_path, text)
+    assert [(each.name, each.is_fence, len(each.corners)) for each in out.zones] == [
+        ("area.kml: roof", False, 4),
+        ("area.kml: pond", False, 3),
+    ]
+    assert out.zones[0].corners[2] == pytest.approx([759.1, 1113.2], abs=0.2)
+    within = kml(tmp_path, placemark(polygon_of(OUTER, INNER)), ", fence")
+    assert [(each.is_fence, len(each.corners)) for each in within.zones] == [(True, 4), (False, 3)]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "a KML file with a Polygon in a Placemark"),
+        ("<open", "a KML file ("),
+        (placemark("<Point><coordinates>8,47</coordinates></Point>"), "a Polygon, not a Point"),
+        (placemark("<LineString/>"), "a Polygon, not a LineString"),
+        (placemark(polygon_of("8,47,30 8.1,47,30 8,47.1,30")), "without heights, got 8,47,30"),
+        (placemark(polygon_of("8,47 8.1,47")), "at least 3 corners"),
+        (placemark(polygon_of("8,47 8.1,47 nan,47.1")), "a number"),
+        (placemark(polygon_of("8,47 8.1,47 east,47.1")), "east"),
+        (placemark(polygon_of(OUTER.replace("8.01", "9.9"))), "of at most 100000 m"),
+    ],
+)
+def test_a_kml_file_that_has_no_zones_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(GrammarError, match=re.escape(said)):
+        kml(tmp_path, text)
+
+
+def test_entities_of_a_kml_file_are_not_expanded(tmp_path: Path) -> None:
+    file = tmp_path / "bomb.kml"
+    file.write_text('<!DOCTYPE k [<!ENTITY a "aaaaaaaa">]><kml>&a;</kml>')
+    read = reading.files_of("mission.zones", f'kml("{file}")')
+    with pytest.raises(GrammarError, match="without a document type"):
+        zone_texts.parse(f'kml("{file}")', 2, read)
+
+
+def geofence(tmp_path: Path, **fence: Any) -> Zones:
+    file = tmp_path / "site.plan"
+    home = {"plannedHomePosition": [47.0, 8.0, 400.0]}
+    file.write_text(json.dumps({"fileType": "Plan", "mission": home, "geoFence": fence}))
+    return zone_texts.parse(
+        f'plan("{file}")', 2, reading.files_of("mission.zones", f'plan("{file}")')
+    )
+
+
+def test_a_geofence_of_a_plan_is_stayed_within_and_kept_out_of(tmp_path: Path) -> None:
+    corners = [[47.0, 8.0], [47.0, 8.01], [47.01, 8.01]]
+    circle = {"center": [47.001, 8.001], "radius": 20.0}
+    found = geofence(
+        tmp_path,
+        polygons=[{"inclusion": True, "polygon": corners}],
+        circles=[{"inclusion": inclusion, "circle": circle} for inclusion in (True, False)],
+    )
+    assert [zone.is_fence for zone in found.zones] == [True, True, False]
+    centre = np.array([[75.9, 111.3]])
+    within, around = (
+        np.linalg.norm(zone.corners - centre, axis=1).max() for zone in found.zones[1:]
+    )
+    assert within == pytest.approx(20.0, abs=0.2)
+    assert around == pytest.approx(20.0 / np.cos(np.pi / 24), abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("fence", "said"),
+    [
+        ({}, "a plan with a geofence"),
+        ({"polygons": [{"polygon": []}]}, "inclusion, and corners or a centre and radius"),
+        ({"circles": [{"inclusion": True, "circle": {"center": [47, 8], "radius": 0}}]}, "above 0"),
+        ({"polygons": [{"inclusion": True, "polygon": [[47, 8], [47, 10]]}]}, "of at most"),
+    ],
+)
+def test_a_geofence_that_cannot_be_kept_is_refused(
+    fence: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(GrammarError, match=said):
+        geofence(tmp_path, **fence)
