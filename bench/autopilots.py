@@ -228,62 +228,63 @@ def judged(
     )
 
 
-HEADINGS = [
-    "set-points",
-    "RMSE xy [m]",
-    "least to most",
+OF_AIR = [
+    "RMSE xy [m] (least to most)",
     f"largest error in a cut of {HEALED_S - CUT_S:g} s [m]",
     "packets/s up, down",
-    "bytes/s up, down",
 ]
+"""Headings of what a table has for each air."""
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
-    """Tables by name: for each flavour and air, and for measurements with a real autopilot."""
+    """Tables by name: one for each flavour, and one of measurements elsewhere."""
     by_name = {}
-    for flavour, air in product(get_args(FlavourName), get_args(Air)):
-        of_case = [each for each in flights if (each.flavour, each.air) == (flavour, air)]
+    for flavour in get_args(FlavourName):
+        of_case = [each for each in flights if each.flavour == flavour]
+        airs = [air for air in get_args(Air) if any(each.air == air for each in of_case)]
         flown = {each.contender for each in of_case}
-        names = [name for name in contenders(flavour) if name in flown]
-        if of_case:
-            rows = [row(name, [e for e in of_case if e.contender == name]) for name in names]
-            by_name[f"{flavour} {air}"] = TextTable(HEADINGS, rows)
-    if comparison := _near(flights):
-        by_name["actual"] = TextTable(
-            ["RMSE xy [m]", "actual", "simulated", "least to most"], comparison
-        )
+        rows = [
+            [name, *(cell for air in airs for cell in figures(of_case, name, air))]
+            for name in contenders(flavour)
+            if name in flown
+        ]
+        if rows:
+            headings = [f"{air}: {OF_AIR[0]}" for air in airs]
+            columns = [each for heading in headings for each in (heading, *OF_AIR[1:])]
+            by_name[flavour] = TextTable(["set-points", *columns], rows)
+    if near := _near(flights):
+        by_name["actual"] = TextTable(["RMSE xy [m]", "actual", "simulated (least to most)"], near)
     return by_name
 
 
 def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
     rows = []
     for (name, air), actual_m in ACTUAL.items():
-        case = name, "ardupilot", air
-        of_case = [each for each in flights if (each.contender, each.flavour, each.air) == case]
-        if of_case:
-            rows.append([f"{name}, {air}", f"{actual_m:g}", *row(name, of_case)[1:3]])
+        simulated, *_ = figures([e for e in flights if e.flavour == "ardupilot"], name, air)
+        if simulated:
+            rows.append([f"{name}, {air}", f"{actual_m:g}", simulated])
     return rows
 
 
-def row(name: str, flights: Sequence[FlownCell]) -> list[str]:
-    """Row of a contender: means over its flights; for the cut, the largest error and failures."""
-    errors = [each.whole.rmse_xy or np.nan for each in flights]
+def figures(flights: Sequence[FlownCell], name: str, air: str) -> list[str]:
+    """Cells of a contender in an air: means over its flights; for the cut, the largest error and
+    failures. Empty texts if it has not flown.
+    """
+    flown = [each for each in flights if (each.contender, each.air) == (name, air)]
+    if not flown:
+        return [""] * len(OF_AIR)
+    errors = [each.whole.rmse_xy or np.nan for each in flown]
 
     def a_second(key: str) -> float:
-        return float(
-            np.mean([getattr(each.whole, key) / each.whole.duration_s for each in flights])
-        )
+        return float(np.mean([getattr(each.whole, key) / each.whole.duration_s for each in flown]))
 
     flying = {str(Mode.TRACK), str(Mode.COAST)}
-    on = sum(each.cut.mode in flying for each in flights)
-    ended = "" if on == len(flights) else f", {on} of {len(flights)} fly on"
+    on = sum(each.cut.mode in flying for each in flown)
+    ended = "" if on == len(flown) else f", {on} of {len(flown)} fly on"
     return [
-        name,
-        f"{np.mean(errors):.3f}",
-        f"{min(errors):.3f} to {max(errors):.3f}",
-        f"{max(each.largest_m for each in flights):.2f}{ended}",
+        f"{np.mean(errors):.3f} ({min(errors):.3f} to {max(errors):.3f})",
+        f"{max(each.largest_m for each in flown):.2f}{ended}",
         f"{a_second('uplink_packets'):.1f}, {a_second('downlink_packets'):.1f}",
-        f"{a_second('uplink_bytes'):.0f}, {a_second('downlink_bytes'):.0f}",
     ]
 
 
