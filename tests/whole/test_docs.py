@@ -80,7 +80,12 @@ def test_a_documented_flight_flies(
         line += " --tau 1 --gain 1 --dead-time 0 --burst 0 --settle 0 --duration 1"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
-    if "fleet swap" in line or "--mission" in line:
+    if "--show" in line:
+        (table,) = re.findall(
+            r"```csv\n(.*?)```", (ROOT / "docs/together.md").read_text(), re.DOTALL
+        )
+        (tmp_path / "show.csv").write_text(table)
+    if "fleet swap" in line or "--mission" in line or "--show" in line:
         line += " --settle 0 --duration 12"
     line = re.sub(r"--vehicles \d+0\b", "--vehicles 5", line)
     if re.search(r"--duration (20|600)\b", line):
