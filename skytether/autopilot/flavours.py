@@ -22,7 +22,7 @@ class FlightMode(Enum):
     PILOT = auto()
     """Flown by a pilot; with sticks centred, the vehicle stays where it is."""
     HOLD = auto()
-    """Brakes, and stays where it is."""
+    """Brakes, and holds the position."""
     GUIDED = auto()
     """Follows a companion computer: GUIDED, OFFBOARD."""
     TAKEOFF = auto()
@@ -30,34 +30,34 @@ class FlightMode(Enum):
     RETURN = auto()
     """Flies home, and lands."""
     LAND = auto()
-    """Lands where it is."""
+    """Lands at its present position."""
 
 
 @dataclass(frozen=True)
 class SimulatedFlavour:
-    """Flavour of the simulated autopilot."""
+    """Constants of one simulated autopilot."""
 
     title: str
-    """Display name."""
     version: tuple[int, int, int]
     """Version on which the behaviour was measured."""
     autopilot: int
     """MAV_AUTOPILOT in the heartbeat."""
     bytewise: bool
-    """Whether a parameter's bits are sent, see `mavlink.parameters`."""
+    """Whether integer parameters are sent as bits, see `mavlink.parameters`."""
     gains: Gains
     """Gains of the velocity loop."""
     frame: str
     """Frame in the autopilot's own simulator, or the nearest one."""
     ready_s: float
-    """Time from the start until it may be armed, in which position and filters settle [s]."""
+    """Time from the start until it may be armed, in which position and filters settle."""
     words_for_stations: bool
-    """Whether its texts go to ground stations alone, as PX4's do."""
+    """Whether its texts go only to ground stations, as PX4's do."""
     spool_s: float
-    """Time from the take-off command until it climbs [s]."""
+    """Time from the take-off command until it climbs."""
     wander_mps: float
-    """Standard deviation of the error of its velocity estimate, along each axis [m/s]. The true
-    velocity differs by this error from the one that the loops control."""
+    """Standard deviation of the error of its velocity estimate, along each axis. The true velocity
+    differs by this error from the one that the loops control.
+    """
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
@@ -206,4 +206,3 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         },
     ),
 }
-"""Flavours by name."""

@@ -1,8 +1,8 @@
-"""Flight of a simulated autopilot: arming, modes, the motion in each mode, and what ends it.
+"""Flight of a simulated autopilot: arming, modes, the motion in each mode, and failsafes.
 
 Both flavours share this module; their differences are in `ardupilot.py` and `px4.py`. Positions are
-x north, y east, altitude up, from where it was started. Times are those of its own clock [ns],
-which begins at 0.
+x north, y east, altitude up, from the start. Times are those of its own clock [ns], which begins at
+0.
 """
 
 from abc import ABC, abstractmethod
@@ -69,13 +69,14 @@ class CompanionSetpoint(NamedTuple):
     velocity: Vector
     """Velocity, or with a position the feed-forward velocity [m/s]."""
     position: Vector | None
-    """Position [m]; None: only the velocity is set."""
+    """Position [m]; None if only the velocity is set."""
     came_ns: int
-    """Time of arrival."""
 
 
 class OwnSpeeds(NamedTuple):
-    """Limits and gains of the autopilot's own flight."""
+    """Limits and gains of the autopilot's own flight, in the modes in which no set-points are
+    followed.
+    """
 
     speed: float
     """Largest horizontal speed [m/s]."""
@@ -99,10 +100,9 @@ class PilotedVehicle(ABC):
     """Vehicle with an autopilot.
 
     Args:
-        flavour: autopilot to simulate.
-        quadrotor: its body, standing on the ground at the origin.
-        ready_s: time from the start until it may be armed [s].
-        noise: random generator of what it estimates.
+        quadrotor: body of the vehicle, standing on the ground at the origin.
+        ready_s: time from the start until it may be armed.
+        noise: random generator of estimation errors.
     """
 
     low = 0.15
@@ -131,13 +131,14 @@ class PilotedVehicle(ABC):
         self._wander, self._noise = np.zeros(3), noise
         """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST
-        """Displacement of the position that it reports [m]."""
+        """Displacement of the reported position [m]."""
         self.said: list[tuple[Severity, str]] = []
         """Texts not sent yet."""
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat; None before any: then there is none to
-        lose."""
+        """Time of the ground station's newest heartbeat; None before any, when the failsafe is
+        off.
+        """
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
@@ -156,22 +157,19 @@ class PilotedVehicle(ABC):
 
     @property
     def mode(self) -> FlightMode:
-        """Present mode."""
         return self.flavour.modes[self.number][1]
 
     @property
     def mode_name(self) -> str:
-        """The autopilot's name for the present mode."""
         return self.flavour.modes[self.number][0]
 
     @property
     def ready(self) -> bool:
-        """Whether the position is known."""
+        """Whether the vehicle has a valid position estimate."""
         return self.estimates and self.now_ns >= self._ready_ns
 
     @property
     def landed(self) -> Landed:
-        """Whether the vehicle is on the ground."""
         if not self.flying:
             return Landed.ON_GROUND
         if self._climb is not None:
@@ -180,7 +178,6 @@ class PilotedVehicle(ABC):
         return Landed.LANDING if landing else Landed.IN_AIR
 
     def say(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """Send a text to all peers."""
         self.said.append((severity, text))
 
     # Commands
@@ -240,12 +237,11 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def set(self, name: str, value: float) -> None:
-        """Set a parameter."""
         self.parameters[name] = value
         self.quadrotor.gains = self.gains()
 
     def act(self, mode: FlightMode, why: str, severity: Severity = Severity.CRITICAL) -> None:
-        """Trigger a failsafe: announce the reason, and enter a mode unless in it already."""
+        """Trigger a failsafe: announce the reason, and enter a mode."""
         self.say(why, severity)
         self.enter(self.flavour.number(mode))
 
@@ -270,7 +266,7 @@ class PilotedVehicle(ABC):
         self._setpoint = CompanionSetpoint(velocity, position, self.now_ns)
 
     def forget(self) -> None:
-        """Forget the companion computer's earlier set-points."""
+        """Discard the companion computer's earlier set-points."""
         self._setpoint = None
 
     # Differences between flavours
@@ -278,15 +274,15 @@ class PilotedVehicle(ABC):
     refusal: Result
     """Result of a command that cannot be executed now."""
     arming_word: str
-    """Text announced at arming; empty for another sentence."""
+    """Word in the text announced at arming; empty for another sentence."""
 
     @abstractmethod
     def why_not_armed(self) -> str:
-        """Reason why it cannot be armed; empty where it can."""
+        """Reason why it cannot be armed; empty if it can."""
 
     @abstractmethod
     def why_not_guided(self) -> str:
-        """Reason why it cannot be guided; empty where it can."""
+        """Reason why it cannot be guided; empty if it can."""
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
@@ -335,7 +331,6 @@ class PilotedVehicle(ABC):
     # Motion
 
     def tick(self) -> None:
-        """Simulate TICK_NS."""
         self.now_ns += TICK_NS
         if self.armed:
             if self.flying:

@@ -34,23 +34,24 @@ class DuelOptions:
 
     scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
     """Two or more names of scenarios (see `skytether scenarios`) or .toml files; the others take
-    the network, duration and seed of the first."""
+    the network, duration and seed of the first.
+    """
     duration: float | None = None
-    """Length of the flights [s]; the first scenario's unless given."""
+    """Length of the flights [s]; by default the first scenario's."""
     seed: int | None = None
-    """Seed of the flights; the first scenario's unless given."""
+    """Seed of the flights; by default the first scenario's."""
     virtual: bool = False
     """Fly in virtual time; the page shows the flights afterwards, until Ctrl-C."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; where that is taken, the next free port."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free one."""
     plugin: command.Plugins = ()
 
 
 def duel(argv: Sequence[str]) -> None:
     """Fly scenarios side by side, and show them on one page.
 
-    All meet the same network, wind and seed; what is changed on the page changes for all. Ctrl-C
-    ends them.
+    All have the same network, wind and seed; a change on the page applies to all. Ctrl-C ends the
+    flights.
     """
     options = read(DuelOptions(tyro.MISSING), argv, "skytether duel", duel.__doc__)
     at = command.address("--page", options.page)
@@ -77,10 +78,10 @@ def together(options: DuelOptions) -> list[Scenario]:
         ConfigError: a scenario cannot be flown.
     """
     if len(options.scenarios) < 2:
-        said = f"got {len(options.scenarios)} scenario, expected two or more"
-        raise CommandError(said, command.CONFIGURATION)
-    given = {"duration": options.duration, "seed": options.seed}
-    asked = {key: value for key, value in given.items() if value is not None}
+        message = f"got {len(options.scenarios)} scenario, expected two or more"
+        raise CommandError(message, command.CONFIGURATION)
+    overrides = {"duration": options.duration, "seed": options.seed}
+    asked = {key: value for key, value in overrides.items() if value is not None}
     first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **asked)
     same = {key: getattr(first, key) for key in ("duration", "seed", "settle", "network")}
     laid = (msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios)
@@ -88,7 +89,7 @@ def together(options: DuelOptions) -> list[Scenario]:
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """Scenario, checked to be flyable.
+    """The scenario, if it can be flown.
 
     Raises:
         ConfigError: the scenario cannot be flown.

@@ -28,11 +28,13 @@ class ExportOptions:
     parquet: Path | None = None
     """Folder for the tables as Parquet; needs pyarrow."""
     traces: Path | None = None
-    """Folder for traces of what netem did to packets, one file per direction and flow, which
-    `trace(FILE)` replays; see docs/network.md."""
+    """Folder for traces of netem's effect on packets, one file per direction and flow, which
+    `trace(FILE)` replays; see docs/network.md.
+    """
     pcap: Path | None = None
-    """File for a packet capture (pcap) of what left netem: made-up headers, true lengths, no
-    payload."""
+    """File for a packet capture (pcap) of what netem sent: made-up headers, true lengths, no
+    payload.
+    """
     plugin: command.Plugins = ()
 
 
@@ -43,8 +45,8 @@ def export(argv: Sequence[str]) -> None:
     """
     options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
     if not (options.csv or options.parquet or options.traces or options.pcap):
-        said = "expected at least one of --csv, --parquet, --traces and --pcap"
-        raise CommandError(said, CONFIGURATION)
+        message = "expected at least one of --csv, --parquet, --traces and --pcap"
+        raise CommandError(message, CONFIGURATION)
     to_parquet = view.parquet() if options.parquet else None
     recorded = recordings.opened(options.file)
     if options.traces or options.pcap:
@@ -64,15 +66,15 @@ def export(argv: Sequence[str]) -> None:
 
 
 def _traffic(options: ExportOptions, recorded: Recorded) -> None:
-    """Write delay traces and a packet capture of what passed netem.
+    """Write delay traces and a packet capture of netem's packets.
 
     Raises:
         CommandError: the recording has no netem part, or a file cannot be written.
     """
     packets = recorded.parts.get("netem")
     if packets is None or not len(packets):
-        said = f"{options.file}: got no packets of netem, expected some"
-        raise CommandError(said, CONFIGURATION)
+        message = f"{options.file}: expected packets of netem, the recording has none"
+        raise CommandError(message, CONFIGURATION)
     command.claim_output("--pcap", options.pcap)
     if options.traces:
         traces = traffic.traces(packets)
@@ -84,7 +86,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a table, and print where it is.
+    """Write a table, and print its path.
 
     Raises:
         CommandError: the file cannot be written.
@@ -92,6 +94,6 @@ def _write(path: Path, content: bytes) -> None:
     try:
         files.write(path, content)
     except OSError as error:
-        said = f"{path}: cannot be written: {error.strerror}"
-        raise CommandError(said, CONFIGURATION) from None
+        message = f"{path}: cannot be written: {error.strerror}"
+        raise CommandError(message, CONFIGURATION) from None
     print(path)

@@ -35,11 +35,10 @@ from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-"""Default number of vehicles."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
-"""Stages of the server's work, in their order; `record`, the cost of recording, is left out."""
+"""Stages of the server's work in order; `record`, the cost of recording, is left out."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,8 @@ class FleetOptions(ScenarioOptions):
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a CSV file with
-    the columns vehicle, t, x, y (and z), the format of light shows."""
+    the columns vehicle, t, x, y (and z), the format of light shows.
+    """
     vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Number of vehicles; by default 20, or as many as the mission has."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -61,8 +61,9 @@ class FleetOptions(ScenarioOptions):
     virtual: bool = False
     """Fly in virtual time: everything in one process, as fast as possible."""
     page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """HOST:PORT of a page with all vehicles, as `skytether fly` has one. No page unless given:
-    `fleet` measures what the flight costs, and a page costs CPU time. Not in virtual time."""
+    """HOST:PORT of a page with all vehicles, as in `skytether fly`; by default none, because
+    `fleet` measures CPU time and a page costs some. Not in virtual time.
+    """
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -81,19 +82,19 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     steps: int
     """Steps flown by all vehicles."""
     secure: bool
-    """Whether the link was authenticated and encrypted."""
     server_steps: int
-    """Steps that the server has planned for."""
+    """Steps that the server planned."""
     event_ratio: float
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
-    """Smallest distance that vehicles of a mission are asked to keep [m]."""
+    """Distance that vehicles of a mission must keep [m]."""
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations of vehicles of a mission that were further from their motions than
-    `mission.tube_m`: the separation is guaranteed only without any."""
+    """Observations of a mission's vehicles further than `mission.tube_m` from their motions; with
+    any, the separation is not guaranteed.
+    """
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -101,42 +102,46 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     """Packets that the network lost, both ways."""
     dropped: int
-    """Packets that the kernels' and netem's full queues dropped, which no scenario asks for."""
+    """Packets dropped because a queue of the kernels or of netem was full, which no scenario asks
+    for.
+    """
     drops: dict[str, dict[str, int]]
     """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     tick_ms_p50: float
-    """Median time that a server's tick took, all vehicles together, in the slowest worker [ms]."""
+    """Median duration of a server's tick, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
-    """99th percentile of the time that a server's tick took, in the slowest worker [ms]."""
+    """99th percentile of the duration of a server's tick, in the slowest worker [ms]."""
     server_missed: int
     """Ticks that the server's workers missed because they woke too late."""
     client_missed: int
     """Steps that vehicles missed because their process woke too late."""
     machine_missed: int | None
-    """Steps that a thread which only sleeps missed in the same time: what the machine alone
-    costs."""
+    """Steps that a thread which only sleeps missed in the same time, which is the machine's
+    share.
+    """
     machine_late_ms_max: float | None
-    """Largest delay with which the sleeping thread woke [ms]."""
+    """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """CPU time of the server per vehicle and step [µs]: `total`; the stages are measured on the
-    wall clock."""
+    """CPU time of the server per vehicle and step [µs]: `total`; the stages are wall-clock
+    times.
+    """
     client_cpu_us: float | None
     """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
     """CPU time of netem per packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """Vehicle steps flown per second of CPU time, everything included; in virtual time only."""
+    """Vehicle steps flown per second of CPU time of all parts; in virtual time only."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetFlight:
-    """A fleet's flight, and what it cost the machine."""
+    """A fleet's flight, and its cost to the machine."""
 
     record: Record
     machine: "Lateness | None" = None
     """How late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
-    """CPU time of everything together [s], in virtual time."""
+    """CPU time of all parts together [s], in virtual time."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -144,7 +149,7 @@ def fleet(argv: Sequence[str]) -> None:
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
     process. The cost of the server's work is shown per vehicle and step. Ctrl-C ends the flight and
-    still shows what was flown.
+    still shows the results so far.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -188,7 +193,7 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """Command line in which `--mission` became the scenario, with flags from its table of goals.
+    """Replace `--mission` by the scenario and the flags from its table of goals.
 
     Raises:
         CommandError: a scenario is given as well, or the file is no table of goals.
@@ -200,8 +205,8 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
         return rest
     mission = missions[-1]
     if rest and not rest[0].startswith("-"):
-        said = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
-        raise CommandError(said, command.CONFIGURATION)
+        message = f"--mission: got the scenario {rest[0]} as well, expected one of the two"
+        raise CommandError(message, command.CONFIGURATION)
     if not mission.endswith(".csv"):
         return [mission, *rest]
     try:
@@ -265,18 +270,17 @@ def _really(
 
 @dataclass(slots=True)
 class Lateness:
-    """How late the machine woke a thread that only sleeps."""
+    """Count of how late the machine woke a thread that only sleeps."""
 
     missed: int = 0
-    """Steps that the thread missed."""
     max_s: float = 0.0
-    """Largest delay with which it woke [s]."""
+    """Longest delay with which it woke [s]."""
 
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Let a thread sleep step by step for as long as the block takes: the steps that it misses are
-    the machine's fault.
+    """Let a thread sleep step by step during the block; the machine causes the steps that it
+    misses.
     """
     late, over = Lateness(), threading.Event()
 
@@ -312,8 +316,8 @@ def _vehicles(options: FleetOptions) -> int:
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (None, count):
-        said = f"got {options.vehicles}, expected {count} on this mission"
-        raise CommandError(f"--vehicles: {said}", command.CONFIGURATION)
+        message = f"got {options.vehicles}, expected {count} on this mission"
+        raise CommandError(f"--vehicles: {message}", command.CONFIGURATION)
     return count
 
 
@@ -395,7 +399,7 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
         ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
         (
-            "least separation, asked for [m]",
+            "smallest, required separation [m]",
             None
             if s.least_separation_m is None
             else f"{s.least_separation_m:.3f}, {s.separation_m:g}",
@@ -407,7 +411,7 @@ def _show(summary: FleetSummary, title: str) -> None:
             "packets/s up, down, both",
             ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),
         ),
-        ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        ("packets lost, dropped by full queues", f"{s.lost}, {s.dropped}"),
         *terminal.drops(s.drops),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
         ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
@@ -428,7 +432,7 @@ def _show(summary: FleetSummary, title: str) -> None:
     table = Table(title=title, title_justify="left", show_header=False)
     for name, value in rows:
         if value is not None:
-            table.add_row(Text(name), value)  # Rendered as text: rich would take "[m]" for markup.
+            table.add_row(Text(name), value)  # `Text`, because rich would take "[m]" for markup
     Console().print(table)
 
 

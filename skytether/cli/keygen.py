@@ -16,7 +16,6 @@ from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 
 HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehicle.\n"
-"""First line of a new file."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,9 @@ class KeygenOptions:
     first: Annotated[int, tyro.conf.arg(metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
-    """Number of the new keys (0 to 255). Unless given, one more than the vehicle's highest, and 1
-    for its first key."""
+    """Number of the new keys (0 to 255); by default one more than the vehicle's highest, and 1 for
+    its first key.
+    """
     add: bool = False
     """Add to an existing file: keys of more vehicles, or the next key of vehicles that have one."""
     if_missing: bool = False
@@ -71,7 +71,7 @@ def make(
     """Make one key per vehicle, in a new file or at the end of an existing one.
 
     Args:
-        number: number of the new keys; unless given, the next of each vehicle.
+        number: number of the new keys; by default the next of each vehicle.
 
     Raises:
         CommandError: a vehicle cannot have another key, or the file cannot be written.
@@ -88,7 +88,7 @@ def make(
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of the new key of a vehicle.
+    """Number of a vehicle's new key.
 
     Raises:
         CommandError: the vehicle cannot have another key, or none with this number.

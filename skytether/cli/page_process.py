@@ -13,7 +13,7 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 STOP_S = 5.0
-"""Longest time that the page may take to end after SIGTERM [s]."""
+"""Longest time for the page to end after SIGTERM [s]."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"
@@ -21,14 +21,14 @@ NONE = "none"
 
 @contextlib.contextmanager
 def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
-    """Serve a page of a flight for as long as the block takes; yields the folder of its sockets.
+    """Serve a page of a flight during the block; yields the folder of the flight's sockets.
 
     Args:
-        at: HOST:PORT, or NONE: no page, as without an address.
-        folder: folder of the flight's sockets; with a page, a temporary one unless given.
+        at: HOST:PORT; NONE or None for no page.
+        folder: folder of the flight's sockets; with a page, a temporary one if None.
 
     Raises:
-        CommandError: the address is none.
+        CommandError: `at` is no address.
     """
     if at is None or at == NONE:
         yield folder
@@ -42,8 +42,8 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
 
 @contextlib.contextmanager
 def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
-    """Serve a page of flights at HOST:PORT for as long as the block takes; its address, or the
-    reason why there is none, is printed.
+    """Serve a page of flights at HOST:PORT during the block, and print its address or why it
+    failed.
     """
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
@@ -86,7 +86,7 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
 
 
 def say(line: object) -> None:
-    """Print lines on stderr, whether or not anybody can read them."""
+    """Print lines on stderr, ignoring errors."""
     # The flight goes on without a terminal.
     with contextlib.suppress(OSError):
         print("\n".join(map(printable, str(line).splitlines())), file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Recorders of flights: over UDP from the feeds of the processes, during the flight."""
+"""Recorders of flights: over UDP, from the feeds of the processes, during the flight."""
 
 import sys
 import threading
@@ -35,11 +35,11 @@ def check(path: Path, flag: str = "--record") -> None:
     """Refuse a file without a recording's suffix before anything is flown.
 
     Raises:
-        CommandError: with the suffix that is expected.
+        CommandError: names the expected suffix.
     """
     if path.suffix != RECORDING:
-        said = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
-        raise CommandError(said, command.CONFIGURATION)
+        message = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
+        raise CommandError(message, command.CONFIGURATION)
 
 
 def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Summary) -> str | None:
@@ -71,11 +71,11 @@ def _about(
 
 def beside() -> int:
     """Record the feed of a process as ordered on stdin (`RecorderOrder`), until stdin ends."""
-    told = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
-    plugins.load(told.plugins)
-    scenario = checked(toml.loads(told.scenario), any_network=True)
-    path, feeds = Path(told.path), {told.process: Path(told.feed)}
-    live = Live(path, feeds, scenario, told.name, secure=told.secure, tell=lambda _: None)
+    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
+    plugins.load(order.plugins)
+    scenario = checked(toml.loads(order.scenario), any_network=True)
+    path, feeds = Path(order.path), {order.process: Path(order.feed)}
+    live = Live(path, feeds, scenario, order.name, secure=order.secure, tell=lambda _: None)
     print("it reads", flush=True)
     sys.stdin.buffer.read()
     fault = live.finish()
@@ -86,7 +86,7 @@ def beside() -> int:
 
 @dataclass(slots=True)
 class _Source:
-    """Feed, and how far it has been recorded."""
+    """State of the recording of one feed."""
 
     begun: bool = False
     """Whether any frame has come."""
@@ -111,17 +111,16 @@ class _Source:
 
 
 class Live:
-    """Recorder of a flight over UDP, in threads of its own: the flight never waits for it.
+    """Recorder of a flight over UDP, in threads of its own, so that the flight never waits for it.
 
     A slow disk blocks only these threads: processes then drop feeds that are not read in time, and
     the recording is reported as incomplete.
 
     Args:
-        path: its file.
-        feeds: socket of each process's feed, by its name.
-        scenario: what is flown.
-        name: of the scenario.
-        secure: whether the link is sealed.
+        path: file of the recording.
+        feeds: socket of each process's feed, by process name.
+        name: name of the scenario.
+        secure: whether the link is encrypted.
         tell: called once, in any thread, when something is missing.
     """
 
@@ -141,7 +140,7 @@ class Live:
         """First fault: what is missing in the recording."""
         self._growing: files.Growing | None = None
         self._recording: Recording | None = None
-        """Recording; None once its file has failed."""
+        """None once the file has failed."""
         self._rows: dict[str, int] = {}
         """Bytes of rows received so far, by part."""
         self._sources = {process: _Source() for process in feeds}
@@ -160,12 +159,12 @@ class Live:
         self._subscriber = Subscriber(feeds, self._take, self._lost)
 
     def finish(self, summary: Summary | None = None, flown: Record | None = None) -> str | None:
-        """End the file after the processes have ended; returns what is missing in it, as a line.
+        """Complete the file after the processes have ended; returns its fault, as a line, or None.
 
-        A second call only returns the same again.
+        Further calls return the same fault.
 
         Args:
-            summary: of the flight, where it came to one.
+            summary: summary of the flight, if there is one.
             flown: record of the flight, to compare the recording with.
         """
         if not self._closed.is_set():
@@ -239,7 +238,7 @@ class Live:
                 self._miss(str(error))
 
     def _miss(self, reason: str) -> None:
-        """Remember the first fault, and report it once."""
+        """Keep the first fault, and report it once."""
         if self._fault is None:
             self._fault = reason
             self._tell(RecordIncomplete(file=str(self._path), reason=reason))

@@ -27,8 +27,8 @@ class SetOptions:
 def set_keys(argv: Sequence[str]) -> None:
     """Change keys of a scenario in flight: all of them at once, or none.
 
-    Without arguments, list the keys that may change there, and their present values. The exit code
-    is 2 if the change was refused, and 1 if no process answers.
+    Without arguments, list the keys that may change, and their present values. The exit code is 2
+    if the change was refused, and 1 if no process answers.
     """
     options = read(SetOptions(tyro.MISSING, ()), argv, "skytether set", set_keys.__doc__)
     values = parsed(options.changes)
@@ -52,7 +52,7 @@ def parsed(changes: Sequence[str]) -> dict[str, Any]:
     """Values by key, parsed from texts such as `control.horizon=60`.
 
     Raises:
-        CommandError: a text is no assignment, a key comes twice, or all together exceed a request.
+        CommandError: a text is no assignment, a key comes twice, or the request is too large.
     """
     values: dict[str, Any] = {}
     for change in changes:

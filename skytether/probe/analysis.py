@@ -1,22 +1,20 @@
 """Analysis of packets that went both ways, as functions of arrays.
 
-Clocks: an apparent delay is the true one and the offset of the clocks, t_receiver - t_sender = d +
-o(t), one way, and d - o(t) the other. With o(t) = o + s t, a line below all points of a direction,
-along the least delays, has the slope s, or -s. Following Moon, Skelly and Towsley (1999), of all
-lines below the points the one with the highest mean is taken; both directions share one slope. A
-point's height above the line is its delay beyond the least one. Of the two least delays only the
-sum is known, in which the offset cancels: half of it is assumed for each direction.
+Clocks: an apparent delay is the true delay plus the offset of the clocks one way, t_receiver -
+t_sender = d + o(t), and d - o(t) the other way. With o(t) = o + s t, a line through the smallest
+delays of a direction has the slope s, or -s. Following Moon, Skelly and Towsley (1999), the line is
+the one with the highest mean among all lines below the points; both directions share one slope. The
+height of a point above the line is its delay beyond the least delay. Of the two least delays only
+the sum can be measured, in which the offset cancels: half of it is assumed for each direction.
 
-Loss: the confidence interval is Wilson's, for the number of packets that are effectively
-independent.
+Loss: the confidence interval is Wilson's, for the effective number of independent packets.
 
-Rate: packets of a train that are sent at once leave a bottleneck one behind the other, each after
-size / rate (packet dispersion). So the i-th of a train has the delay of a packet that was sent
-alone, and i size / rate more. The time size / rate is estimated in two ways, and the estimate with
-the smaller error is taken. One is the slope of a line through delay over place in the train, common
-to all trains: it is insensitive to slowly varying delays. The other is the maximum-likelihood time,
-given the measured distribution of the delays of packets sent alone: it is the better one for delays
-that vary fast.
+Rate: packets of a train that are sent at once leave a bottleneck one behind the other, size / rate
+apart (packet dispersion). So the i-th packet of a train has the delay of a packet sent alone, plus
+i size / rate. The time size / rate is estimated in two ways, and the estimate with the smaller
+error is used. One is the common slope of lines through delay over place in the train: slowly
+varying delays hardly affect it. The other is the maximum-likelihood time, given the measured
+distribution of the delays of packets sent alone: it is the better one for delays that vary fast.
 """
 
 from collections.abc import Callable
@@ -31,11 +29,11 @@ from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array, Flags
 
 DRIFT_MAX = 500e-6
-"""Largest believable drift between two clocks: the fastest rate at which clocks are slewed."""
+"""Largest plausible drift between two clocks: the fastest rate at which clocks are slewed."""
 WINDOWS = 12
 """Number of parts of a measurement whose least delays give the drift's uncertainty."""
 CERTAIN = 5.0
-"""Number of standard errors above which a drift is taken as real, estimated from so few parts."""
+"""Number of standard errors above which a drift is significant; large, because of few WINDOWS."""
 Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
 ALIKE_S = 50e-6
@@ -61,25 +59,26 @@ class Clocks:
     """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, assuming that half of the least round trip is the delay of each
-    way [s]."""
+    """Offset at the first probe, assuming that both directions have half of the least round-trip
+    time.
+    """
     drift: float
-    """Rate by which the listener's clock runs faster; 0 where no drift is certain."""
+    """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
     drift_doubt: float
-    """Standard error of the drift."""
     least_sum_s: float
-    """Sum of the two least delays [s]."""
+    """Sum of the two least delays."""
     doubt_s: float
     """Largest error of the offset, and so of all one-way delays: half of the least delays, less
-    known fixed times [s]."""
+    known fixed times.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class BottleneckRate:
-    """Rate of a path's bottleneck; None if its packet trains give no finite rate."""
+    """Rate of a path's bottleneck, in one direction."""
 
     bytes_per_s: float
-    """Rate, headers of IP and UDP included [B/s]."""
+    """Rate, headers of IP and UDP included."""
     low: float
     high: float
     """Bounds of the 95 % interval [B/s]."""
@@ -92,11 +91,11 @@ class Delays:
     """Packets of one direction that were sent alone, in order of sending."""
 
     time_s: Array
-    """Time of sending on the prober's clock, from the first probe [s]; shape (n,)."""
+    """Time of sending on the prober's clock, from the first probe; shape (n,)."""
     delay_s: Array
-    """One-way delay [s]; NaN of a lost packet; shape (n,)."""
+    """One-way delay; NaN for a lost packet; shape (n,)."""
     rate: BottleneckRate | None
-    """Rate of the direction; None where trains show no finite one."""
+    """None if trains give no finite rate."""
 
     @property
     def came(self) -> Flags:
@@ -111,7 +110,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
 
     Raises:
-        ValueError: too few packets arrived in a direction.
+        ValueError: fewer than two packets arrived in a direction.
     """
     down, up = measured.downlink, measured.uplink
     alone = down.came & (down.train < 0), up.came & (up.train < 0)
@@ -141,7 +140,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
 
 
 def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
-    """Clocks, and delays of both ways, of a log: its two ways are one, on one clock.
+    """Clocks, and delays of a log, which has one series of delays on one clock for both directions.
 
     Raises:
         ValueError: fewer than two packets arrived.
@@ -165,7 +164,7 @@ def _alone(way: Way, time_s: Array, delay_s: Array, found: BottleneckRate | None
 
 
 def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[float, float]:
-    """Slope of both lines, and its standard error; 0 where it is not certain."""
+    """Slope of both lines, and its standard error; the slope is 0 if it is not significant."""
     if x_down[-1] - x_down[0] <= 0.0:
         return 0.0, DRIFT_MAX
     down, up = lower_hull(x_down, y_down), lower_hull(x_up, y_up)
@@ -184,8 +183,8 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
 def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> float:
     """Standard error of the slope, from least delays in parts of the measurement.
 
-    Half the difference of both directions' least delays in a part is the offset there; the scatter
-    of these offsets over time gives the uncertainty of a line through them.
+    Half the difference of both directions' least delays in a part is the offset in that part; the
+    scatter of these offsets over time gives the uncertainty of a line through them.
     """
     edges = np.linspace(0.0, max(x_down[-1], x_up.max()), WINDOWS + 1)
     offsets, times = [], []
@@ -244,11 +243,11 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
     Pairs with a gap between them, such as those around a train, are left out.
 
     Args:
-        time_s: times of sending, in the order of sending [s]; shape (n,).
+        time_s: times of sending, in the order of sending; shape (n,).
         values: NaN for unknown values; shape (n,).
 
     Returns:
-        Two arrays of shape (lags,), with fewer entries where there are few packets.
+        two arrays of shape (lags,), with fewer entries if there are few packets.
     """
     centred = values - np.nanmean(values)
     variance = float(np.nanmean(centred**2))
@@ -266,8 +265,7 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
 
 
 def effective(count: int, correlations: Array) -> float:
-    """Effective sample size: number of independent values that determine a mean as well as these
-    correlated ones.
+    """Effective sample size: number of independent values that determine a mean equally well.
 
     The sum over lags ends where the correlation no longer differs significantly from 0.
     """
@@ -324,8 +322,8 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     """Rate of the bottleneck of a path; None if the packet trains give no finite rate.
 
     Args:
-        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored
-            [s]; shape (n,).
+        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored;
+            shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -367,8 +365,7 @@ def _slope(trains: Trains) -> tuple[float, float]:
 
 
 def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:
-    """Most likely transmission time of a packet [s], and its jackknife standard error over groups
-    of trains.
+    """Most likely transmission time of a packet [s], and its jackknife standard error over trains.
 
     Args:
         alone: sorted delays of packets that were sent alone [s].
@@ -408,7 +405,7 @@ def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tupl
     ]
     spread = np.array(without) - np.mean(without)
     error = sqrt((groups - 1) / groups * float(spread @ spread))
-    # A time that is hardly likelier than zero is not certain, however small the scatter is.
+    # A time that is hardly more likely than zero is uncertain, however small its scatter.
     gain = likelihood(time_s, trains) - likelihood(0.0, trains)
     error = max(error, time_s / sqrt(2.0 * max(gain, 1e-9)))
     # factor by which Student's t is wider than the normal distribution

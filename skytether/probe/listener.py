@@ -1,4 +1,4 @@
-"""Far end of a measurement: it answers each probe with one packet, no longer than the probe.
+"""Far end of a measurement: answers each probe with one packet, no longer than the probe.
 
 An answer has the listener's time, and lists the arrivals that the prober has not acknowledged, the
 oldest first, so that a lost answer loses no arrival. The probes of a train are answered together
@@ -6,8 +6,8 @@ once all have arrived, so that the answers form a train as well.
 
 A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
 kept from the first PROBE on, which only a sender that receives packets at that address can send.
-Without keys a session is answered at that address alone: otherwise whoever knows the session could
-direct answers at a third party. With keys a sender may change its address.
+Without keys a session is answered at that address only: otherwise anybody who has seen the session
+id could direct answers at a third party. With keys a sender may change its address.
 """
 
 import hashlib
@@ -37,7 +37,8 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
 """Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of
-the host with the most."""
+the host with the most.
+"""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
@@ -65,7 +66,7 @@ class ProbeSession:
     """Measurement by one prober."""
 
     heard_ns: int
-    """Time of the newest probe [ns]."""
+    """Time of the newest probe."""
     host: str
     """Host of the prober."""
     logged: int = 0
@@ -75,14 +76,14 @@ class ProbeSession:
     train: list[HeldPacket] = field(default_factory=list)
     """Packets of a train that wait for the rest."""
     train_ns: int = 0
-    """Time of the newest packet in `train` [ns]."""
+    """Time of the newest packet in `train`."""
 
 
 class Listener(Endpoint):
     """Listener that answers probes.
 
     Args:
-        gate: opens incoming packets, and seals answers.
+        gate: opens incoming packets, and encrypts answers.
         secret: random bytes, from which session ids are derived.
     """
 
@@ -95,7 +96,6 @@ class Listener(Endpoint):
         self._answered = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
             if call is not None:
@@ -125,8 +125,8 @@ class Listener(Endpoint):
         """Measurement of a session, begun if it is new.
 
         Raises:
-            ProtocolError: the session id is not this listener's for the sender, or there is no
-                room.
+            ProtocolError: the session id is not this listener's for the sender, or SESSIONS_MAX are
+                open.
         """
         session = self._sessions.get(name)
         if session is None or not self._gate.secure:
@@ -198,7 +198,7 @@ class Listener(Endpoint):
             self._answered += 1
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`; an incomplete train is answered after a time limit."""
+        """Answer incomplete trains after a time limit."""
         for name, session in self._sessions.items():
             if session.train and now_ns >= session.train_ns + HOLD_NS:
                 self._release(session, name, now_ns)
@@ -211,7 +211,6 @@ class Listener(Endpoint):
         )
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "sessions": len(self._sessions),
             "answered": self._answered,
@@ -219,7 +218,6 @@ class Listener(Endpoint):
         }
 
     def _cookie(self, nonce: bytes, peer: Address) -> bytes:
-        """Cookie for a prober's nonce and address."""
         host, port = peer
-        told = nonce + f"{host} {port}".encode()
-        return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()
+        content = nonce + f"{host} {port}".encode()
+        return hashlib.blake2s(content, key=self._secret, digest_size=COOKIE_BYTES).digest()

@@ -16,18 +16,20 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest reported correlation time, in times between two packets; shorter ones are left out of
-the text."""
+"""Shortest reported correlation time, in times between two packets; a shorter one is left out of
+the text.
+"""
 ORDERED_SHARE = 0.01
-"""Share of reordered packets predicted for independent delays; above it, a path without reordering
-is called ordered."""
+"""Share of reordered packets, predicted for independent delays, above which a path without
+reordering is called ordered.
+"""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
     """Fitted model, for the output."""
 
     text: str
-    """The impairment as a scenario writes it."""
+    """Impairment in the notation of a scenario."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
@@ -51,24 +53,24 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     reordered: float
     """Share of packets that arrived after one sent later."""
     mean_s: float
-    """Mean one-way delay [s]."""
+    """Mean one-way delay."""
     sd_s: float
-    """Standard deviation of the delay [s]."""
+    """Standard deviation of the delay."""
     quantiles_s: dict[str, float]
-    """Quantiles of the delay [s], by probability."""
+    """Quantiles of the delay, by probability."""
     correlation: list[tuple[float, float]]
     """Time between two packets [s], and correlation of their delays."""
     correlation_s: float
-    """Time in which the correlation falls to 1/e [s]; 0 without significant correlation."""
+    """Time in which the correlation falls to 1/e; 0 without significant correlation."""
     rate_bytes_per_s: float | None
-    """Rate of the narrowest part, with headers [B/s]; None where trains show none."""
+    """Rate of the bottleneck, with headers; None if trains give none."""
     rate_low: float | None
     rate_high: float | None
     """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
     """Number of trains of which enough packets arrived."""
     train_wait_s: float
-    """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
+    """Time for which the last packet of a train waits in the bottleneck's queue."""
     delay_models: list[ModelFigures]
     """Models of the delay, without the transmission time at the rate, the best first."""
     loss_models: list[ModelFigures]
@@ -84,28 +86,31 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """What a log was of, whose delays both ways have; of round trips they have half."""
+    """Content of a log; empty for a measurement. Both directions get its delays, or half of its
+    round-trip times.
+    """
     seconds: float
-    """Length of the measurement [s]."""
+    """Length of the measurement."""
     bytes: int
-    """UDP payload of a packet [B]; 0 where a log does not have it."""
+    """UDP payload of a packet [B]; 0 if a log does not have it."""
     every_s: float
-    """Time between two packets [s]."""
+    """Time between two packets."""
     offset_s: float
-    """Offset of the listener's clock at the first probe [s]."""
+    """Offset of the listener's clock at the first probe."""
     offset_doubt_s: float
-    """Largest error of that offset, and of all one-way delays, with opposite signs [s]."""
+    """Largest error of that offset, and of all one-way delays, with opposite signs."""
     drift_ppm: float
-    """Drift of the listener's clock [10⁻⁶]; 0 where none is certain."""
+    """Drift of the listener's clock; 0 if none is significant."""
     drift_doubt_ppm: float
-    """Standard error of the drift [10⁻⁶]."""
+    """Standard error of the drift."""
     round_trip_mean_s: float
-    """Mean round trip [s], which depends on no clock."""
+    """Mean round-trip time, which depends on no clock offset."""
     round_trip_least_s: float
-    """Sum of both least delays [s]."""
+    """Sum of both least delays."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them, or of packets in
-    captures that are left out."""
+    """Arrivals that the listener dropped before it could report them, or packets in captures that
+    are left out.
+    """
     uplink: DirectionFigures
     """Direction from the listener to the prober."""
     downlink: DirectionFigures
@@ -114,8 +119,6 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class ProbeOutcome:
-    """Result of a measurement."""
-
     clocks: Clocks
     delays: Mapping[str, Delays]
     """Packets of the uplink and of the downlink."""
@@ -134,7 +137,7 @@ def outcome(
     Args:
         listener: HOST:PORT of the other end, or the names of files.
         secure: whether packets were encrypted.
-        log: what it is from, where it is from a log.
+        log: content of the log; empty for a measurement.
 
     Raises:
         ValueError: too few packets arrived.
@@ -228,7 +231,7 @@ def trace(delays: Delays) -> str:
     begin = float(delays.time_s[0])
     for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # a trace holds one packet for each instant: the first
+        if at > last:  # a trace has one packet for each instant: the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"

@@ -1,4 +1,4 @@
-"""Near end of a measurement: it sends probes on a time grid, and records what became of each.
+"""Near end of a measurement: sends probes on a time grid, and records the fate of each.
 
     HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
     the last answers have had time to come
@@ -50,10 +50,10 @@ HELLO_BYTES = 64
 PATIENCE_NS = 10 * SECOND_NS
 """Longest wait for a first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
-"""Time between two polls [ns]."""
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Shortest and longest wait for the last answers [ns]; between them, twice the longest round
-trip."""
+"""Shortest and longest wait for the last answers [ns]; between them, twice the longest round-trip
+time.
+"""
 
 Longs = NDArray[np.int64]
 
@@ -66,9 +66,9 @@ class Way:
     """
 
     sent_ns: Longs
-    """Time of sending, on the sender's clock [ns]; shape (n,)."""
+    """Time of sending, on the sender's clock; shape (n,)."""
     came_ns: Longs
-    """Time of arrival, on the receiver's clock [ns]; 0 for a lost packet; shape (n,)."""
+    """Time of arrival, on the receiver's clock; 0 for a lost packet; shape (n,)."""
     came: Flags
     """Whether each packet arrived; shape (n,)."""
     train: Longs
@@ -79,8 +79,6 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """Packets of both directions."""
-
     downlink: Way
     """Packets from the prober to the listener, as from a vehicle to the server."""
     uplink: Way
@@ -88,21 +86,22 @@ class MeasuredPath:
     size: int
     """UDP payload of each packet [B]."""
     period_ns: int
-    """Time between two probes [ns]."""
+    """Time between two probes."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them, or of packets in
-    captures that are left out."""
+    """Arrivals that the listener dropped before it could report them, or packets in captures that
+    are left out.
+    """
 
 
 class Prober(Endpoint):
-    """Prober that sends probes, and keeps their times of sending, arrival and answer.
+    """Sender of probes; keeps their times of sending, arrival and answer.
 
     Args:
-        link: seals outgoing packets, and opens incoming ones.
+        link: encrypts outgoing packets, and opens incoming ones.
         listener: address of the other end.
         nonce: NONCE_BYTES, different for each measurement.
         probes: number of places on the grid, at most PROBES_MAX.
-        period_ns: time between two places [ns].
+        period_ns: time between two places.
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
     """
 
@@ -128,9 +127,7 @@ class Prober(Endpoint):
         self._due_ns: int | None = 0
         """Time of the next wake; 0 before the first."""
         self._hello_ns = 0
-        """Time of the newest HELLO."""
         self._began_ns: int | None = None
-        """Time of the first HELLO."""
         self._zero_ns = 0
         """Time of the first probe."""
         self._slot = 0
@@ -138,9 +135,9 @@ class Prober(Endpoint):
         self._over_ns: int | None = None
         """Time at which the last probe was sent; None before."""
         self._longest_ns = 0
-        """Longest round trip so far."""
+        """Longest round-trip time so far."""
         self.refused = False
-        """Whether the listener has refused for lack of room."""
+        """Whether the listener has refused, because it serves SESSIONS_MAX."""
         self.failed = False
         """Whether the listener has not answered in time."""
         self._done = False
@@ -162,7 +159,6 @@ class Prober(Endpoint):
     # -- what comes ----------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         try:
             if datagram.peer != self._listener:
                 raise ProtocolError(Drop.ELSEWHERE)
@@ -192,7 +188,7 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        """Keep the arrivals in an answer."""
+        """Store the arrivals in an answer."""
         # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
@@ -200,7 +196,7 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.FIELD)
         self._total = max(self._total, answer.logged)
         known = self._logged
-        # the listener's memory was full: the arrivals between were dropped
+        # the listener's memory was full: the arrivals in between were dropped
         if answer.first > known:
             for _ in range(answer.first - known):
                 self._logged_number.append(-1)
@@ -221,7 +217,6 @@ class Prober(Endpoint):
     # -- what is sent --------------------------------------------------------------------------
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if self._done:
             return
         if self._began_ns is None:
@@ -289,23 +284,20 @@ class Prober(Endpoint):
         self.send(self._link.seal(encode(probe, size)), self._listener)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         return None if self._done else self._due_ns
 
     @property
     def finished(self) -> bool:
-        """See `Endpoint`."""
         return self._done
 
     # -- what was measured ---------------------------------------------------------------------
 
     @property
     def probed_s(self) -> float:
-        """Length of the measurement so far [s]."""
+        """Length of the measurement so far."""
         return self._slot * self._period_ns / SECOND_NS
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "sent": len(self._sent_ns),
             "arrived": self._logged,

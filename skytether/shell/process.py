@@ -49,7 +49,7 @@ from skytether.shell.recording import RecordFile
 from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
 
-# for type checking alone: they are slow to import, and a process that flies does without
+# for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
     from skytether.shell.exporter import Metrics
 
@@ -61,19 +61,21 @@ class ProcessOptions(ScenarioOptions):
     log: LogFormat = "text"
     """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for the process's part of the record; one that ends in .mcap becomes a recording with
-    all that it says, see `skytether join`."""
+    """File for the process's part of the record; a name that ends in .mcap makes a recording with
+    its rows and events, see `skytether join`.
+    """
     json: Path | None = None
     """File for the process's counters and its CPU time, as JSON."""
     control: Path | None = None
-    """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    """Unix socket to create, through which keys change in flight, see `skytether set`."""
     new_flight: bool = False
-    """Begin a new flight: discard what was set in flight in an earlier run, and is kept beside the
-    socket of --control. For a person to say; never put it into the command of a service."""
+    """Begin a new flight: discard values that were set in an earlier run, which are kept beside the
+    socket of --control. To be given by a person; never put it into the command of a service.
+    """
     feed: Path | None = None
-    """Unix socket to make, at which other programs read the rows and events of this process."""
+    """Unix socket to create, at which other programs read the rows and events of this process."""
     metrics: str | None = None
-    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    """HTTP address for Prometheus metrics and /healthz, HOST:PORT."""
 
 
 @contextmanager
@@ -81,7 +83,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
     """Record into a file; if the disk fails in flight, the flight goes on and the command fails.
 
     Raises:
-        CommandError: the file cannot be opened; at the end, it does not hold all rows.
+        CommandError: the file cannot be opened, or is incomplete at the end.
     """
     try:
         growing = files.Growing(path, buffering=0)
@@ -96,10 +98,10 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; if none can be made, nothing is recorded.
+    """Record into a temporary file; if none can be created, nothing is recorded.
 
     Raises:
-        CommandError: at the end, the file does not hold all rows.
+        CommandError: the file is incomplete at the end.
     """
     file: BinaryIO | OSError
     try:
@@ -120,19 +122,18 @@ def _until_the_end(recording: RecordFile) -> Iterator[RecordFile]:
 
 @dataclass(slots=True)
 class Process:
-    """One endpoint as a process, made by `begin`."""
+    """One endpoint as a process; `begin` makes it."""
 
     name: str
     """Name in its log."""
     options: ProcessOptions
     secure: bool | None
-    """Whether it has keys; None for one that only forwards datagrams."""
+    """Whether the endpoint has keys; None for netem, which only forwards datagrams."""
     scenario: Scenario
     """The scenario, with what was set in an earlier run."""
     journal: Journal | None
-    """Journal of what is set in flight."""
     warnings: list[Event]
-    """Warnings and news for the operator, said at the start."""
+    """Warnings and news for the operator, logged at the start."""
     recording: RecordFile | None
     """File of its rows; the process waits at the end until they are written."""
     feed: Feed | None
@@ -141,7 +142,7 @@ class Process:
     """Recorder of its rows, for a file, a feed or both; None for neither."""
 
     def fed(self, part: str, columns: np.dtype[np.void]) -> Recorder | None:
-        """Recorder of a further part of the record, for the feed alone; None without one."""
+        """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
     def drive(
@@ -159,13 +160,12 @@ class Process:
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,
     ) -> None:
-        """Run an endpoint until it has finished or is told to stop.
+        """Run an endpoint until it has finished or is stopped.
 
         Args:
-            endpoint: what to run.
             bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
-            waiting_for: the peer whose datagrams it waits for, named to the operator.
-            insecure: whether it may run without keys even where other machines can reach it.
+            waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
+            insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
 
         Raises:
@@ -263,17 +263,17 @@ def begin(
     warnings: Sequence[Event] = (),
     keeps_rows: bool = False,
 ) -> Iterator[Process]:
-    """Take up what was set in an earlier run, and open record and feed for as long as the block
-    takes.
+    """Restore what was set in an earlier run, and open record and feed for the duration of the
+    block.
 
     Args:
         name, options, secure, warnings: see `Process`.
         columns: columns of its rows.
-        number: number of a worker, which stands behind its name; 0 for a process alone.
-        keeps_rows: whether its rows are kept in a temporary file where no record is asked for.
+        number: number of a worker, which is added to its name; 0 for a single process.
+        keeps_rows: whether rows go to a temporary file if no record is asked for.
 
     Raises:
-        CommandError: a file or a socket cannot be made; at the end, the record is incomplete.
+        CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
     """
     taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
     part = None if options.record and options.record.suffix == RECORDING else options.record
@@ -308,7 +308,7 @@ def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.vo
 
 @contextmanager
 def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]:
-    """Serve metrics over HTTP for as long as the block takes; none without an address.
+    """Serve metrics over HTTP during the block; None without an address.
 
     Raises:
         CommandError: the address cannot be listened at.
@@ -344,11 +344,12 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
 
 @contextmanager
 def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Feed | None]:
-    """Open a feed for the duration of the block; None if neither a feed nor a recording is
-    requested. A recording (.mcap) is written from the feed by another process.
+    """Open a feed during the block; None if neither a feed nor a recording is requested.
+
+    A recording (.mcap) is written from the feed by another process.
 
     Raises:
-        CommandError: the socket cannot be made, or the recording is incomplete at the end.
+        CommandError: the socket cannot be created, or the recording is incomplete at the end.
     """
     record = options.record if options.record and options.record.suffix == RECORDING else None
     if not (options.feed or record):

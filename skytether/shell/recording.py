@@ -10,12 +10,15 @@ from skytether.shared.telemetry.record import Recorder, Rows, parse
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
-"""Most bytes of rows that wait for the disk: those of 1000 vehicles at 20 Hz in 8 s; rows as short
-as netem's take three times as much in memory."""
+"""Most bytes of rows that wait for the disk: 8 s of 1000 vehicles at 20 Hz; rows as short as
+netem's take three times as much memory.
+"""
 TOGETHER_BYTES = 256 * 1024
 """Most bytes of rows in one write."""
 PAUSE_S = 0.02
-"""Time for which rows gather before a write [s]; a killed process loses at most this much."""
+"""Time for which rows are collected before a write [s]; a killed process loses at most this
+much.
+"""
 PATIENCE_S = 3.0
 """Longest time to wait at the end until all rows are written [s]."""
 
@@ -23,13 +26,12 @@ SLOW = "the disk is too slow"
 
 
 class RecordFile:
-    """Recorder and its file; rows that the file does not take are lost and counted.
+    """Recorder and its file; rows that cannot be written are lost and counted.
 
     Args:
         name: name of the file, for messages.
-        columns: columns of its rows.
-        file: the file, open for reading and writing without a buffer; or the error for which there
-            is none.
+        file: the file, open for reading and writing without a buffer; or the error that opening it
+            raised.
     """
 
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
@@ -43,7 +45,7 @@ class RecordFile:
         self._told = False
 
     def news(self) -> RecordIncomplete | None:
-        """Event to report about the record: once, after the first row was lost."""
+        """Event about lost rows: once, after the first was lost; else None."""
         reason = self._reason()
         if reason is None or self._told:
             return None
@@ -51,12 +53,12 @@ class RecordFile:
         return RecordIncomplete(file=self._name, reason=reason)
 
     def end(self) -> None:
-        """Wait until the last row is written, for a bounded time."""
+        """Wait at most PATIENCE_S until the last row is written."""
         self._writer.close(PATIENCE_S)
         self._ended = True
 
     def fault(self) -> str | None:
-        """Sentence on what is missing in the record, or None; valid after `end`."""
+        """Sentence that says what is missing in the record, or None; valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
@@ -69,7 +71,6 @@ class RecordFile:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no row has been written."""
         return self._writer.written <= self._header_bytes
 
     def rows(self) -> Rows:
@@ -91,7 +92,7 @@ class RecordFile:
         return parse(bytes(part))
 
     def close(self) -> None:
-        """Close the file, unless something is still being written to it."""
+        """Close the file, unless the thread still writes to it."""
         done = self._writer.close(0.0 if self._ended else PATIENCE_S)
         if done and not isinstance(self._file, OSError):
             self._file.close()

@@ -1,7 +1,7 @@
 """Byte streams, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
 
 A stream that has ended, or cannot be opened yet, is opened again each second while its endpoint
-runs: after a cable is plugged in again, the autopilot is heard again.
+runs, so a cable may be plugged in again.
 """
 
 import asyncio
@@ -16,16 +16,14 @@ from skytether.shared.core.line import Line
 from skytether.shell.udp import AddressError
 
 AGAIN_S = 1.0
-"""Time after which a line that has ended is opened again [s]."""
+"""Time after which a stream that has ended is opened again [s]."""
 PIECE_BYTES = 4096
-"""Most bytes that are read at once."""
 
 
 class ByteStream:
     """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:
-        line: address of the stream.
         hear: called with each piece of bytes.
 
     Raises:
@@ -37,11 +35,11 @@ class ByteStream:
             raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
-        """File descriptor of our end; None while the stream is not open."""
+        """File descriptor; None while the stream is not open."""
 
     def send(self, payload: bytes) -> bool:
-        """Send bytes; False where they are lost: the stream is not open or cannot take all of
-        them.
+        """Send bytes; False if the stream is not open or cannot take all of them, which are then
+        lost.
         """
         if self._end is None:
             return False
@@ -51,14 +49,12 @@ class ByteStream:
             return False
 
     async def run(self) -> None:
-        """Keep the stream open, until this task is cancelled."""
         while True:
             with contextlib.suppress(OSError, termios.error):
                 await self._carry(await self._open())
             await asyncio.sleep(AGAIN_S)
 
     async def _carry(self, end: int) -> None:
-        """Read from the stream until it ends."""
         loop = asyncio.get_running_loop()
         ended = loop.create_future()
 
@@ -109,11 +105,11 @@ class ByteStream:
 
 
 def prepare(port: int, baud: int) -> None:
-    """Configure a serial port for raw bytes at a rate.
+    """Configure a serial port for raw bytes.
 
     Args:
-        port: its file descriptor.
-        baud: rate [bit/s], one that the system knows.
+        port: file descriptor of the port.
+        baud: rate [bit/s] that the system supports.
 
     Raises:
         termios.error: the file is no serial port.

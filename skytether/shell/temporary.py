@@ -2,7 +2,7 @@
 
 A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
 folder of this user with an unlocked mark is removed. The mark is removed last, so that the next
-process finishes an interrupted removal.
+process completes an interrupted removal.
 """
 
 import contextlib
@@ -14,14 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PREFIX = "skytether-"
-"""Beginning of the names of temporary folders."""
 MARK = ".of-a-process"
-"""Name of the lock file that marks a folder as one of these and shows whether its owner lives."""
+"""Name of the lock file that marks these folders and shows whether the owner lives."""
 
 
 @contextlib.contextmanager
 def folder() -> Iterator[Path]:
-    """Temporary folder for as long as the block takes; those of dead processes are removed."""
+    """Temporary folder for the duration of the block; first removes those of dead processes."""
     _clear(Path(tempfile.gettempdir()))
     made = Path(tempfile.mkdtemp(prefix=PREFIX))
     with _marked(made):
@@ -33,12 +32,13 @@ def folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _marked(made: Path) -> Iterator[None]:
-    """Create and lock a folder's mark; it gets its name once it is locked, so that no other process
-    removes the folder.
+    """Create and lock a folder's mark.
+
+    The mark gets its name once it is locked, so that no other process removes the folder.
     """
     held = made / f"{MARK}.new"
     with held.open("x") as mark:
-        # a file system without locks: nobody can clear the folder
+        # a file system without locks: no process can remove the folder
         with contextlib.suppress(OSError):
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
             held.rename(made / MARK)
@@ -55,7 +55,7 @@ def _clear(place: Path) -> None:
 
 
 def _clear_one(made: Path) -> None:
-    """Remove a folder, if it is ours and its owner is dead.
+    """Remove a folder, if it is this user's and its owner is dead.
 
     Raises:
         OSError: the folder has no mark, or its owner lives.
@@ -69,7 +69,7 @@ def _clear_one(made: Path) -> None:
 
 
 def _remove(made: Path) -> None:
-    """Remove a folder, its mark last; if a process still writes there, the next call removes it."""
+    """Remove a folder, its mark last; if a process still writes to it, a later call removes it."""
     with contextlib.suppress(OSError):
         for each in made.iterdir():
             if each.name == MARK:

@@ -1,9 +1,9 @@
 """Recordings as tables: one for each part of the record, and one of the events.
 
-A column is a number with its unit in its name, as in `position_x_m`; a plan has one for each of its
-inputs (`input_x_mps_0`). Codes of the record become words: `mode`, `reason`, `direction`,
-`compared`. Durations are in ms, as in a summary, and `error_m` is the distance of a vehicle from
-its desired position.
+A column is a number with its unit in its name, as in `position_x_m`; a plan has a column for each
+of its inputs (`input_x_mps_0`). The codes in `mode`, `reason`, `direction` and `compared` become
+words. Durations are in ms, as in a summary, and `error_m` is the distance of a vehicle from its
+desired position.
 """
 
 import io
@@ -73,7 +73,7 @@ def csv(columns: Columns) -> str:
 
 
 def parquet() -> Callable[[Columns], bytes]:
-    """Writer of a table as Parquet.
+    """Function that writes a table as Parquet.
 
     Raises:
         ImportError: pyarrow is not installed.

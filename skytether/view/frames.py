@@ -14,7 +14,7 @@ from skytether.shared.telemetry.feed import Rows as RowsFrame
 from skytether.shared.telemetry.record import Record, Rows
 
 Timed = tuple[int, str, Frame]
-"""Time of a frame [ns], the process that it comes from, and the frame."""
+"""Time of a frame [ns], its process, and the frame."""
 PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": "netem"}
 """Process that makes each part of the record."""
 
@@ -23,8 +23,7 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
     """Frames of a flight in virtual time, in order of time; time begins at 0.
 
     Args:
-        scenario: what was flown.
-        name: of the scenario.
+        name: name of the scenario.
     """
     begins = _begins(flight)
     parts: dict[str, Rows] = {part: getattr(flight, part) for part in PROCESSES}
@@ -69,7 +68,7 @@ def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Ind
 
 
 def _rows(part: str, rows: Rows, times_ns: Indices) -> Iterator[Timed]:
-    """Frames of a part: one for all rows of an instant."""
+    """Frames of a part, one for all rows with the same time."""
     starts = np.flatnonzero(np.diff(times_ns, prepend=-1))
     ends = np.append(starts[1:], len(rows))[: len(starts)]
     for begin, end in zip(starts, ends, strict=True):

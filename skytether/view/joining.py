@@ -3,7 +3,7 @@
     frames of each, by the time of day → one file → summary of the first client's flight
 
 Each process has recorded its own part, with its own scenario. A key's value is taken from the
-process that owns the key; keys that both ends predict with must be equal. Times are converted to
+process that owns the key; keys with which both ends predict must be equal. Times are converted to
 the clock of the first client, by the difference of the times of day.
 """
 
@@ -27,8 +27,7 @@ from skytether.view.recorded import Recorded, summary_of
 from skytether.view.recording import Recording
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
-"""Owner of the keys whose values a process's recording has, by the part of the record that it
-holds."""
+"""Owner of keys by part of the record: a key's value is taken from the recording with that part."""
 
 
 def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
@@ -54,8 +53,8 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     for each in recordings:
         terms = first.scenario.terms(), each.scenario.terms()
         if different := catalogue.differences(*terms):
-            said = f"it is of another flight than {first.path}: {different[0]}"
-            raise RecordingError(f"{each.path}: {said}")
+            message = f"it is of another flight than {first.path}: {different[0]}"
+            raise RecordingError(f"{each.path}: {message}")
         owners = {OWNERS.get(part) for part in each.parts}
         values = flat(to_table(each.scenario))
         set_keys({key: value for key, value in values if KEYS[key].owner in owners}, table)

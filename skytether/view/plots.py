@@ -18,7 +18,6 @@ from skytether.view.scene import FLIGHT_RGB
 from skytether.view.state import Curves, State
 
 POINTS = 400
-"""Number of points of a line."""
 SEEN = 4.0
 """Upper limit of the trigger's plot, in thresholds."""
 SPARE = 6
@@ -27,22 +26,22 @@ HEIGHT = 150
 """Height of a plot [pixels]."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
-"""Colours of the two directions, in plots of one flight or of what all flights share."""
+"""Colours of the two directions, in plots of one flight or of data that all flights share."""
 TIME = "time of flight [s]"
-"""Label of most plots' horizontal axis."""
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
-"""Series of a plot that only widens its range: another range would make the browser begin anew."""
+"""Invisible series that widens a plot's range: changing the range itself would redraw from
+scratch.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """View of a flight that the plots show."""
+    """Data of a flight for the plots."""
 
     state: State
     curves: Curves
     now_ns: int
     vehicle: int = 0
-    """Number of the vehicle."""
 
 
 Values = Callable[[Look], Array]
@@ -55,7 +54,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; that of the flight unless given, and where each of several flights has this line."""
+    """Colour; the flight's if empty, or if several flights have this line."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False
@@ -64,8 +63,6 @@ class PlotLine:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One plot."""
-
     title: str
     lines: tuple[PlotLine, ...]
     grid: Values = lambda look: look.curves.time_s
@@ -75,7 +72,7 @@ class Plot:
     crop: bool = False
     """Whether trailing zeros are cropped."""
     equal: bool = False
-    """Whether its range is as wide as that of the others with this flag."""
+    """Whether its range is as wide as that of the other plots with this flag."""
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:
@@ -95,7 +92,7 @@ def _seconds(look: Look) -> Array:
 
 def _rates(direction: int) -> Values:
     def values(look: Look) -> Array:
-        """Packets in each second, from the last one before the flight on; NaN before."""
+        """Packets in each second, from the last second before the flight; NaN before."""
         rates = look.state.network.rates(direction, look.now_ns)
         return np.where(_seconds(look) > -1.0, rates, np.nan)
 
@@ -137,7 +134,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """Compared figure, cut off where it would hide its threshold."""
+    """Compared figure, limited to SEEN thresholds so that the threshold stays visible."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 
@@ -152,7 +149,6 @@ BY_DELAY = Plot(
     across="delay [ms]",
     crop=True,
 )
-"""Histogram plot of packets by their delay."""
 
 
 APART = Plot(
@@ -168,7 +164,7 @@ APART = Plot(
         PlotLine("nearest", lambda look: look.state.nearest_m(look.vehicle, POINTS)),
     ),
 )
-"""Plot of the distance to the nearest other vehicle of a mission."""
+"""Distance to the nearest other vehicle of a mission."""
 
 
 def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
@@ -186,7 +182,7 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
             grid=_seconds,
         ),
         Plot(
-            "What the trigger compares",
+            "Trigger: figure and threshold",
             (
                 PlotLine("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
                 PlotLine("compared", _compared),
@@ -196,10 +192,10 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
 
 
 def of_network(*, solves: bool) -> tuple[Plot, ...]:
-    """Plots of the network, and of the cost of plans where inputs are planned."""
+    """Plots of the network, and of computing time where plans are solved."""
     packets = (
         Plot(
-            "Age of what is flown by, and delays [s]",
+            "Age of the observation flown by, and delays [s]",
             (
                 PlotLine("age", lambda look: look.curves.age_s),
                 PlotLine("delay up", _delays(UPLINK), UP, once=True, width=1.0),
@@ -209,7 +205,7 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
         BY_DELAY,
     )
     solving = Plot(
-        "Solving, against the deadline [ms]",
+        "Computing time, and its deadline [ms]",
         (
             PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
             PlotLine("solving", lambda look: look.curves.solve_ms),
@@ -245,9 +241,7 @@ class Plots:
     """Plots of one browser.
 
     Args:
-        gui: viser's interface that they are added to.
-        titles: what the flights are called; empty for a flight that is alone.
-        plots: the plots.
+        titles: titles of the flights; empty for a single flight.
     """
 
     def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
@@ -299,7 +293,7 @@ class Plots:
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
-        """Redraw the flights; the first one determines the times."""
+        """Redraw the flights; the first determines the times."""
         drawn = []
         for plot in self._plots:
             data = [plot.grid(looks[0])]
@@ -325,7 +319,7 @@ def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:
-    """Data without the trailing zeros, except for a few."""
+    """Data with only SPARE trailing zeros."""
     used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
     return [values[: max(used) + SPARE] for values in data]
 
@@ -341,7 +335,7 @@ def begun(data: Sequence[Array]) -> list[Array]:
 def drawable(data: Sequence[Array]) -> list[Any]:
     """Data for uPlot: None in gaps, because uPlot draws no line that contains NaN.
 
-    A list, because viser converts all that is in a tuple to numbers.
+    A list, because viser converts everything in a tuple to numbers.
     """
     return [_with_gaps(values) if np.isnan(values).any() else values for values in data]
 

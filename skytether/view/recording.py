@@ -1,24 +1,24 @@
-"""Recordings: a flight as an MCAP file, for this program and for others.
+"""Recordings: a flight as an MCAP file, for Skytether and for other programs.
 
 The frames of the flight's processes are written as they come from their feeds, encoded as msgpack
-(`shared.telemetry.feed`); they alone are read back, by `view.recorded`:
+(`shared.telemetry.feed`); only they are read back, by `view.recorded`:
 
-    /recording           what the recording is of, a `Begun`; the first message
+    /recording           facts about the recording, a `Begun`; the first message
     /feed/PROCESS        frames of a process
 
-All else is written for other programs, a channel of JSON for each topic:
+Other programs get a channel of JSON for each topic:
 
     /vehicle/N/flown     rows of the client's part, see `view.rows`
     /vehicle/N/decided   rows of the server's part
     /vehicle/N/plan      rows of its plans
     /netem/packets       rows of netem's part
     /said                events
-    /figures/PROCESS     numbers counted so far
+    /figures/PROCESS     counters so far
 
 Foxglove and Lichtblick draw /events, and for each of the first VEHICLES_MAX vehicles
-/vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, where it
-should be and its trajectory. The scenario and, at the end, the summary are attachments. A chunk is
-complete as soon as it is written.
+/vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, its
+desired position and its trajectory. The scenario and, at the end, the summary are attachments. A
+chunk is complete as soon as it is written.
 """
 
 from collections.abc import Mapping
@@ -47,13 +47,13 @@ from skytether.view import foxglove, rows
 from skytether.view.container import ENCODING
 
 BEGUN, FEED = "/recording", "/feed/"
-"""Topic of the first message, and the beginning of the topics of frames."""
+"""Topic of the first message, and the prefix of the topics of frames."""
 OURS = "skytether"
 """Name of the metadata, and of the writing library."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
 """Names of the attachments."""
 VEHICLES_MAX = 64
-"""Most vehicles that are drawn; for larger numbers only rows are recorded."""
+"""Most vehicles that are drawn; of further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
 """Size of messages after which a chunk is written [B]."""
 POINTS_MAX = 400
@@ -77,9 +77,8 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     scenario: str
     """Name of the scenario."""
     seed: int
-    """Seed of the flight."""
     version: str
-    """Version of Skytether that flew it."""
+    """Version of Skytether that recorded the flight."""
     began: str
     """Time of day at the beginning, ISO 8601; empty in virtual time."""
     offset_ns: int
@@ -92,7 +91,6 @@ class Begun(msgspec.Struct, frozen=True, kw_only=True):
     """First message of a recording."""
 
     about: About
-    """Facts about it."""
     scenario: str
     """Scenario at the beginning, as TOML."""
 
@@ -102,7 +100,6 @@ class Recording:
 
     Args:
         file: file opened for writing.
-        scenario: what is flown.
         about: facts for its metadata.
 
     Raises:
@@ -170,7 +167,7 @@ class Recording:
         self._writer.add_attachment(0, self._now_ns, name, kind, content)
 
     def _add_frame(self, process: str, frame: Frame) -> None:
-        """Add a frame as it is, for this program."""
+        """Add a frame unchanged, to be read back by Skytether."""
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _say(self, process: str, event: Event) -> None:
@@ -179,7 +176,7 @@ class Recording:
         self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
 
     def _put_rows(self, part: str, table: rows.RowTable, made: Table) -> None:
-        """Add rows for other programs, a message for each, and what is drawn of them."""
+        """Add rows for other programs, a message for each, and their drawn messages."""
         for row, message in zip(made, table.messages(made), strict=True):
             number = int(row["vehicle"]) if "vehicle" in table.names else 0
             at = f"/vehicle/{number}/{_TOPICS.get(part, part)}" if number else f"/{part}/packets"

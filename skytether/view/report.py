@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVENTS_MAX = 400
-"""Most events on a page."""
 WIDTH = 9.0
 """Width of a figure [inch]."""
 LETTERS = 9
@@ -37,7 +36,6 @@ class ReportedFlight:
     """Data for the figures: one vehicle's flight, and the network."""
 
     scenario: Scenario
-    """Scenario that was flown."""
     client: Rows
     """Rows of the vehicle."""
     server: Rows
@@ -58,7 +56,7 @@ class ReportedFlight:
         return time_s
 
     def spans(self) -> Iterator[tuple[Mode, slice]]:
-        """Modes in succession, each with its first row and the first row after it."""
+        """Modes in succession, each with the slice of its rows and the first row after it."""
         modes = self.client["mode"]
         begins = np.flatnonzero(np.diff(modes, prepend=-1))
         for begin, end in zip(begins, [*begins[1:], len(modes)], strict=True):
@@ -66,13 +64,13 @@ class ReportedFlight:
 
 
 def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
-    """The page of a recording, as HTML.
+    """Page of a recording, as HTML.
 
     Args:
         figures: names and values of its summary.
 
     Raises:
-        RecordingError: nothing was flown in it.
+        RecordingError: no vehicle has flown a step.
     """
     parts, scenario, about = recorded.parts, recorded.scenario, recorded.about
     client = parts.get("client")
@@ -95,13 +93,15 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     began = f"{about.began[:10]} {about.began[11:16]} UTC"
     where = f"over UDP, {began}" if about.began else "in virtual time"
     fleet = len(np.unique(client["vehicle"]))
-    others = f" Drawn is vehicle {number} of {fleet}." if fleet > 1 else ""
+    others = f" The figures show vehicle {number} of {fleet}." if fleet > 1 else ""
     summary = recorded.summary
     sent = "–" if summary.event_ratio is None else f"{summary.event_ratio:.1%}"
     rmse = summary.rmse_xy
     off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
     rows = [list(row) for row in figures]
-    table = Table("summary", "Summary", "What came of the flight.", "", ("figure", "value"), rows)
+    table = Table(
+        "summary", "Summary", "Figures of the whole flight.", "", ("figure", "value"), rows
+    )
     made = {
         "scenario": about.scenario,
         "seed": str(scenario.seed),
@@ -142,7 +142,7 @@ def path(flown: ReportedFlight) -> Picture:
         plane.set_ylabel("y [m]")
         plane.legend(loc="upper right")
         _name_modes(figure, flown)
-        says = "Red and dashed where the vehicle should be, in colour where it was."
+        says = "Dashed red: desired positions. Coloured: the vehicle's positions, by mode."
         return Picture("path", "Path from above", says, as_png(figure, 140))
 
 
@@ -165,11 +165,11 @@ def timeline(flown: ReportedFlight) -> Picture:
         figure.align_ylabels(axes)
         _name_modes(figure, flown)
         says = (
-            "From above: position, with the desired one dashed; distance between them; what the "
-            "trigger compares with its threshold, linear up to there and logarithmic above, and "
-            "when a horizon was sent; how old the observation behind the input was, and the plan; "
-            "packets in each second, by when they entered the network, but for those still under "
-            "way at the end. The colour behind is what the vehicle did."
+            "From top to bottom: position, with the desired one dashed; distance between them; the "
+            "figure that the trigger compares with its threshold, linear up to it and logarithmic "
+            "above, and when a horizon was sent; age of the observation behind the input, and of "
+            "the plan; packets in each second, by their time of entry into the network, without "
+            "those still under way at the end. The background shows the vehicle's mode."
         )
         return Picture("timeline", "What happened", says, as_png(figure, 140))
 

@@ -1,7 +1,7 @@
 """Rows of the record as plain columns: one number each, with axis and unit in its name.
 
-An exported table has plain columns, and a recording's messages for other programs have them as
-keys. An array of the library has all axes of one quantity.
+Exported tables have plain columns, and messages of recordings for other programs have them as keys.
+An array of the library has all axes of one quantity.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,6 @@ from skytether.shared.telemetry.record import (
 from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
-"""Names of the axes."""
 SHORT = {"inputs": "input"}
 """Column names of velocities that become other names here."""
 WORDS: Mapping[str, Mapping[int, str]] = {
@@ -43,7 +42,7 @@ FLOWN_S_MAX = 2 * 86_400.0
 DELAY_NS_MAX = 86_400 * SECOND_NS
 """Longest delay of a packet that is accepted [ns]."""
 NUMBER_MAX = 1e100
-"""Largest number accepted in a row: squares of measured numbers do not overflow."""
+"""Largest number accepted in a row, so that squares do not overflow."""
 
 Columns = dict[str, NDArray[Any]]
 """Columns of a table, all of one length, by name."""
@@ -53,11 +52,11 @@ def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
     """Plain columns of the record's row type, at the same offsets in memory.
 
     A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, prefixed by its
-    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) of the inputs of a
+    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) for the inputs of a
     plan, become `input_x_mps` and so on.
 
     Raises:
-        ValueError: a column is of another kind, and no number.
+        ValueError: a column is neither a number nor of these shapes.
     """
     fields: list[Any] = []
     for name in columns.names or ():
@@ -87,9 +86,6 @@ class RowTable:
     """Converter of a part's rows to messages of JSON, with a key for each plain column.
 
     JSON has no numbers that are not finite; they are left out.
-
-    Args:
-        columns: columns of the rows.
 
     Raises:
         ValueError: see `plain`.
@@ -130,7 +126,7 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
     Additional columns are accepted. Plans may have any number of inputs.
 
     Raises:
-        ValueError: with the part and the column.
+        ValueError: names the part and the column.
     """
     axes = scenario.model.axes
     match part:
@@ -158,7 +154,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
     """Refuse rows with impossible values for a flight of a scenario.
 
     Raises:
-        ValueError: with the part, the column, the value and what was expected.
+        ValueError: names the part, the column, the value and the range.
     """
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
@@ -185,7 +181,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
 
 
 def readable(rows: Rows) -> Columns:
-    """Plain columns of rows, with words for modes, and one column per input of a plan."""
+    """Plain columns of rows, with words for codes, and one column per input of a plan."""
     flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
     made: Columns = {}
     for name in flat.dtype.names or ():
@@ -224,7 +220,6 @@ def planned(scenario: Scenario, row: np.void) -> Array:
     """Positions along a plan [m], from its initial state on; shape (steps + 1, axes).
 
     Args:
-        scenario: what is flown.
         row: row of the part "plan".
     """
     inputs = row["inputs"] + row["disturbance"][:, np.newaxis]

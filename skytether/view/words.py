@@ -1,4 +1,4 @@
-"""Words of a page about a flight, as HTML."""
+"""Status of a flight on a page, in words, as HTML."""
 
 from collections.abc import Sequence
 from html import escape
@@ -46,24 +46,24 @@ def badge(word: Word) -> str:
 
 
 def number(value: float, form: str, unit: str = "") -> str:
-    """Number as text, or a dash for an unknown one."""
+    """Number as text, or a dash for NaN."""
     return "–" if np.isnan(value) else f"{value:{form}}{unit}"
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     """State of a vehicle and its link, in words and numbers."""
     if not state.name:
-        return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
+        return f'<div style="{_BODY}">{escape(title)} No flight yet.</div>'
     if not state.flies:
         return _carried(state, now_ns, title)
     track = state.vehicles.get(vehicle)
     head = f"<b>{escape(title or state.title)}</b>"
     if track is None:
-        return f'<div style="{_BODY}">{head}: no vehicle {vehicle} has been heard of yet.</div>'
+        return f'<div style="{_BODY}">{head}: no data of vehicle {vehicle} yet.</div>'
     rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
-    rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
-    rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
-    rows.append(("age of what the server knows", number(track.known_s, ".2f", " s")))
+    rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
+    rows.append(("age of observation flown by", number(track.age_s, ".2f", " s")))
+    rows.append(("age of server's observation", number(track.known_s, ".2f", " s")))
     rows += _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms
@@ -115,7 +115,9 @@ def _gone(state: State) -> str:
 
 
 def _newest(state: State) -> str:
-    """The last few events, newest first, in a line each: what stands below does not move."""
+    """Newest events, newest first, a line each, always NEWEST lines so that the page does not
+    move.
+    """
     cut = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
         f'<div style="{cut}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
@@ -130,7 +132,7 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of a vehicle on a mission; none without one."""
+    """Table rows of a vehicle on a mission; empty without a mission."""
     if not state.scenario.is_mission:
         return []
     asked = f"at least {state.scenario.mission.separation_m:g} m"
@@ -142,12 +144,15 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
             f"{nearest}, {asked}",
         ),
         ("waits for", state.waits(vehicle) or "–"),
-        ("clock known to ±", f"{number(bound_ms, '.0f', ' ms')}, {number(clock_m, '.2f', ' m')}"),
+        (
+            "clock and position, known to ±",
+            f"{number(bound_ms, '.0f', ' ms')}, {number(clock_m, '.2f', ' m')}",
+        ),
     ]
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of the vehicle's autopilot; none without one."""
+    """Table rows of the vehicle's autopilot; empty without one."""
     says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
     if not says:
         return []
@@ -163,7 +168,6 @@ def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
-    """Table rows of the network."""
     rows = []
     for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
@@ -211,7 +215,7 @@ def note(text: str) -> str:
 
 
 def answers(given: Sequence[tuple[str, bool]]) -> str:
-    """Answers to the newest request, in a box whose height does not depend on them.
+    """Answers to the newest request, in a box of fixed height.
 
     Args:
         given: answer of each flight, and whether it is a refusal.

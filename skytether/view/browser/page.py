@@ -27,21 +27,22 @@ MOVES_TO_A_DRAWING = 5
 
 
 STOPPED_S = 30.0
-"""Time after which a server of viser that does not end is left alone [s]."""
+"""Time after which a viser server that does not end is abandoned [s]."""
 
-# A browser may leave while it is drawn for, which is no mistake.
+# A browser may leave while it is being drawn for.
 warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
-    """Keep viser's prints off standard output; it prints even when told not to."""
+    """Keep viser's prints off standard output; it prints even when asked not to."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def stop(server: viser.ViserServer) -> None:
-    """Stop a server of viser, and wait until its thread has printed its last line.
+    """Stop a viser server, and wait until its thread has printed its last line.
 
-    viser itself waits for a second, and would print when something else has the standard output.
+    viser itself waits for a second, and could print when standard output is used for something
+    else.
     """
     thread = server._websock_server._server_thread
     with _silence():
@@ -55,8 +56,7 @@ class Page:
 
     Args:
         host, port: address that it listens at.
-        flights: flights that are shown.
-        now_ns: time of the frames [ns]; this machine's clock unless given.
+        now_ns: function that returns the time of the frames [ns]; by default this machine's clock.
         token: secret that lets a visitor look and change the flight from any machine; empty for
             none.
         more: adds further controls to a browser.
@@ -97,7 +97,6 @@ class Page:
         return self._guard.events()
 
     def close(self) -> None:
-        """Close the page."""
         self._closed.set()
         self._thread.join()
         stop(self._server)
@@ -131,7 +130,7 @@ class Page:
                 with self._alone(number):
                     self._panels[number] = self._panel(client)
                 draws = True
-                break  # one at a time: a browser that keeps reconnecting costs no more
+                break  # one at a time, which bounds the cost of a browser that keeps reconnecting
         with self._server.atomic():
             self._scene.move(states)
             if draws:
@@ -150,7 +149,7 @@ class Page:
 
     @contextlib.contextmanager
     def _alone(self, number: int) -> Iterator[None]:
-        """Contain errors of one browser's panel: they close its connection, and no other.
+        """Close only this browser's connection when its panel raises an error.
 
         viser sets values as browsers send them: texts for numbers, lists of any length.
         """
@@ -163,7 +162,7 @@ class Page:
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
     def _begin(self, shown: tuple[object, ...]) -> None:
-        """Build the scene again: other flights are flown."""
+        """Build the scene again, for another flight."""
         self._server.scene.reset()
         for client in self._server.get_clients().values():
             client.gui.reset()

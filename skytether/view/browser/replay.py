@@ -54,13 +54,11 @@ class Player:
         self._lock = threading.Lock()
         self._at_ns = 0
         self._next = 0
-        """Index of the next frame."""
         self.speed = 1.0
         """Playback speed relative to real time."""
         self.plays = True
-        """Whether playback is running."""
         self._wanted_ns: int | None = None
-        """Requested time [ns]; None where it is shown already."""
+        """Time that the user has requested [ns]; None once it is shown."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -76,7 +74,7 @@ class Player:
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:
-        """Jump to another time."""
+        """Jump to a time since the first frame [ns]."""
         with self._lock:
             for flight in self._flights:
                 with flight.lock:
@@ -87,7 +85,7 @@ class Player:
             self._go(at_ns)
 
     def advance(self, passed_ns: int) -> None:
-        """Play the frames of some more time."""
+        """Play the frames of the next `passed_ns`."""
         with self._lock:
             self._go(min(self._at_ns + passed_ns, self.end_ns))
 
@@ -96,7 +94,7 @@ class Player:
         for _, place, process, frame in self._frames[self._next : until]:
             self._flights[place].take(process, frame)
         self._next = max(self._next, until)
-        self._at_ns = at_ns  # last: pages may be drawn meanwhile, and would call the link cut
+        self._at_ns = at_ns  # last: a page drawn in between would show the link as cut
 
     def _work(self) -> None:
         before_s = time.monotonic()
@@ -110,7 +108,6 @@ class Player:
             before_s = now_s
 
     def close(self) -> None:
-        """Stop playback."""
         self._closed.set()
         self._thread.join()
 

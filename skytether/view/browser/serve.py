@@ -1,4 +1,4 @@
-"""Page server: its address, who may change the flight, and how it ends."""
+"""Page server: its address, its token, and its end."""
 
 import errno
 import secrets
@@ -46,11 +46,10 @@ def page(
     now_ns: Callable[[], int] | None = None,
     more: More | None = None,
 ) -> Iterator[tuple[Page, PageServed]]:
-    """Serve a page for as long as the block takes; yields the page and its address.
+    """Serve a page during the block; yields the page and its address.
 
     Args:
         at: address to listen at; if its port is taken, the next free one.
-        flights: flights on the page.
         now_ns, more: see `Page`.
 
     Raises:
@@ -67,7 +66,7 @@ def page(
 
 
 def next_free(host: str, port: int) -> int:
-    """First free port from the given one on; 0, which takes any free port, stays 0.
+    """First free port, from `port` on; 0, which takes any free port, stays 0.
 
     Raises:
         CommandError: no port is free, or the host is not this machine.
