@@ -27,8 +27,6 @@ BIND = "127.0.0.1:14550"
 
 @dataclass(frozen=True)
 class AutopilotOptions(ProcessOptions):
-    """Options of `skytether autopilot`."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file, of which only `vehicle.frame`,
     `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and `seed` are used."""

@@ -34,7 +34,6 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 SYSTEM, COMPONENT = 1, int(dialect.MAV_COMP_ID_AUTOPILOT1)
-"""System and component id of the autopilot."""
 PEERS_MAX = 8
 """Most peers at once; a new one replaces the one that was silent longest."""
 PATIENCE_NS = SECOND_NS
@@ -42,7 +41,6 @@ PATIENCE_NS = SECOND_NS
 BEHIND_MAX_NS = SECOND_NS
 """Longest time that is simulated at once after a late wake [ns]; the flight skips the rest."""
 LISTED_EACH_TICK = 2
-"""Number of parameters of a list that are sent per tick."""
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -68,7 +66,6 @@ class Peer:
         self.codec = Codec(SYSTEM, COMPONENT)
         self.heard_ns = now_ns
         self.is_station = False
-        """Whether a ground station's heartbeat came from this peer."""
         self.listed: int | None = None
         """Number of parameters sent of a requested list; None without a request."""
         self.streams: dict[int, tuple[int, int]] = {}
@@ -139,7 +136,6 @@ class Autopilot(Endpoint):
             self._meet(address, pinned=True)
         self._reader = Codec(SYSTEM, COMPONENT)
         self._texts = 0
-        """Id of the newest text."""
         self._counts: Counter[str] = Counter()
         self._handlers: dict[str, Callable[[Message, Peer, int], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -180,7 +176,6 @@ class Autopilot(Endpoint):
         self._fly(now_ns)
 
     def next_wake_ns(self) -> int:
-        """Time of the next tick."""
         return 0 if self._began_ns is None else self._began_ns + self.flight.now_ns + TICK_NS
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
@@ -204,7 +199,7 @@ class Autopilot(Endpoint):
     # Flight and telemetry
 
     def _fly(self, now_ns: int) -> None:
-        """Fly until now, tick by tick, and send the messages due at each tick."""
+        """Fly until `now_ns`, tick by tick, and send the messages due at each tick."""
         if self._began_ns is None:
             self._began_ns = now_ns
         behind_ns = now_ns - self._began_ns - self.flight.now_ns
@@ -240,7 +235,6 @@ class Autopilot(Endpoint):
         return peer
 
     def _send(self, peer: Peer, message: Message) -> None:
-        """Send a message to a peer, unless a fault silences the autopilot."""
         if not self.script.silent:
             self._counts["sent"] += 1
             self.send(peer.codec.encode(message), peer.address)
@@ -254,7 +248,6 @@ class Autopilot(Endpoint):
         return make is not None
 
     def _speak(self) -> None:
-        """Send all peers the flight's new texts, and log them."""
         for severity, text in self.flight.said:
             self.tell(AutopilotSaid(text=text, severity=int(severity)))
             self._texts = self._texts % 65535 + 1
@@ -265,7 +258,6 @@ class Autopilot(Endpoint):
         self.flight.said.clear()
 
     def _list(self, peer: Peer) -> None:
-        """Send the next parameters of a requested list."""
         if peer.listed is None:
             return
         names = list(self.flight.parameters)
@@ -374,7 +366,7 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Set the interval of a message to a peer [µs]; 0 restores the default, below 0 stops the
+        """Set the interval of a message to a peer; 0 restores the default, below 0 stops the
         stream.
         """
         if number not in STREAMS or not isfinite(interval_us):

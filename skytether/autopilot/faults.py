@@ -15,7 +15,6 @@ FaultName = Literal[
 ]
 NAMES: tuple[str, ...] = get_args(FaultName)
 LASTING = ("silence", "estimate", "drift", "leap", "commander")
-"""Faults that may end."""
 DRIFT: Vector = (3.5, 0.0, 0.0)
 """True velocity of the fault `drift`, which the estimate does not show [m/s]."""
 COMMANDED: Vector = (3.0, 0.0, 0.0)
@@ -31,9 +30,8 @@ LOW_CHARGE = 0.05
 class ScriptedFault(NamedTuple):
     name: str
     from_ns: int
-    """Begin, counted from arming."""
     until_ns: int | None
-    """End, counted from arming; None if it does not end."""
+    """None for a fault that does not end."""
 
 
 def parse(text: str) -> ScriptedFault:
@@ -63,12 +61,9 @@ class Script:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
         self._lasting: list[ScriptedFault] = []
         self._commands = False
-        """Whether a second station commands the vehicle, over another line of the autopilot."""
         self.silent = False
-        """Whether the autopilot sends nothing."""
 
     def play(self, flight: PilotedVehicle) -> None:
-        """Apply the faults that are due."""
         if flight.armed_ns is None:
             return
         past_ns = flight.now_ns - flight.armed_ns

@@ -41,11 +41,9 @@ class SimulatedFlavour:
     version: tuple[int, int, int]
     """Version on which the behaviour was measured."""
     autopilot: int
-    """MAV_AUTOPILOT in the heartbeat."""
     bytewise: bool
     """Whether integer parameters are sent as bits, see `mavlink.parameters`."""
     gains: Gains
-    """Gains of the velocity loop."""
     frame: str
     """Frame in the autopilot's own simulator, or the nearest one."""
     ready_s: float
@@ -55,19 +53,16 @@ class SimulatedFlavour:
     spool_s: float
     """Time from the take-off command until it climbs."""
     wander_mps: float
-    """Standard deviation of the error of its velocity estimate, along each axis. The true velocity
-    differs by this error from the one that the loops control.
+    """Standard deviation, along each axis, of the error of the velocity estimate that the loops
+    use.
     """
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
     """Name and meaning of each mode, by the number in the heartbeat."""
     first: int
-    """Mode at the start."""
     streams: dict[int, float]
-    """Default rates of a link's messages [Hz], by message id."""
     parameters: Parameters
-    """Parameters at the start."""
 
     def number(self, mode: FlightMode) -> int:
         """Number of the first mode with this meaning."""

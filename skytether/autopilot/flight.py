@@ -37,8 +37,6 @@ REST: Vector = (0.0, 0.0, 0.0)
 
 
 class Result(IntEnum):
-    """Result of a command: MAV_RESULT."""
-
     ACCEPTED = dialect.MAV_RESULT_ACCEPTED
     REJECTED = dialect.MAV_RESULT_TEMPORARILY_REJECTED
     DENIED = dialect.MAV_RESULT_DENIED
@@ -47,16 +45,12 @@ class Result(IntEnum):
 
 
 class Severity(IntEnum):
-    """Severity of a text: MAV_SEVERITY."""
-
     CRITICAL = dialect.MAV_SEVERITY_CRITICAL
     WARNING = dialect.MAV_SEVERITY_WARNING
     INFO = dialect.MAV_SEVERITY_INFO
 
 
 class Landed(Enum):
-    """Landed state: MAV_LANDED_STATE."""
-
     ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
     IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
     TAKEOFF = dialect.MAV_LANDED_STATE_TAKEOFF
@@ -64,8 +58,6 @@ class Landed(Enum):
 
 
 class CompanionSetpoint(NamedTuple):
-    """Set-point of a companion computer."""
-
     velocity: Vector
     """Velocity, or with a position the feed-forward velocity [m/s]."""
     position: Vector | None
@@ -74,18 +66,12 @@ class CompanionSetpoint(NamedTuple):
 
 
 class OwnSpeeds(NamedTuple):
-    """Limits and gains of the autopilot's own flight, in the modes in which no set-points are
-    followed.
-    """
+    """Limits and gains of the autopilot's own flight, in modes that follow no set-points."""
 
     speed: float
-    """Largest horizontal speed [m/s]."""
     up: float
-    """Largest speed upwards [m/s]."""
     down: float
-    """Largest speed downwards [m/s]."""
     land: float
-    """Speed of landing [m/s]."""
     p: float
     """Gain from horizontal distance to speed [1/s]."""
     p_up: float
@@ -118,12 +104,9 @@ class PilotedVehicle(ABC):
         self.flavour, self.quadrotor = flavour, quadrotor
         self.parameters: Parameters = dict(flavour.parameters)
         self.number = flavour.first
-        """Number of the present mode."""
         self.armed = False
         self.armed_ns: int | None = None
-        """Time of the first arming."""
         self.flying = False
-        """Whether the vehicle has left the ground."""
         self.estimates = True
         """Whether its position estimate is valid, once it is ready."""
         self.drift: Vector = REST
@@ -131,24 +114,18 @@ class PilotedVehicle(ABC):
         self._wander, self._noise = np.zeros(3), noise
         """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST
-        """Displacement of the reported position [m]."""
         self.said: list[tuple[Severity, str]] = []
-        """Texts not sent yet."""
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat; None before any, when the failsafe is
-        off.
-        """
+        """Time of the ground station's newest heartbeat; None before any: no failsafe then."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
         """Altitude to climb to [m]; None while not climbing."""
         self._climb_ns = 0
-        """Time at which the climb begins."""
         self._held: Vector | None = None
         """Point that is held after coming to rest."""
         self._stood_ns = 0
-        """Time since which the vehicle has been at rest on the ground."""
         self._landing = False
         """Whether a return has become a landing."""
         self._told: set[str] = set()
@@ -165,7 +142,6 @@ class PilotedVehicle(ABC):
 
     @property
     def ready(self) -> bool:
-        """Whether the vehicle has a valid position estimate."""
         return self.estimates and self.now_ns >= self._ready_ns
 
     @property
@@ -208,7 +184,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def switch(self, number: int) -> Result:
-        """Enter the mode with this number, if it is possible now."""
         if number not in self.flavour.modes:
             return Result.DENIED
         name, kind = self.flavour.modes[number]
@@ -225,7 +200,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def enter(self, number: int) -> None:
-        """Enter the mode with this number unconditionally."""
         if number == self.number:
             return
         self.number = number
@@ -258,7 +232,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def want(self, velocity: Vector, position: Vector | None) -> None:
-        """Accept a set-point of a companion computer."""
         if not self.takes_setpoints():
             return
         if self.mode is FlightMode.GUIDED:
@@ -302,11 +275,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def limits(self) -> OwnSpeeds:
-        """Limits and gains of its own flight, from its parameters."""
+        pass
 
     @abstractmethod
     def gains(self) -> Gains:
-        """Gains of its velocity loop, from its parameters."""
+        pass
 
     @abstractmethod
     def is_station(self, system: int, kind: int) -> bool:
@@ -355,7 +328,6 @@ class PilotedVehicle(ABC):
         return new
 
     def _lift(self, velocity: Vector) -> None:
-        """Leave the ground, if the mode climbs."""
         if self.flying:
             return
         climbs = self._climb is not None and self.now_ns >= self._climb_ns
@@ -375,7 +347,6 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def _guide(self) -> Vector:
-        """Desired velocity now [m/s]."""
         if self._climb is not None:
             return self._climbing(self._climb)
         match self.mode:

@@ -55,7 +55,6 @@ class PX4(PilotedVehicle):
         self._covered = False
         """Whether a failsafe covers OFFBOARD until set-points come again."""
         self._after_disarming = flavour.first
-        """Mode after disarming."""
 
     def switch(self, number: int) -> Result:
         result = super().switch(number)

@@ -24,8 +24,6 @@ UNKNOWN_MV = 65535
 
 
 class Telemetry:
-    """Maker of telemetry messages of a flight."""
-
     def __init__(self, flight: PilotedVehicle) -> None:
         self._flight = flight
 
@@ -43,7 +41,6 @@ class Telemetry:
         )
 
     def local_position(self) -> Message | None:
-        """Position and velocity; None while unknown."""
         if not self._flight.ready:
             return None
         position = turned(self._flight.estimate())
@@ -110,7 +107,6 @@ class Telemetry:
         )
 
     def home(self) -> Message | None:
-        """None while unknown."""
         if not self._flight.ready:
             return None
         latitude, longitude, altitude = self._flight.flavour.home

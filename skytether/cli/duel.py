@@ -30,8 +30,6 @@ from skytether.view.frames import of_flight
 
 @dataclass(frozen=True)
 class DuelOptions:
-    """Options of `skytether duel`."""
-
     scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
     """Two or more names of scenarios (see `skytether scenarios`) or .toml files; the others take
     the network, duration and seed of the first.
@@ -71,12 +69,7 @@ def duel(argv: Sequence[str]) -> None:
 
 
 def together(options: DuelOptions) -> list[Scenario]:
-    """The scenarios, with the same network, duration and seed.
-
-    Raises:
-        CommandError: there are fewer than two.
-        ConfigError: a scenario cannot be flown.
-    """
+    """The scenarios, with the same network, duration and seed."""
     if len(options.scenarios) < 2:
         message = f"got {len(options.scenarios)} scenario, expected two or more"
         raise CommandError(message, command.CONFIGURATION)
@@ -89,11 +82,7 @@ def together(options: DuelOptions) -> list[Scenario]:
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """The scenario, if it can be flown.
-
-    Raises:
-        ConfigError: the scenario cannot be flown.
-    """
+    """The scenario; refused if it cannot be flown."""
     return reading.check(reading.to_table(scenario), name)
 
 
@@ -106,8 +95,6 @@ def titles(names: Sequence[str]) -> list[str]:
 
 
 def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> None:
-    """Fly the scenarios over UDP at once, each with its own processes."""
-
     def fly(scenario: Scenario, sockets: Path) -> Record:
         run = partial(processes.run, on_second=on_second, interrupted=interrupted, sockets=sockets)
         return processes.flown(scenario, run)

@@ -19,8 +19,6 @@ from skytether.view.recorded import Recorded
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of `skytether export`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     csv: Path | None = None
@@ -32,7 +30,7 @@ class ExportOptions:
     `trace(FILE)` replays; see docs/network.md.
     """
     pcap: Path | None = None
-    """File for a packet capture (pcap) of what netem sent: made-up headers, true lengths, no
+    """File for a packet capture (pcap) of netem's output: made-up headers, true lengths, no
     payload.
     """
     plugin: command.Plugins = ()
@@ -66,11 +64,7 @@ def export(argv: Sequence[str]) -> None:
 
 
 def _traffic(options: ExportOptions, recorded: Recorded) -> None:
-    """Write delay traces and a packet capture of netem's packets.
-
-    Raises:
-        CommandError: the recording has no netem part, or a file cannot be written.
-    """
+    """Write delay traces and a packet capture of netem's packets."""
     packets = recorded.parts.get("netem")
     if packets is None or not len(packets):
         message = f"{options.file}: expected packets of netem, the recording has none"
@@ -86,11 +80,6 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a table, and print its path.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     try:
         files.write(path, content)
     except OSError as error:

@@ -43,8 +43,6 @@ STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger",
 
 @dataclass(frozen=True)
 class FleetOptions(ScenarioOptions):
-    """Options of `skytether fleet`."""
-
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
@@ -80,7 +78,6 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float
     """Time flown by the vehicle that flew longest [s]."""
     steps: int
-    """Steps flown by all vehicles."""
     secure: bool
     server_steps: int
     """Steps that the server planned."""
@@ -102,9 +99,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     """Packets that the network lost, both ways."""
     dropped: int
-    """Packets dropped because a queue of the kernels or of netem was full, which no scenario asks
-    for.
-    """
+    """Packets dropped because a queue of the kernels or of netem was full."""
     drops: dict[str, dict[str, int]]
     """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     tick_ms_p50: float
@@ -116,15 +111,11 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     client_missed: int
     """Steps that vehicles missed because their process woke too late."""
     machine_missed: int | None
-    """Steps that a thread which only sleeps missed in the same time, which is the machine's
-    share.
-    """
+    """Steps that a thread which only sleeps missed in the same time: the machine's share."""
     machine_late_ms_max: float | None
     """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """CPU time of the server per vehicle and step [µs]: `total`; the stages are wall-clock
-    times.
-    """
+    """CPU time of the server per vehicle and step [µs]: `total`; by stage, wall-clock time."""
     client_cpu_us: float | None
     """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
@@ -135,13 +126,10 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class FleetFlight:
-    """A fleet's flight, and its cost to the machine."""
-
     record: Record
     machine: "Lateness | None" = None
-    """How late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
-    """CPU time of all parts together [s], in virtual time."""
+    """In virtual time [s]."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -193,11 +181,7 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """Replace `--mission` by the scenario and the flags from its table of goals.
-
-    Raises:
-        CommandError: a scenario is given as well, or the file is no table of goals.
-    """
+    """Replace `--mission` by the scenario and the flags from its table of goals."""
     missions, rest = plugins.flag_values(argv, "--mission")
     if "--mission" in rest:
         raise CommandError("--mission: expected a name or a file", command.CONFIGURATION)
@@ -274,14 +258,11 @@ class Lateness:
 
     missed: int = 0
     max_s: float = 0.0
-    """Longest delay with which it woke [s]."""
 
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Let a thread sleep step by step during the block; the machine causes the steps that it
-    misses.
-    """
+    """Let a thread sleep step by step during the block; the steps it misses are the machine's."""
     late, over = Lateness(), threading.Event()
 
     def sleep() -> None:
@@ -305,11 +286,6 @@ def metronome(dt_s: float) -> Iterator[Lateness]:
 
 
 def _vehicles(options: FleetOptions) -> int:
-    """Number of vehicles.
-
-    Raises:
-        CommandError: the mission has another number.
-    """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
     mission = options.config.unallocated_reference()

@@ -42,15 +42,12 @@ UNSEEN = Fault, ReferenceTooFast
 """Events of a flight in virtual time that are printed after it."""
 PRINTED = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked while the page stays open [s]."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Modes before the first plan is flown, which are not printed."""
 
 
 @dataclass(frozen=True)
 class FlyOptions(ScenarioOptions):
-    """Options of `skytether fly`."""
-
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
@@ -83,7 +80,7 @@ class FlyOptions(ScenarioOptions):
     show the file.
     """
     beside: Annotated[tuple[str, ...], Argument(metavar="SCENARIO", append=True)] = ()
-    """Scenario to compare with, flown in virtual time with the same duration and seed; may be
+    """Scenario to compare with, flown in virtual time with same duration and seed; may be
     repeated.
     """
 
@@ -138,11 +135,7 @@ def _show(
     unrecorded: str | None,
     beside: Mapping[str, Scenario],
 ) -> None:
-    """Print the flight's summary, and write its picture.
-
-    Raises:
-        CommandError: no step was flown, or the figure or the recording is incomplete.
-    """
+    """Print the flight's summary, and write its picture."""
     scenario = options.config
     if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
@@ -168,11 +161,6 @@ def _show(
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:
-    """Create the folder of the sockets, accessible to its owner only.
-
-    Raises:
-        CommandError: the folder cannot be created, or the flight is in virtual time.
-    """
     if virtual:
         message = "--control: got --virtual as well, expected a flight in real time"
         raise CommandError(message, command.CONFIGURATION)
@@ -184,7 +172,6 @@ def _make_folder(folder: Path, *, virtual: bool) -> None:
 
 
 def _beside(options: FlyOptions) -> dict[str, Scenario]:
-    """Scenarios to compare with, by name."""
     same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
     try:
         scenarios = {
@@ -255,8 +242,8 @@ def _really(
 
 
 def _missing(scenario: Scenario, flown: Record) -> str | None:
-    """Sentence that says what could not be recorded and how much was; None if the record is
-    complete.
+    """Sentence that says what could not be recorded, and how much was; None if nothing is
+    missing.
     """
     if not flown.incomplete:
         return None

@@ -16,8 +16,6 @@ from skytether.view.joining import join as joined
 
 @dataclass(frozen=True)
 class JoinOptions:
-    """Options of `skytether join`."""
-
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
     """Recordings (.mcap), one from each process; or a single one of a killed flight, which then
     gets the end that other programs expect.

@@ -20,8 +20,6 @@ HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehic
 
 @dataclass(frozen=True)
 class KeygenOptions:
-    """Options of `skytether keygen`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """File for the keys."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -88,11 +86,7 @@ def make(
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of a vehicle's new key.
-
-    Raises:
-        CommandError: the vehicle cannot have another key, or none with this number.
-    """
+    """Number of a vehicle's new key."""
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:
@@ -115,11 +109,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 
 
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
-    """Write lines to a new file of mode 0600, or to the end of an existing one.
-
-    Raises:
-        CommandError: the file exists and must not, or cannot be written.
-    """
+    """Write lines to a new file of mode 0600, or to the end of an existing one."""
     try:
         files.check_private(path)
         before = HEAD.encode()

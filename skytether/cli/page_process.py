@@ -13,7 +13,6 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 STOP_S = 5.0
-"""Longest time for the page to end after SIGTERM [s]."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"
@@ -26,9 +25,6 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
     Args:
         at: HOST:PORT; NONE or None for no page.
         folder: folder of the flight's sockets; with a page, a temporary one if None.
-
-    Raises:
-        CommandError: `at` is no address.
     """
     if at is None or at == NONE:
         yield folder
@@ -42,9 +38,7 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
 
 @contextlib.contextmanager
 def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
-    """Serve a page of flights at HOST:PORT during the block, and print its address or why it
-    failed.
-    """
+    """Serve a page of flights at HOST:PORT during the block; print its address or why it failed."""
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
         [sys.executable, "-P", "-m", "skytether.view", *arguments],

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
-"""Longest measurement [s], and largest packet rate [1/s]."""
 SECRET_BYTES = 32
 MODELS_SHOWN = 3
 """Number of printed models, for delays and for losses of each direction."""
@@ -55,8 +54,6 @@ MODELS_SHOWN = 3
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """Options of `skytether probe`."""
-
     target: Annotated[str, Argument(metavar="HOST:PORT", positional=True)] = ""
     """Address of the other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
@@ -116,11 +113,7 @@ def probe(argv: Sequence[str]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn an OSError within the block into one line that names the file or folder.
-
-    Raises:
-        CommandError: the block raised an OSError.
-    """
+    """Turn an OSError within the block into a CommandError that names the file or folder."""
     try:
         yield
     except OSError as error:
@@ -166,7 +159,6 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
 
 
 def _probe(options: ProbeOptions, listener: Address) -> None:
-    """Measure the path, and print and write the results."""
     link: ClientLink = PlainLink()
     if options.keys:
         from skytether.client.secure import SecureLink
@@ -219,7 +211,6 @@ def _conclude(options: ProbeOptions, measured: MeasuredPath, outcome: ProbeOutco
 
 
 def _read(options: ProbeOptions) -> None:
-    """Read a log or two captures, and print and write the results."""
     _check(options)
     read = [File(str(path), _content(path)) for path in options.files]
     captures = sum(recorded.is_capture(file.content) for file in read)
@@ -244,11 +235,6 @@ def _read(options: ProbeOptions) -> None:
 
 
 def _content(path: Path) -> bytes:
-    """Content of a file.
-
-    Raises:
-        CommandError: it cannot be read.
-    """
     try:
         return files.read(path, reading.FILES["network.uplink"][1])
     except (OSError, ValueError) as error:
@@ -264,11 +250,7 @@ def _say(event: Event) -> None:
 
 
 def _check(options: ProbeOptions) -> None:
-    """Refuse impossible measurements, and files that cannot be written.
-
-    Raises:
-        CommandError: names the flag, its value and the range.
-    """
+    """Refuse impossible measurements, and files that cannot be written."""
     for flag, given, least, most in (
         ("--seconds", options.seconds, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
@@ -294,11 +276,6 @@ def _check(options: ProbeOptions) -> None:
 
 
 def _write(options: ProbeOptions, outcome: ProbeOutcome) -> None:
-    """Write the traces, the figures and the picture.
-
-    Raises:
-        CommandError: a file cannot be written.
-    """
     for name, delays in outcome.delays.items():
         with _writing(file := options.out / f"{name}.csv"):
             files.write(file, trace(delays).encode())
@@ -312,11 +289,6 @@ def _write(options: ProbeOptions, outcome: ProbeOutcome) -> None:
 
 
 def _record(path: Path, packets: Rows) -> None:
-    """Write one row per packet.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     content = io.BytesIO()
     recorder = Recorder(PACKET_COLUMNS, content)
     recorder.append(len(packets), **{name: packets[name] for name in PACKET_COLUMNS.names or ()})
@@ -325,9 +297,7 @@ def _record(path: Path, packets: Rows) -> None:
 
 
 def _tell(options: ProbeOptions, outcome: ProbeOutcome) -> None:
-    """Print tables of both directions, the limits of their accuracy, and network texts for a
-    scenario.
-    """
+    """Print tables of both directions, their accuracy, and network texts for a scenario."""
     path = outcome.told
     ways = {"downlink": path.downlink, "uplink": path.uplink}
     shown = {"each way": path.downlink} if path.log else ways
@@ -384,7 +354,6 @@ def _of_clocks(path: PathFigures) -> str:
 
 
 def _figures(way: DirectionFigures) -> dict[str, str]:
-    """Figures of a direction, formatted for printing."""
     texts = {
         "packets sent, arrived": f"{way.sent}, {way.came}",
         "lost [%], 95 % interval": f"{100 * way.loss:.3g} ({100 * way.loss_low:.3g} to "

@@ -48,7 +48,6 @@ from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
-"""Arguments that make a process listen on any free port of loopback."""
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record."""
 
@@ -57,9 +56,7 @@ START_S = 120.0
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
-"""Longest time for a process to end after SIGTERM [s]."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked [s]."""
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
@@ -75,11 +72,9 @@ class Child:
     name: str
     process: asyncio.subprocess.Process
     reader: "asyncio.Task[None]" = field(init=False)
-    """Task that reads the process's output until its end."""
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
     """Last lines of its output, events as sentences."""
     address: Address = ("", 0)
-    """Address that the process listens on."""
     failed: bool = False
     """Whether the process has reported an event after which it could not fly."""
     fell_short: bool = False
@@ -184,7 +179,6 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
 
 
 def feeds_in(folder: Path) -> dict[str, Path]:
-    """Feed sockets in a folder, by process name, see `run`."""
     return {name: folder / f"{name}.feed" for name in NAMES}
 
 

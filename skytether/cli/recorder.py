@@ -28,15 +28,10 @@ from skytether.view.recording import About, Recording
 FLUSH_S = 0.25
 """Interval at which new frames are written [s]; a killed process loses at most this much."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end for the rest of the feeds [s]."""
 
 
 def check(path: Path, flag: str = "--record") -> None:
-    """Refuse a file without a recording's suffix before anything is flown.
-
-    Raises:
-        CommandError: names the expected suffix.
-    """
+    """Refuse a file without a recording's suffix before anything is flown."""
     if path.suffix != RECORDING:
         message = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
         raise CommandError(message, command.CONFIGURATION)
@@ -86,18 +81,13 @@ def beside() -> int:
 
 @dataclass(slots=True)
 class _Source:
-    """State of the recording of one feed."""
-
     begun: bool = False
-    """Whether any frame has come."""
     ended: bool = False
-    """Whether the feed has ended, for now."""
+    """False again once the feed has been reopened."""
     resumed: bool = False
     """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0
-    """Time of the newest frame [ns]."""
     newest: list[Frame] = field(default_factory=list)
-    """Frames with the time `last_ns`."""
 
     def is_new(self, frame: Frame) -> bool:
         """Whether a frame is new: a feed that is opened again repeats its last frames."""
@@ -187,7 +177,6 @@ class Live:
         return all(source.ended or not source.begun for source in self._sources.values())
 
     def _compare(self, flown: Record) -> None:
-        """Check that every row of the record has been received."""
         for part, rows in (
             ("client", flown.client),
             ("server", flown.server),

@@ -19,8 +19,6 @@ from skytether.view.browser.serve import until_told
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Options of `skytether replay`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording, as `fly --record FILE.mcap` makes it."""
     page: str = HOST_PORT

@@ -17,8 +17,6 @@ from skytether.view.report import page
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Options of `skytether report`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     out: Path = Path("report.html")

@@ -16,8 +16,6 @@ from skytether.shell.options import read, toml_value
 
 @dataclass(frozen=True)
 class SetOptions:
-    """Options of `skytether set`."""
-
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Socket that server, netem or client was given as --control."""
     changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
@@ -49,11 +47,7 @@ def set_keys(argv: Sequence[str]) -> None:
 
 
 def parsed(changes: Sequence[str]) -> dict[str, Any]:
-    """Values by key, parsed from texts such as `control.horizon=60`.
-
-    Raises:
-        CommandError: a text is no assignment, a key comes twice, or the request is too large.
-    """
+    """Values by key, parsed from texts such as `control.horizon=60`."""
     values: dict[str, Any] = {}
     for change in changes:
         key, equals, text = change.partition("=")

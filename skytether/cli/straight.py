@@ -26,8 +26,6 @@ TOLD = AutopilotRefused, AutopilotText, Fault
 
 @dataclass(frozen=True)
 class StraightOptions(LawOptions, ScenarioOptions):
-    """Options of `skytether straight`."""
-
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     flavour: FlavourName = "ardupilot"

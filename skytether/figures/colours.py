@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from skytether.shared.wire.protocol import Mode
 
 Rgb = tuple[int, int, int]
-"""Red, green and blue, 0 to 255 each."""
 
 GREY, GREEN, AMBER, RED, BLUE, VIOLET = "grey", "green", "amber", "red", "blue", "violet"
 PALETTE: Mapping[str, Rgb] = {

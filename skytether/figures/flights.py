@@ -87,7 +87,6 @@ def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
 
 
 def draw_path(plane: "Axes", scenario: Scenario, flight: Record) -> None:
-    """Draw a flight's path over its reference."""
     position = flight.client["state"][..., 0]
     draw_reference(plane, scenario, flight.client, flight.server)
     plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
@@ -182,7 +181,6 @@ def fleet(
 
 
 def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_m: Array) -> None:
-    """Draw the smallest distance of two vehicles, and the required one."""
     axes.plot(times_s - times_s[:1], nearest_m, "k-", linewidth=0.8, label="nearest two vehicles")
     asked_m = scenario.mission.separation_m
     axes.axhline(asked_m, color="tab:red", linestyle="--", label=f"required: {asked_m:g} m")

@@ -19,22 +19,18 @@ class Table:
     """Table of a report: its numbers as CSV, and as shown."""
 
     name: str
-    """Name of the table's file."""
     title: str
-    """Heading above the table."""
     says: str
     """Explanation of the numbers: a few sentences."""
     csv: str
     """Numbers as CSV, with all digits."""
     heading: Sequence[str]
     rows: Sequence[Sequence[str]]
-    """Cells as shown, row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
     name: str
-    """Name of the figure in the page, and of its file."""
     title: str
     says: str
     """Caption: one or two sentences."""

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOTS_MAX = 20_000
-"""Largest number of packets that are drawn one by one."""
 
 
 def drawn(outcome: ProbeOutcome) -> "Figure":

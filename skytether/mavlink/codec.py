@@ -14,7 +14,6 @@ Message = Any
 FRAME_BYTES_MAX = 280
 """Longest frame [B]: 10 of header, 255 of payload, 2 of checksum and 13 of signature."""
 SIGNED = 0x01
-"""Flag of a frame that has a signature."""
 
 
 class Codec:
@@ -58,7 +57,6 @@ class Codec:
         return messages
 
     def _one(self, frame: bytearray) -> Message | None:
-        """Message of a frame; None if the frame is invalid."""
         if not frame:
             return None
         number = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]

@@ -10,7 +10,6 @@ CHUNK_BYTES = 50
 UNFINISHED_MAX = 8
 """Most unfinished texts that are kept; a new one replaces the oldest."""
 CHUNKS_MAX = 8
-"""Most chunks of a text."""
 
 
 def chunks(severity: int, text: str, number: int) -> list[Message]:

@@ -39,7 +39,6 @@ Z95 = 1.959963984540054
 ALIKE_S = 50e-6
 """Standard deviation up to which values count as all equal [s]."""
 LAGS = 20
-"""Number of lags of the autocorrelation."""
 TOGETHER_NS = 2 * MILLISECOND_NS
 """Longest time within which the packets of a train are sent [ns]."""
 SPREAD_MIN_S = 1e-3
@@ -51,7 +50,6 @@ GROUPS_MIN, GROUPS_MAX = 4, 10
 ALONE_MIN, KERNELS = 100, 500
 """Smallest number of packets for a distribution, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
-"""Probabilities of the reported quantiles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +81,6 @@ class BottleneckRate:
     high: float
     """Bounds of the 95 % interval [B/s]."""
     trains: int
-    """Number of trains used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +96,6 @@ class Delays:
 
     @property
     def came(self) -> Flags:
-        """Whether each packet arrived; shape (n,)."""
         return np.isfinite(self.delay_s)
 
 
@@ -353,9 +349,7 @@ Trains = list[tuple[Array, Array]]
 
 
 def _slope(trains: Trains) -> tuple[float, float]:
-    """Common slope of lines through all trains, each with its own intercept, and its standard
-    error.
-    """
+    """Common slope of lines through all trains, each with its own intercept; standard error."""
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx

@@ -18,15 +18,12 @@ from skytether.probe.analysis import highest
 from skytether.shared.law.model import Array, Flags
 
 RESOLUTION_S = 50e-6
-"""Time resolution of the likelihoods [s]."""
 CONSTANT_S = 0.5e-3
 """Largest standard deviation of delays that are called constant [s]."""
 LEASTS = 60
-"""Number of candidates for a delay distribution's lower bound."""
 SLOTS = 4000
 """Number of slot lengths that are tried for the paper's distribution."""
 PAIRS_MIN = 20
-"""Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
 """Bounds of the redraw time of a Gilbert-Elliott channel: shortest, in mean times between packets,
 and longest [s].
@@ -35,16 +32,14 @@ and longest [s].
 
 @dataclass(frozen=True, slots=True)
 class FittedImpairment:
-    """Fitted impairment."""
+    """Impairment with fitted arguments."""
 
     name: str
     numbers: tuple[float, ...]
-    """Arguments of the impairment."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
     def text(self, correlation_s: float = 0.0) -> str:
-        """Impairment in the notation of a scenario."""
         shown = [f"{number:.5g}" for number in self.numbers]
         if correlation_s and self.name != "constant":
             shown.append(f"correlation_s={correlation_s:.3g}")
@@ -97,9 +92,7 @@ def _normal(delay_s: Array) -> Found:
 
 
 def _with_least(delay_s: Array, name: str) -> Found:
-    """Gamma or lognormal distribution beyond a least delay; the best least delay is found by
-    trial.
-    """
+    """Gamma or lognormal distribution beyond the best least delay, which is found by trial."""
     first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
     law = _gamma if name == "gamma" else _lognormal
     below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)
@@ -112,7 +105,7 @@ def _with_least(delay_s: Array, name: str) -> Found:
 
 
 def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best lognormal distribution beyond
+    """Log-likelihood, mean and standard deviation of the best lognormal distribution over
     `least_s`.
     """
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
@@ -124,9 +117,7 @@ def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best gamma distribution beyond
-    `least_s`.
-    """
+    """Log-likelihood, mean and standard deviation of the best gamma distribution over `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     count, mean, mean_log = len(over), float(np.mean(over)), float(np.mean(np.log(over)))
 
@@ -140,8 +131,8 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Least delay plus a Poisson number of slots, with a normal error; None without visible
-    slots.
+    """Least delay plus a Poisson number of slots, with a normal error; None if no slots are
+    visible.
     """
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
@@ -172,7 +163,7 @@ def _paper(delay_s: Array) -> Found | None:
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Log-likelihood of the Poisson distribution if `before` slots below the smallest delay are
+        """Log-likelihood of the Poisson distribution if `before` slots below the least delay are
         empty.
         """
         counts, times = np.unique(places + before, return_counts=True)
@@ -228,9 +219,7 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
 
 
 def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
-    """Log-likelihood as a function of the share; the second argument is the logarithm of the cell
-    length.
-    """
+    """Log-likelihood as a function of the share; `cell` is the logarithm of the cell length."""
     return likelihood(share, exp(cell))
 
 

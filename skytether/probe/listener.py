@@ -46,7 +46,6 @@ HISTORY_MAX = 65_536
 HOLD_NS = 200 * MILLISECOND_NS
 """Time to wait for the rest of a train after each of its packets [ns]."""
 _ARRIVALS_MAX = PAYLOAD_BYTES_MAX // 12
-"""Most arrivals that fit an answer."""
 
 
 @dataclass(slots=True)
@@ -54,11 +53,9 @@ class HeldPacket:
     """Packet of a train whose answer waits for the rest of the train."""
 
     number: int
-    """Number of the packet's arrival."""
     call: GateCall
     peer: Address
     size: int
-    """Size of the datagram [B]."""
 
 
 @dataclass(slots=True)
@@ -68,9 +65,7 @@ class ProbeSession:
     heard_ns: int
     """Time of the newest probe."""
     host: str
-    """Host of the prober."""
     logged: int = 0
-    """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
     train: list[HeldPacket] = field(default_factory=list)
@@ -181,7 +176,6 @@ class Listener(Endpoint):
             self._answer(session, probe.session, waits, now_ns)
 
     def _release(self, session: ProbeSession, name: bytes, now_ns: int) -> None:
-        """Answer all packets of a train."""
         for each in session.train:
             self._answer(session, name, each, now_ns)
         session.train.clear()
@@ -204,7 +198,6 @@ class Listener(Endpoint):
                 self._release(session, name, now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which an incomplete train is answered."""
         return min(
             (each.train_ns + HOLD_NS for each in self._sessions.values() if each.train),
             default=None,

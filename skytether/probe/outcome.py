@@ -26,10 +26,7 @@ reordering is called ordered.
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
-    """Fitted model, for the output."""
-
     text: str
-    """Impairment in the notation of a scenario."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
@@ -42,20 +39,16 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     copies: int
     """Duplicate arrivals, those of trains included."""
     loss: float
-    """Share of the packets that were lost."""
     loss_low: float
     loss_high: float
     """Bounds of the 95 % interval of the loss."""
     bursts: int
-    """Number of runs of lost packets."""
     burst_packets: float
     """Mean length of a run [packets]."""
     reordered: float
     """Share of packets that arrived after one sent later."""
     mean_s: float
-    """Mean one-way delay."""
     sd_s: float
-    """Standard deviation of the delay."""
     quantiles_s: dict[str, float]
     """Quantiles of the delay, by probability."""
     correlation: list[tuple[float, float]]
@@ -74,7 +67,6 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     delay_models: list[ModelFigures]
     """Models of the delay, without the transmission time at the rate, the best first."""
     loss_models: list[ModelFigures]
-    """Models of the losses, the best first."""
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
 
@@ -86,15 +78,13 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """Content of a log; empty for a measurement. Both directions get its delays, or half of its
-    round-trip times.
+    """Content of a log; empty for a measurement. Both directions get half of its round-trip times,
+    or its one-way delays.
     """
     seconds: float
-    """Length of the measurement."""
     bytes: int
     """UDP payload of a packet [B]; 0 if a log does not have it."""
     every_s: float
-    """Time between two packets."""
     offset_s: float
     """Offset of the listener's clock at the first probe."""
     offset_doubt_s: float
@@ -102,26 +92,24 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     drift_ppm: float
     """Drift of the listener's clock; 0 if none is significant."""
     drift_doubt_ppm: float
-    """Standard error of the drift."""
     round_trip_mean_s: float
     """Mean round-trip time, which depends on no clock offset."""
     round_trip_least_s: float
     """Sum of both least delays."""
     unreported: int
-    """Arrivals that the listener dropped before it could report them, or packets in captures that
-    are left out.
+    """Arrivals that the listener dropped before it could report them, or captured packets left
+    out.
     """
     uplink: DirectionFigures
-    """Direction from the listener to the prober."""
+    """From the listener to the prober."""
     downlink: DirectionFigures
-    """Direction from the prober to the listener."""
+    """From the prober to the listener."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeOutcome:
     clocks: Clocks
     delays: Mapping[str, Delays]
-    """Packets of the uplink and of the downlink."""
     told: PathFigures
 
 

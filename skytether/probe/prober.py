@@ -40,7 +40,6 @@ BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 PROBES_MAX = 1_000_000
 """Most probes: as many as a trace has rows."""
 TRAIN = 16
-"""Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
 """Number of regular probe slots that a train takes: twice its number of packets."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
@@ -48,7 +47,6 @@ TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 HELLO_BYTES = 64
 """Size of a HELLO without keys: its WELCOME is shorter [B]."""
 PATIENCE_NS = 10 * SECOND_NS
-"""Longest wait for a first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
 """Shortest and longest wait for the last answers [ns]; between them, twice the longest round-trip
@@ -70,26 +68,22 @@ class Way:
     came_ns: Longs
     """Time of arrival, on the receiver's clock; 0 for a lost packet; shape (n,)."""
     came: Flags
-    """Whether each packet arrived; shape (n,)."""
     train: Longs
     """Number of each packet's train, -1 for a packet sent alone; shape (n,)."""
     copies: int
-    """Number of duplicate arrivals."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
     downlink: Way
-    """Packets from the prober to the listener, as from a vehicle to the server."""
+    """From the prober to the listener, as from a vehicle to the server."""
     uplink: Way
-    """Packets from the listener to the prober."""
+    """From the listener to the prober."""
     size: int
-    """UDP payload of each packet [B]."""
     period_ns: int
-    """Time between two probes."""
     unreported: int
-    """Arrivals that the listener dropped before it could report them, or packets in captures that
-    are left out.
+    """Arrivals that the listener dropped before it could report them, or captured packets left
+    out.
     """
 
 
@@ -129,17 +123,14 @@ class Prober(Endpoint):
         self._hello_ns = 0
         self._began_ns: int | None = None
         self._zero_ns = 0
-        """Time of the first probe."""
         self._slot = 0
         """Place on the grid of the next probe."""
         self._over_ns: int | None = None
         """Time at which the last probe was sent; None before."""
         self._longest_ns = 0
-        """Longest round-trip time so far."""
         self.refused = False
         """Whether the listener has refused, because it serves SESSIONS_MAX."""
         self.failed = False
-        """Whether the listener has not answered in time."""
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
         self._logged_number, self._logged_ns = array("q"), array("q")
@@ -188,7 +179,6 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        """Store the arrivals in an answer."""
         # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)

@@ -32,7 +32,6 @@ UDP = 17
 
 
 def is_capture(content: bytes) -> bool:
-    """Whether a file is a pcap or pcapng file."""
     return content[:4] in {*CAPTURES, CAPTURES_NEW}
 
 
@@ -117,7 +116,7 @@ def _as_sent(near: Packets, far: Packets) -> tuple[Packets, Packets]:
 
 
 def _ahead_ns(near: Packets, far: Packets) -> float:
-    """Far time minus near time of the packets of a direction: the median [ns].
+    """Far time minus near time of the packets of a direction: the median.
 
     Raises:
         ValueError: fewer than two packets are in both captures.
@@ -164,7 +163,6 @@ def _way(sent: Packets, came: Packets) -> tuple[Way, int]:
 
 
 def _directions(content: bytes) -> Mapping[Ends, Packets]:
-    """UDP packets of a capture, by sender and receiver."""
     flows = defaultdict[Ends, Packets](list)
     for number, (time_ns, link, frame) in enumerate(_records(content)):
         if number >= RECORDS_MAX:

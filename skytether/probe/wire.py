@@ -33,7 +33,6 @@ NO_NUMBER = 2**32 - 1
 """Number in a PROBE that only asks for arrivals, and in its ANSWER."""
 
 _ARRIVAL = Struct("<IQ")
-"""Arrival: number of the PROBE, and the listener's time [ns]."""
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
 
 
@@ -47,7 +46,6 @@ class ProbeWelcome(NamedTuple):
     """WELCOME: the listener grants or refuses a session."""
 
     nonce: bytes
-    """Nonce of the HELLO that is answered."""
     cookie: bytes
     room: bool
     """Whether the listener grants the session."""

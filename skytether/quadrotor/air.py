@@ -22,8 +22,6 @@ ROOT_3 = 1.7320508075688772
 
 
 class Air(NamedTuple):
-    """Wind, and the state of its gust filters."""
-
     steady: F1
     """Velocity of the steady wind [m/s; north, east, down]; shape (3,)."""
     turbulence: F1

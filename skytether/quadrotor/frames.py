@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """Quadrotor in X configuration; rotors 1 front right, 2 back left, 3 front left, 4 back
+    """Quadrotor in X configuration: rotors 1 front right, 2 back left, 3 front left, 4 back
     right.
     """
 
@@ -36,11 +36,9 @@ class Frame(NamedTuple):
     body_drag: float
     """Drag c of the body over its airspeed squared [N s²/m²]."""
     rotor_lag_s: float
-    """Time constant of a rotor's speed [s]."""
     rotor_max: float
     """Largest speed of a rotor with a full battery [rad/s]."""
     cells: int
-    """Cells of the battery, in series."""
     capacity_ah: float
     resistance_ohm: float
     """Internal resistance of the battery [Ω]."""
@@ -51,7 +49,7 @@ class Frame(NamedTuple):
     rate_gain: float
     """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Gain on measured angular acceleration, subtracted from the command to shorten the rotors'
+    """Gain on measured angular acceleration, subtracted from the command to reduce the rotors'
     lag.
     """
 

@@ -47,7 +47,6 @@ class Gains(NamedTuple):
     integral_max: float
     """Largest acceleration from an integral [m/s²]."""
     tilt_max: float
-    """Largest tilt [rad]."""
 
 
 ARDUPILOT = Gains(
@@ -134,7 +133,6 @@ class Quad(NamedTuple):
 
 @inline
 def clipped(value: float, most: float) -> float:
-    """Value clipped to -most … most."""
     return min(max(value, -most), most)
 
 

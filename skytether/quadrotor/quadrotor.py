@@ -20,8 +20,6 @@ UP = np.array([1.0, 1.0, -1.0])
 
 
 class Attitude(NamedTuple):
-    """Attitude and rates of the body."""
-
     roll: float
     """To the right [rad]."""
     pitch: float
@@ -34,11 +32,11 @@ class Attitude(NamedTuple):
 
 class Battery(NamedTuple):
     charge: float
-    """Remaining charge, from 1 to 0."""
+    """From 1 to 0."""
     voltage: float
-    """[V]."""
+    """Unit: V."""
     current: float
-    """[A]."""
+    """Unit: A."""
 
 
 class Quadrotor:
@@ -69,7 +67,6 @@ class Quadrotor:
         self.gains = gains
         self._ground = np.inf if ground_m is None else -ground_m
         self.on = hovers
-        """Whether the rotors turn."""
         x = np.zeros(STATES)
         x[:3], x[6] = UP * position, 1.0
         x[13:] = frame.hover if hovers else 0.0
@@ -137,7 +134,6 @@ class Quadrotor:
         return Battery(max(charge, 0.0), voltage, current)
 
     def discharge(self, charge: float) -> None:
-        """Set the battery's charge to a lower value."""
         self._quad.battery[0] = min(self._quad.battery[0], charge)
 
     def stands(self) -> bool:

@@ -25,7 +25,6 @@ from typing import Any
 from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
-"""Most datagrams in one call."""
 NEAR_NS, READINGS = 5_000, 4
 """Longest time between two readings of a clock for them to count as simultaneous [ns], and number
 of attempts.
@@ -33,7 +32,7 @@ of attempts.
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
-"""Most datagrams that are sent as one; older kernels refuse more."""
+"""Most datagrams sent as one; older kernels refuse more."""
 SEGMENTED_BYTES_MAX = 65_000
 """Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
@@ -85,7 +84,6 @@ def pack_address(address: tuple[str, int] | tuple[str, int, int, int]) -> RawAdd
 
 
 def unpack_address(raw: RawAddress) -> tuple[str, int] | tuple[str, int, int, int]:
-    """Address in the form that `socket.recvfrom` returns."""
     if len(raw) == _IPV4.size:
         _, port, number = _IPV4.unpack(raw)
         return socket.inet_ntop(socket.AF_INET, number), socket.ntohs(port)
@@ -130,7 +128,7 @@ class _Headers:
         """Sizes of the control data [B]; the kernel lowers each to what it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
-        """Arrival times by CLOCK_REALTIME: seconds, and nanoseconds beyond them; each of shape
+        """Arrival times by CLOCK_REALTIME: seconds, and nanoseconds beyond them; shape
         (BATCH_MAX,).
         """
 
@@ -142,9 +140,6 @@ def _address(room: bytearray | mmap.mmap) -> int:
 
 class DatagramBatch:
     """Preallocated arrays with which all sockets of one family receive and send.
-
-    Args:
-        family: AF_INET or AF_INET6.
 
     Raises:
         OSError: this system has no such calls.

@@ -42,7 +42,6 @@ from skytether.shell.udp import (
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
 """Exit codes: 2 the request is impossible, 1 something failed on the way, 130 ended by Ctrl-C."""
 OUTPUTS = ("json", "figure", "record")
-"""Options that name an output file, in any command."""
 
 ScenarioName = Annotated[str, Argument(metavar="SCENARIO", positional=True)]
 ScenarioFlags = Annotated[Scenario, Argument(name="")]
@@ -59,8 +58,6 @@ Plugins = Annotated[
 
 @dataclass(frozen=True)
 class ScenarioOptions:
-    """Options of a command that flies a scenario."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     plugin: Plugins = ()
@@ -133,11 +130,7 @@ def parse(
 
 
 def address(flag: str, text: str) -> Address:
-    """Address given to a flag as HOST:PORT, with an IPv6 host in brackets.
-
-    Raises:
-        CommandError: the text is no address.
-    """
+    """Address given to a flag as HOST:PORT, with an IPv6 host in brackets."""
     found = parse_address(text)
     if found is None:
         raise CommandError(f"{flag}: got {text!r}, expected {HOST_PORT}", CONFIGURATION)
@@ -145,38 +138,27 @@ def address(flag: str, text: str) -> Address:
 
 
 def flight_warnings(scenario: Scenario) -> list[Event]:
-    """Warnings for the operator before a flight."""
     return [NoFailsafe()] if scenario.vehicle.exhausted == "hold" else []
 
 
 def optional_address(flag: str, text: str | None) -> Address | None:
-    """Address given to a flag, see `address`; None for a flag that was not given."""
     return None if text is None else address(flag, text)
 
 
 def check_count(flag: str, given: int, most: int) -> None:
-    """Refuse a count that is less than 1 or more than `most`.
-
-    Raises:
-        CommandError: names the flag, its value and the range.
-    """
+    """Refuse a count outside 1 to `most`."""
     if not 1 <= given <= most:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
 
 
 def check_sealed(bind: Address, *, secure: bool) -> None:
-    """Refuse to run without keys at an address that other machines can reach.
-
-    Raises:
-        CommandError: names the options that allow it.
-    """
+    """Refuse to run without keys at an address that other machines can reach."""
     with suppress(OSError):  # an unusable address is reported when the socket is bound
         if not (secure or is_loopback(look_up(bind))):
             raise unsealed(bind)
 
 
 def unsealed(*addresses: Address) -> CommandError:
-    """Error for a process without keys at addresses that other machines can reach."""
     at = ", ".join(address_text(*address) for address in addresses)
     expected = "expected --keys FILE (see skytether keygen), or --insecure"
     message = f"{at}: other machines can reach it and there are no keys, {expected}"
@@ -184,10 +166,8 @@ def unsealed(*addresses: Address) -> CommandError:
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Raise this process's limit of open files so that it can open so many sockets.
-
-    Raises:
-        CommandError: the system does not allow as many open files.
+    """Raise this process's limit of open files for so many sockets; refuse more than the system
+    allows.
     """
     most = sockets_max()
     if given > most:
@@ -235,9 +215,7 @@ def _claim(claim: Callable[[Path], object], flag: str, path: Path | None) -> Non
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Handle Ctrl-C and SIGTERM inside the block; yields a function that says whether one has
-    come.
-    """
+    """Handle Ctrl-C and SIGTERM inside the block; yields a function that says if one has come."""
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
@@ -287,11 +265,6 @@ def _reason(error: OSError) -> str:
 
 
 def write(path: Path, json: bytes) -> None:
-    """Write JSON to a file, indented.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     try:
         files.write(path, msgspec.json.format(json, indent=2) + b"\n")
     except OSError as error:

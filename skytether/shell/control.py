@@ -23,13 +23,11 @@ from skytether.shell.journal import Journal
 from skytether.shell.local import Local
 
 REST_S = 0.01
-"""Shortest pause after a request [s]."""
 RESTS = 20
 """Smallest ratio of the pause to the time that the request took: requests take at most 1/21 of the
 endpoint's time.
 """
 PATIENCE_S = 5.0
-"""Longest time to wait for an answer [s]."""
 ANSWER_BYTES_MAX = 65_536
 
 
@@ -103,7 +101,6 @@ class Control:
                 loop.call_soon_threadsafe(self._go_on, fault)
 
     def _go_on(self, fault: str) -> None:
-        """Continue after the journal was written, or could not be (`fault`)."""
         if fault:
             self._running.tell(NotKept(reason=fault))
         if self._loop is not None:
@@ -200,11 +197,6 @@ _DECODER = msgspec.json.Decoder(Answer)
 
 
 def answer_of(text: bytes) -> Answer:
-    """Decode an answer.
-
-    Raises:
-        ControlError: the datagram is no answer.
-    """
     try:
         return _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

@@ -62,10 +62,7 @@ RESOLVE_EVERY_S = 2.0
 
 @dataclass(slots=True)
 class Arrivals:
-    """Count of datagrams at a socket of an endpoint with `patience_ns`."""
-
     since_ns: int
-    """Start of the count [ns]."""
     count: int = 0
 
 
@@ -129,30 +126,25 @@ class Shell:
             admit_only(bound, forms)
         self._sockets = {0: bound}
         self._stream: ByteStream | None = None
-        """Stream that serves as socket 1; None without a line."""
         if line is not None:
             with contextlib.ExitStack() as failed:
                 failed.enter_context(bound)
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer for every datagram: copying out of it is faster than allocating a buffer of full
-        size.
+        """One buffer for all datagrams: copying out of it is faster than allocating one for
+        each.
         """
         self._batches: dict[int, DatagramBatch | None] = {}
-        """Arrays by address family; None where the system has no batch calls."""
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
-        """Counts by socket number, if the endpoint has `patience_ns`."""
         self._crowded: dict[int, DatagramBatch] = {}
         """Arrays by the number of each socket that is read in batches."""
         self._heard_ns = 0
         """Newest time that the endpoint was given [ns]; times must not decrease."""
         self._woken_ns = 0
-        """Time of the endpoint's last wake [ns]."""
         self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
-        """Address of socket 0."""
 
     @property
     def is_local(self) -> bool:
@@ -162,7 +154,6 @@ class Shell:
         return is_loopback(self.address) and is_loopback(self._elsewhere)
 
     def _add(self, line: Line) -> None:
-        """Use a line as socket 1."""
         if line.kind in ("tcp", "serial"):
             self._stream = ByteStream(line, self._hear_line)
         elif line.kind == "udp":
@@ -219,7 +210,6 @@ class Shell:
                 task.cancel()
 
     def kernel_drops(self) -> int:
-        """Datagrams that the kernel dropped, see `shell.udp.kernel_drops`."""
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
@@ -282,7 +272,6 @@ class Shell:
         self._slices.set(now_ns + self._patience_ns)
 
     def _hear_slice(self) -> None:
-        """Hand over the datagrams at crowded sockets, at the end of a slice of time."""
         try:
             self._read_slice()
         finally:
@@ -321,7 +310,6 @@ class Shell:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
     def _batch(self, sock: socket) -> DatagramBatch | None:
-        """Arrays of the socket's family, allocated at first use."""
         if sock.family not in self._batches:
             try:
                 self._batches[sock.family] = DatagramBatch(sock.family)
@@ -377,7 +365,6 @@ class Shell:
             self._after()
 
     def _changed(self) -> None:
-        """Continue after a change of keys, which gave the endpoint the present time."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 
@@ -419,9 +406,7 @@ class Shell:
                     self._send(datagram)
 
     def _send_together(self, row: Sequence[Datagram]) -> int:
-        """Send datagrams of one socket in few calls; returns how many were sent, from the first
-        on.
-        """
+        """Send datagrams of one socket in few calls; returns how many were sent."""
         sock = self._sockets.get(row[0].socket)
         if sock is None:
             return 0
@@ -462,7 +447,6 @@ class Shell:
             self._learn(await found)
 
     def _learn(self, addresses: dict[Address, Address]) -> None:
-        """Use these addresses of peers from now on; report those that were missing before."""
         late = [
             (host, addresses[host, port][0])
             for host, port in self._names.missing.keys() & addresses

@@ -35,12 +35,9 @@ from skytether.shell.web import HEADERS, host_name, is_ours
 CONNECTIONS_MAX = 8
 """Most connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
-"""Longest time for a request and its answer [s]."""
 REQUEST_BYTES_MAX = 8192
 POLL_S = 0.1
-"""Interval at which connections that take too long are closed [s]."""
 REST_S = 0.02
-"""Pause between two accepted connections [s]."""
 FRESH_S = 3.0
 """Age from which figures count as stale, and the process as stuck [s]."""
 BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"
@@ -55,8 +52,6 @@ class Collected(Collector):
 
     Args:
         process: server, netem or client; `server.N` is worker N of a server.
-        scenario: name of the scenario.
-        step_s: length of a step [s].
     """
 
     def __init__(self, process: str, scenario: str, step_s: float) -> None:
@@ -71,7 +66,6 @@ class Collected(Collector):
         self._snapshot = figures, time.monotonic()
 
     def collect(self) -> Iterable[Exposed]:
-        """Metrics; called by prometheus_client."""
         labels = {"process": self._process, "scenario": self._scenario}
         info, step_s, age_s, unmapped = (metric.exposed() for metric in OWN)
         info.add_sample(info.name, labels, 1.0)
@@ -86,7 +80,6 @@ class Collected(Collector):
         yield from (age_s, unmapped, *told)
 
     def trouble(self) -> str:
-        """Reason why the process is unhealthy; empty for a healthy process."""
         if self._snapshot is None:
             return "it has not begun"
         figures, taken_s = self._snapshot
@@ -96,23 +89,15 @@ class Collected(Collector):
         return trouble(self._kind, figures)
 
     def health(self) -> tuple[str, bytes]:
-        """Status and body of the answer to a health check."""
         why = self.trouble()
         answer = {"process": self._process, "healthy": not why, "trouble": why}
         return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(answer) + b"\n"
 
 
 class _Bounded(io.BufferedReader):
-    """Reader of a request whose total size is bounded."""
-
     left = REQUEST_BYTES_MAX
 
     def readline(self, _: int | None = -1, /) -> bytes:
-        """Read the next line.
-
-        Raises:
-            OSError: the request is too long.
-        """
         line = super().readline(self.left + 1)
         self.left -= len(line)
         if self.left < 0:
@@ -121,7 +106,7 @@ class _Bounded(io.BufferedReader):
 
 
 class _Handler(WSGIRequestHandler):
-    """Handler of a request; error answers have the common headers, too."""
+    """Handler of a request, whose error answers have the common headers, too."""
 
     def setup(self) -> None:
         super().setup()
@@ -154,14 +139,12 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self.socket.close()
         self.socket = listening
         self.address = from_kernel(listening.getsockname())
-        """Address at which the server listens."""
         # set here, because `server_bind` would look the name up in the DNS
         self.server_name, self.server_port = self.address
         self.setup_environ()
         self.set_app(self._answer)
         self._collected = collected
         self._name = address[0].lower()
-        """Name that `--metrics` gives this machine."""
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
         self._connections: dict[socket.socket, float] = {}
@@ -174,11 +157,9 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self.server_close()
 
     def take(self, figures: Mapping[str, Any]) -> None:
-        """Replace the figures; the caller must not change them afterwards."""
         self._collected.take(figures)
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Next connection, after a pause."""
         time.sleep(REST_S)
         return super().get_request()
 
@@ -196,7 +177,6 @@ class Metrics(ThreadingMixIn, WSGIServer):
                 self._hang_up(connection)
 
     def _hang_up(self, connection: socket.socket) -> None:
-        """Shut a connection down, which its thread notices."""
         self._connections.pop(connection, None)
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
@@ -233,11 +213,6 @@ class Metrics(ThreadingMixIn, WSGIServer):
 
 
 def _listening(address: Address) -> socket.socket:
-    """Listening TCP socket.
-
-    Raises:
-        MetricsError: the address cannot be listened at.
-    """
     try:
         host, port = look_up(address)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

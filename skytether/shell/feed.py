@@ -39,20 +39,16 @@ WAITING_BYTES_MAX = 4 * 1024 * 1024
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Most bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Size of rows after which a frame is full [B]."""
 SEND_BYTES_MAX = 64 * 1024
-"""Most bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
-"""Time for which frames are collected before they are sent [s]."""
 REST_S = 0.02
-"""Pause between two accepted readers [s], so that one that reconnects in a loop costs little."""
+"""Pause between two accepted readers [s], which bounds the cost of one that reconnects in a
+loop.
+"""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until readers have received everything [s]."""
 
 READ_BYTES = 256 * 1024
-"""Most bytes that are read from a feed at a time."""
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process [s]."""
 
 
 class _Part:
@@ -63,11 +59,9 @@ class _Part:
         self.rows: list[bytes] = []
 
     def write(self, rows: bytes) -> None:
-        """Append whole rows."""
         self.rows.append(rows)
 
     def frames(self, now_ns: int) -> Iterator[bytes]:
-        """Frames of all pending rows, which are then no longer pending."""
         rows, self.rows = self.rows, []
         first = size = 0
         for last, piece in enumerate(rows, start=1):
@@ -79,8 +73,6 @@ class _Part:
 
 
 class _Reader:
-    """Connection of a reader, and the bytes queued for it."""
-
     def __init__(self, connection: socket.socket, waiting: bytes) -> None:
         connection.setblocking(False)
         self.connection = connection
@@ -112,7 +104,6 @@ class Feed:
         self._columns: dict[str, np.dtype[np.void]] = {}
         self._parts: list[_Part] = []
         self._fresh: list[bytes] = []
-        """Frames that were not sent yet."""
         self._backlog: deque[bytes] = deque()
         """Newest frames that were sent; each item is one frame, or several."""
         self._backlog_bytes = 0
@@ -125,7 +116,6 @@ class Feed:
         self._dropped = self._refused = 0
 
     def part(self, name: str, columns: np.dtype[np.void]) -> _Part:
-        """Sink for the rows of a new part of the record."""
         self._columns[name] = columns
         self._parts.append(_Part(name))
         return self._parts[-1]
@@ -136,11 +126,7 @@ class Feed:
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Accept readers once the loop runs.
-
-        Args:
-            opened: makes the first frame for a reader.
-        """
+        """Accept readers once the loop runs; `opened` makes the first frame for each."""
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:
@@ -162,7 +148,6 @@ class Feed:
         self._add(encode(Figures(time_ns=time.monotonic_ns(), figures=dict(figures))))
 
     def figures(self) -> dict[str, Any]:
-        """Counters of the feed itself, in the form of `Endpoint.figures`."""
         return {
             "readers": len(self._readers),
             "dropped": self._dropped,
@@ -170,7 +155,6 @@ class Feed:
         }
 
     def end(self) -> None:
-        """Stop serving readers in the loop."""
         if self._loop is None:
             return
         self._loop.remove_reader(self._local.socket)
@@ -222,7 +206,6 @@ class Feed:
             self._backlog_bytes -= len(self._backlog.popleft())
 
     def _go_on(self, reader: _Reader) -> None:
-        """Send a reader more; if its socket is full, the loop continues later."""
         try:
             reader.send()
         except OSError:
@@ -249,7 +232,6 @@ class Feed:
             self._loop.add_reader(self._local.socket, self._let_in)
 
     def _let_in(self) -> None:
-        """Accept the next reader, then pause."""
         assert self._loop is not None
         assert self._opened is not None
         self._loop.remove_reader(self._local.socket)

@@ -24,7 +24,6 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell.command import CONFIGURATION, CommandError
 
 SUFFIX = ".set"
-"""Suffix of a journal's name, after the socket's name."""
 BYTES_MAX = 1_000_000
 DAY_S = 86_400.0
 """Age above which a journal belongs to another flight [s]."""
@@ -36,12 +35,9 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True):
     time_s: float
     """Time of the last change [s; Unix time]."""
     values: dict[str, Any]
-    """Values that were set, by key."""
     digest: str = ""
-    """Digest of the other fields."""
 
     def sealed(self) -> "_Entry":
-        """Copy with its digest filled in."""
         bare = msgspec.structs.replace(self, digest="")
         return msgspec.structs.replace(self, digest=_digest(msgspec.json.encode(bare)))
 
@@ -57,9 +53,7 @@ class Journal:
         self._path, self._base = path, scenario
         self._name = _digest(reading.to_toml(scenario))
         self.values: Mapping[str, Any] = {}
-        """Values set in an earlier run."""
         self.scenario = scenario
-        """The scenario with `values` applied."""
 
     def read(self) -> SettingsRecalled | None:
         """Restore what was set in an earlier run; None if there is no journal.
@@ -83,15 +77,9 @@ class Journal:
         return SettingsRecalled(path=str(self._path), values=dict(entry.values))
 
     def running(self, endpoint: Endpoint) -> Running:
-        """Changeable keys of an endpoint that was made with `self.scenario`."""
         return Running(endpoint, self.scenario, self.values)
 
     def _check(self, entry: _Entry) -> None:
-        """Refuse an entry that is damaged or of another flight.
-
-        Raises:
-            ConfigError: with the reason.
-        """
         if entry != entry.sealed():
             raise ConfigError("it is damaged")
         if entry.scenario != self._name:
@@ -115,11 +103,6 @@ class Journal:
             file.write(msgspec.json.encode(entry))
 
     def forget(self) -> None:
-        """Remove the journal, for a new flight.
-
-        Raises:
-            CommandError: the file cannot be removed.
-        """
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:
@@ -131,10 +114,9 @@ class TakenUp(NamedTuple):
     """Scenario of a process that starts, with what was set in an earlier run."""
 
     journal: Journal | None
-    """Journal for changes to come; None without a control socket."""
+    """None without a control socket."""
     scenario: Scenario
     news: list[Event]
-    """Events that report which values are in force again."""
 
 
 def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
@@ -144,9 +126,6 @@ def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> Ta
         control: path of the control socket; None without one.
         scenario: scenario that the process is started with.
         new_flight: whether to discard values that were set before.
-
-    Raises:
-        CommandError: the journal cannot be used.
     """
     if control is None:
         return TakenUp(None, scenario, [])

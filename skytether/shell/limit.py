@@ -12,8 +12,6 @@ KIND_MAX = 5
 
 @dataclass(slots=True)
 class _Second:
-    """Count of events of a kind during one second, which begins with the first of them."""
-
     end_ns: int
     logged: int = 0
     omitted: int = 0
@@ -49,8 +47,8 @@ class Limit:
         """Counts of events omitted in the seconds that are over, each returned once.
 
         Args:
-            kinds: kinds to look at; if empty, all.
-            now_ns: present time; None ends every second.
+            kinds: if empty, all.
+            now_ns: None ends every second.
         """
         told = []
         for kind in kinds or tuple(self._seconds):

@@ -56,7 +56,7 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
     """Remove a socket of this user at which no process listens; leave anything else alone.
 
     Raises:
-        OSError: the socket cannot be removed, or the path is in use.
+        OSError: the path is in use.
     """
     try:
         found = path.lstat()

@@ -20,18 +20,14 @@ from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 256 * 1024
-"""Most bytes of lines that wait to be written."""
 TOGETHER_BYTES = 4096
 """Most bytes in one write: PIPE_BUF, which a pipe takes whole even with several writers."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until all lines are written [s]."""
 
 LogFormat = Literal["text", "json"]
 
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
-    """Line of a JSON log."""
-
     process: str
     """Server, netem or client; `server.N` is worker N of a server."""
     time_ns: int
@@ -41,7 +37,6 @@ class LogLine(msgspec.Struct, frozen=True, kw_only=True):
 
 _DECODER = msgspec.json.Decoder(LogLine)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors of the decoder for text that is no log line."""
 
 
 def line_of(text: bytes) -> LogLine | None:
@@ -70,7 +65,6 @@ class Log:
         self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
-        """Number of lines dropped because the queue was full, and not reported yet."""
 
     def hear(self, event: Event) -> None:
         """Log an event of an endpoint, within the limit of each kind."""
@@ -96,7 +90,6 @@ class Log:
                 self._unread = before
 
     def close(self) -> None:
-        """Wait at most PATIENCE_S until all lines are written."""
         self._writer.close(PATIENCE_S)
 
     def _lines(self, event: Event) -> list[bytes]:
@@ -133,7 +126,6 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
 
 
 def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures without cumulative histograms, which only monitoring programs need."""
     return {
         name: _for_people(value) if isinstance(value, Mapping) else value
         for name, value in figures.items()
@@ -142,7 +134,6 @@ def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
-    """Groups with the same names, a column each."""
     flat = [_flat(group) for group in groups.values()]
     names = dict.fromkeys(name for each in flat for name in each)
     table = [
@@ -158,7 +149,6 @@ def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
 
 
 def _flat(group: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Numbers of a group and of its nested groups, by names joined by spaces."""
     flat: dict[str, Any] = {}
     for name, value in group.items():
         inner = isinstance(value, Mapping)

@@ -29,7 +29,6 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 AGAIN_S = 1.0
-"""Time after which a failed write is tried again [s]."""
 
 
 class MemoryRefused(ValueError):
@@ -37,8 +36,6 @@ class MemoryRefused(ValueError):
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """Content of a memory file, with its owner and the time of writing."""
-
     host: str
     """Boot id of the host; empty if the system has none."""
     written_ns: int
@@ -87,13 +84,12 @@ class MemoryFile:
                 raise
             raise OSError(f"{path}: another process keeps its memory there") from None
         self._wanted: bytes | None = None
-        """Content to be written next."""
         self._changed = threading.Condition()
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._told = ""
-        """Reason why the newest content could not be written, and the reason reported last; empty
-        if it was written.
+        """Reasons why the newest content could not be written, and the one reported last; "" if it
+        was.
         """
 
     @property
@@ -136,17 +132,11 @@ class MemoryFile:
         return blake2b(body, key=self._secret, digest_size=DIGEST_BYTES, person=b"memory").digest()
 
     def sealed(self, content: bytes, written_ns: int) -> bytes:
-        """Content of the file with its header and digest."""
         envelope = _Envelope(self._host, written_ns, self._identity, content)
         body = msgspec.msgpack.encode(envelope)
         return MAGIC + self._digest(body) + body
 
     def forget(self) -> None:
-        """Remove the file, for a new flight.
-
-        Raises:
-            OSError: the file cannot be removed.
-        """
         self._path.unlink(missing_ok=True)
 
     # -- in flight -----------------------------------------------------------------------------
@@ -158,7 +148,6 @@ class MemoryFile:
         self._thread.start()
 
     def look(self) -> None:
-        """Fetch new content from the endpoint, for the thread to write."""
         now_ns = time.monotonic_ns()
         content = self._endpoint.keep(now_ns=now_ns)
         if content is not None:
@@ -167,9 +156,7 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Event that says why the file cannot be written; None if it can, or was reported
-        before.
-        """
+        """Event that says why the file cannot be written; None if it can, or that was reported."""
         failure, told = self._failure, self._told
         self._told = failure
         return NotKept(reason=failure) if failure and failure != told else None
@@ -213,7 +200,6 @@ class MemoryFile:
                     self._loop.call_soon_threadsafe(self._tell)
 
     def _tell(self) -> None:
-        """Acknowledge to the endpoint that its newest content is written."""
         if self._wanted is None:
             self._endpoint.kept()
 

@@ -13,7 +13,6 @@ from skytether.shared.wire.protocol import Mode
 
 PREFIX = "skytether_"
 UNITS = {"_ms": 1e-3, "_ns": 1e-9}
-"""Units in figures' names, and their factors to the metrics' base units."""
 
 
 class Metric(NamedTuple):
@@ -24,14 +23,12 @@ class Metric(NamedTuple):
     matches any name, which becomes the value of that label.
     """
     name: str
-    """Name without the prefix."""
     labels: Mapping[str, str]
     """Fixed labels, which separate figures of the same metric."""
     help: str
 
     @property
     def kind(self) -> str:
-        """Type of the metric: counter, histogram, summary or gauge."""
         if self.name.endswith("_total"):
             return "counter"
         if "{le}" in self.figure:
@@ -40,11 +37,9 @@ class Metric(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Factor from the figure's unit to the metric's."""
         return next((scale for unit, scale in UNITS.items() if unit in self.figure), 1.0)
 
     def exposed(self) -> Exposed:
-        """Metric for prometheus_client, without samples."""
         # prometheus_client adds the suffix of a counter's name itself.
         return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
 
@@ -243,7 +238,6 @@ LEFT_OUT = {
         "by_vehicle/{vehicle}/autopilot/mode",  # its number is exported
     ),
 }
-"""Figures that are deliberately not exported."""
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:

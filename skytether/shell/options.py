@@ -27,7 +27,6 @@ from skytether.shell import plugins
 T = TypeVar("T")
 
 HELP_KEYS = "--help-keys"
-"""Flag that shows the help with every key of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,6 @@ class Argument:
     flags themselves.
     """
     metavar: str | None = None
-    """Placeholder for the value in the help."""
     help: str | None = None
     """Text of the help, if different from the field's docstring."""
     positional: bool = False
@@ -109,7 +107,6 @@ def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str,
 
 
 def _slipped(flag: str) -> bool:
-    """Whether an unknown flag resembles a top-level key of the scenario."""
     import difflib  # slow to import, and needed only after a typing error
 
     keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
@@ -190,7 +187,6 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 
 
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
-    """Fields of options by flag, and the positional ones."""
     flags, positional = {}, []
     for name, hint in _hints(options).items():
         argument = _argument(hint) or Argument()

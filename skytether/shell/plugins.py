@@ -37,12 +37,9 @@ GROUPS = {
     "skytether.vehicles": VEHICLES,
     "skytether.impairments": IMPAIRMENTS,
 }
-"""Tables that plug-ins extend, by group of entry points."""
 
 
 class Plugin(NamedTuple):
-    """Plug-in that is a file."""
-
     path: str
     """Absolute path, which is also the name of its module."""
     code: bytes
@@ -57,9 +54,7 @@ def named(argv: Sequence[str]) -> list[str]:
 
 
 def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
-    """Values of a flag on a command line, and the line without them; a flag without a value stays
-    in it.
-    """
+    """Values of a flag on a command line, and the line without them; a flag without value stays."""
     words, values, rest = deque(argv), list[str](), list[str]()
     while words:
         word = words.popleft()
@@ -95,15 +90,12 @@ def loaded() -> tuple[Plugin, ...]:
 
 
 def flags() -> list[str]:
-    """Command-line arguments with which a child process loads the same plug-ins."""
     return [word for path in _loaded for word in (FLAG, path)]
 
 
 def use(plugins: Iterable[Plugin]) -> None:
-    """Import installed plug-ins, and files read already, perhaps by another process.
-
-    Raises:
-        ConfigError: see `load`.
+    """Import installed plug-ins, and files read already, perhaps by another process; raises as
+    `load`.
     """
     _load_installed()
     for plugin in plugins:
@@ -139,11 +131,6 @@ def _import(plugin: Plugin) -> None:
 
 @cache
 def _load_installed() -> None:
-    """Import the plug-ins of installed packages, found by their entry points.
-
-    Raises:
-        ConfigError: see `load`.
-    """
     if not any(_mention_groups(Path(folder)) for folder in sys.path):
         return
     from importlib import metadata  # takes 0.1 s to import
@@ -162,7 +149,6 @@ def _load_installed() -> None:
 
 
 def _mention_groups(folder: Path) -> bool:
-    """Whether a package in a site-packages folder has entry points of ours."""
     words = [f"[{group}]".encode() for group in GROUPS]
     for points in folder.glob("*-info/entry_points.txt"):
         with suppress(OSError):
@@ -188,14 +174,7 @@ def _tables(where: str) -> Iterator[None]:
 
 
 def _guarded(run: Callable[[], Any], where: str, path: str = "") -> Any:
-    """Run a plug-in's code; any exception becomes an error of one line.
-
-    Args:
-        path: the plug-in's file, for the line number.
-
-    Raises:
-        ConfigError: the code raised an exception.
-    """
+    """Run a plug-in's code; any exception becomes a ConfigError of one line."""
     try:
         return run()
     except ConfigError:

@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ProcessOptions(ScenarioOptions):
-    """Options of every process."""
-
     log: LogFormat = "text"
     """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
@@ -80,11 +78,7 @@ class ProcessOptions(ScenarioOptions):
 
 @contextmanager
 def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a file; if the disk fails in flight, the flight goes on and the command fails.
-
-    Raises:
-        CommandError: the file cannot be opened, or is incomplete at the end.
-    """
+    """Record into a file; if the disk fails in flight, the flight goes on and the command fails."""
     try:
         growing = files.Growing(path, buffering=0)
     except OSError as error:
@@ -98,11 +92,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; if none can be created, nothing is recorded.
-
-    Raises:
-        CommandError: the file is incomplete at the end.
-    """
+    """Record into a temporary file; if none can be created, nothing is recorded."""
     file: BinaryIO | OSError
     try:
         temporary = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - the recording closes it
@@ -122,22 +112,16 @@ def _until_the_end(recording: RecordFile) -> Iterator[RecordFile]:
 
 @dataclass(slots=True)
 class Process:
-    """One endpoint as a process; `begin` makes it."""
-
     name: str
-    """Name in its log."""
     options: ProcessOptions
     secure: bool | None
     """Whether the endpoint has keys; None for netem, which only forwards datagrams."""
     scenario: Scenario
-    """The scenario, with what was set in an earlier run."""
     journal: Journal | None
     warnings: list[Event]
-    """Warnings and news for the operator, logged at the start."""
     recording: RecordFile | None
     """File of its rows; the process waits at the end until they are written."""
     feed: Feed | None
-    """Feed of its rows and events."""
     recorder: Recorder | None
     """Recorder of its rows, for a file, a feed or both; None for neither."""
 
@@ -167,9 +151,6 @@ class Process:
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
-
-        Raises:
-            CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
         """
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
@@ -263,8 +244,7 @@ def begin(
     warnings: Sequence[Event] = (),
     keeps_rows: bool = False,
 ) -> Iterator[Process]:
-    """Restore what was set in an earlier run, and open record and feed for the duration of the
-    block.
+    """Restore what was set in an earlier run, and open record and feed during the block.
 
     Args:
         name, options, secure, warnings: see `Process`.
@@ -308,11 +288,7 @@ def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.vo
 
 @contextmanager
 def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]:
-    """Serve metrics over HTTP during the block; None without an address.
-
-    Raises:
-        CommandError: the address cannot be listened at.
-    """
+    """Serve metrics over HTTP during the block; None without an address."""
     if options.metrics is None:
         yield None
         return
@@ -330,7 +306,6 @@ def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]
 
 
 def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
-    """Function that makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
     return lambda: Opened(
         process=process,
@@ -347,9 +322,6 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
     """Open a feed during the block; None if neither a feed nor a recording is requested.
 
     A recording (.mcap) is written from the feed by another process.
-
-    Raises:
-        CommandError: the socket cannot be created, or the recording is incomplete at the end.
     """
     record = options.record if options.record and options.record.suffix == RECORDING else None
     if not (options.feed or record):
@@ -374,9 +346,7 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
 
 @contextmanager
 def _told_once() -> Iterator[Callable[[], None]]:
-    """Handle SIGINT and SIGTERM once: after the yielded function was called, later ones are
-    ignored.
-    """
+    """Handle SIGINT and SIGTERM until the yielded function is called; then ignore them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def ignore() -> None:

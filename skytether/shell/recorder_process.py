@@ -17,25 +17,18 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins, temporary
 
 PATIENCE_S = 30.0
-"""Longest time for a recorder to complete its file [s]."""
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
     """Order to a recorder, sent as one line of JSON on its standard input."""
 
     path: str
-    """File of the recording."""
     feed: str
-    """Socket of the feed."""
     process: str
     name: str
-    """Name of the scenario."""
     scenario: str
-    """The scenario, as TOML."""
     secure: bool
-    """Whether the link is encrypted."""
     plugins: list[str]
-    """Files of plug-ins."""
 
 
 class RecorderError(Exception):

@@ -14,13 +14,9 @@ ROOM_BYTES = 32 * 1024 * 1024
 netem's take three times as much memory.
 """
 TOGETHER_BYTES = 256 * 1024
-"""Most bytes of rows in one write."""
 PAUSE_S = 0.02
-"""Time for which rows are collected before a write [s]; a killed process loses at most this
-much.
-"""
+"""Time for which rows are collected before a write [s], and lost if the process is killed."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end until all rows are written [s]."""
 
 SLOW = "the disk is too slow"
 
@@ -39,7 +35,6 @@ class RecordFile:
         self._file = file
         self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
-        """Recorder that takes the rows; it never blocks and never raises."""
         self._header_bytes = self._writer.offered
         self._ended = False
         self._told = False
@@ -74,11 +69,7 @@ class RecordFile:
         return self._writer.written <= self._header_bytes
 
     def rows(self) -> Rows:
-        """Whole rows in the file; valid after `end`.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
+        """Whole rows in the file; valid after `end`."""
         part = bytearray()
         while not isinstance(self._file, OSError) and len(part) < self._writer.written:
             # Not `read`, which would move the position of a late write.

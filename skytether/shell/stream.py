@@ -35,12 +35,9 @@ class ByteStream:
             raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
-        """File descriptor; None while the stream is not open."""
 
     def send(self, payload: bytes) -> bool:
-        """Send bytes; False if the stream is not open or cannot take all of them, which are then
-        lost.
-        """
+        """Send bytes; False if the stream is not open or cannot take all of them."""
         if self._end is None:
             return False
         try:
@@ -105,11 +102,7 @@ class ByteStream:
 
 
 def prepare(port: int, baud: int) -> None:
-    """Configure a serial port for raw bytes.
-
-    Args:
-        port: file descriptor of the port.
-        baud: rate [bit/s] that the system supports.
+    """Configure a serial port, a file descriptor, for raw bytes at a rate that the system supports.
 
     Raises:
         termios.error: the file is no serial port.

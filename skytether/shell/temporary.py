@@ -46,7 +46,6 @@ def _marked(made: Path) -> Iterator[None]:
 
 
 def _clear(place: Path) -> None:
-    """Remove the folders whose owners are dead."""
     with contextlib.suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             with contextlib.suppress(OSError):

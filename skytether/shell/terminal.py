@@ -94,7 +94,6 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
 
 
 def summary_rows(summary: Summary) -> list[tuple[str, str]]:
-    """Names and values of a summary's known figures, for a table."""
     s = summary
     ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
     rows = [
@@ -132,7 +131,6 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
 
 
 def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
-    """Rows of a summary about dropped packets, one for each end that dropped some."""
     return [
         (f"dropped by {end}", ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
         for end, reasons in by_end.items()
@@ -140,7 +138,6 @@ def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:
-    """Numbers of horizons and of other packets on the uplink, where both are known."""
     if s.uplink_horizons is None or s.uplink_packets is None:
         return ()
     return s.uplink_horizons, max(0, s.uplink_packets - s.uplink_horizons)

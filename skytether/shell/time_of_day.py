@@ -44,7 +44,6 @@ class HostTime(NamedTuple):
 
 @cache
 def _adjtimex() -> "ctypes._FuncPointer | None":
-    """Function of the C library; None where it has none."""
     return getattr(ctypes.CDLL(None), "adjtimex", None)
 
 

@@ -24,7 +24,7 @@ class Timer(Protocol):
         """Arm for `due_ns` [ns; CLOCK_MONOTONIC], replacing an earlier time; None disarms."""
 
     def close(self) -> None:
-        """Disarm for good."""
+        pass
 
 
 class _Itimerspec(ctypes.Structure):

@@ -23,14 +23,10 @@ BUFFER_BYTES = 4 * 1024 * 1024
 """Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
 
 FLOODED_BYTES = 16 * 1024 * 1024
-"""Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s, for a
-process that waits that long for a core.
-"""
+"""Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Most addresses whose other forms are cached, 360 B each; with more peers the cache starts anew. A
-flood of HELLOs from ever new ports fills it.
-"""
+"""Most addresses whose other forms are cached, 360 B each: a flood of HELLOs may fill the cache."""
 
 SPARE_FILES = 48
 """Open files that a process may need beside its sockets: readers of its feed, metrics."""
@@ -42,8 +38,8 @@ _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 _IP_RECVERR, _IPV6_RECVERR, _MSG_ERRQUEUE, _FROM_THIS_MACHINE = 11, 25, 0x2000, 1
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
 _BYTE, _LENGTH, _IF_EQUAL, _IF_AT_LEAST, _RETURN = 0x30, 0x80, 0x15, 0x35, 0x06
-"""Instructions of classic BPF, Linux's packet filter: load a byte, load the length, compare (equal,
-at least), and accept so many bytes.
+"""Instructions of classic BPF, Linux's packet filter: load a byte, load the length, jump if equal,
+jump if at least, accept so many bytes.
 """
 
 
@@ -161,13 +157,11 @@ def to_kernel(address: Address) -> tuple[Any, ...]:
 
 
 def files_max() -> int:
-    """Largest number of open files that this process may ask for."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     return sys.maxsize if hard == resource.RLIM_INFINITY else hard
 
 
 def sockets_max() -> int:
-    """Largest number of sockets that this process may have beside its other files."""
     return files_max() - SPARE_FILES
 
 
@@ -260,7 +254,6 @@ class Names:
 
     def __init__(self, peers: Iterable[Address], *, is_patient: bool = False) -> None:
         self.missing: dict[Address, str] = {}
-        """Peers that could not be resolved yet, and the reasons."""
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
         self._names: list[Address] = []
@@ -306,7 +299,6 @@ class Names:
 
     @property
     def may_change(self) -> bool:
-        """Whether some peers were given by name, whose numeric address may change."""
         return bool(self._names)
 
     def numbers(self) -> list[Address]:
@@ -337,11 +329,7 @@ class Names:
         return peer
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
-        """Peers, as by `heard`.
-
-        Raises:
-            OSError: the interface of an address's scope does not exist.
-        """
+        """Peers, as by `heard`; raises the same."""
         known = list(map(self._heard.get, raws))
         if None not in known:
             return cast("list[Address]", known)
@@ -388,7 +376,6 @@ class Names:
         return addresses
 
     def learn(self, found: dict[Address, Address]) -> None:
-        """Use these numeric addresses of peers from now on."""
         for peer in found:
             self.missing.pop(peer, None)
         self._numbers |= found

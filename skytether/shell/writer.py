@@ -31,13 +31,10 @@ class Writer:
         self._pause_s = pause_s
         # Each counter is changed by one thread only: `offered` and `refused` by the caller's.
         self.offered = 0
-        """Bytes that `write` was called with."""
         self.refused = 0
         """Bytes that were dropped because too many were waiting."""
         self.written = 0
-        """Bytes that were written to the file."""
         self._handled = 0
-        """Bytes that are no longer waiting, written or not."""
         self._pieces: SimpleQueue[bytes] = SimpleQueue()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -45,7 +42,6 @@ class Writer:
 
     @property
     def failure(self) -> OSError | None:
-        """Error after which nothing more is written."""
         return self._file if isinstance(self._file, OSError) else None
 
     def write(self, piece: bytes) -> bool:

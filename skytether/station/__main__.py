@@ -22,8 +22,6 @@ from skytether.station.laws import LawOptions
 
 @dataclass(frozen=True)
 class StationOptions(LawOptions, ProcessOptions):
-    """Options of `skytether station`."""
-
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:14550"

@@ -36,11 +36,9 @@ from skytether.station.laws import Heard, Law, Setpoint, setpoint
 SYSTEM, COMPONENT = 255, int(dialect.MAV_COMP_ID_MISSIONPLANNER)
 """System and component id of the ground station; ArduPilot accepts commands of this system id."""
 VEHICLE = 1
-"""Number of the vehicle in records and events."""
 TICK_NS = 100 * MILLISECOND_NS
 """Interval at which requests other than set-points are checked [ns]."""
 HEARTBEAT_NS = SECOND_NS
-"""Interval of the station's heartbeats [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, 5 * SECOND_NS
 """Intervals of requests for the autopilot's clock, before the flight and during it [ns]."""
 STREAM_NS = 500 * MILLISECOND_NS
@@ -93,7 +91,6 @@ class Station(Endpoint):
         self._texts = Texts()
         self._peer: Address | None = None
         self._target = (0, 0)
-        """System and component id of the autopilot."""
         self._flavour: Flavour | None = None
         self._launch: Launch | None = None
         self._failure: NotTakenOff | None = None
@@ -104,22 +101,17 @@ class Station(Endpoint):
         """Times of the next tick, heartbeat, clock request and stream request [ns]."""
         self._asked = 0
         self._epoch_ns: int | None = None
-        """Time of step 0 [ns]."""
         self._step_ns = 0
-        """Time of the next set-point [ns]."""
         self._step = 0
         self._missed = 0
-        """Number of steps missed by waking too late."""
         self._newest: Measurement | None = None
 
     @property
     def failure(self) -> NotTakenOff | None:
-        """Event after which the vehicle could not be flown."""
         return self._failure or (self._launch.failure if self._launch else None)
 
     @property
     def finished(self) -> bool:
-        """Whether the vehicle has landed, or cannot be flown."""
         if not (self._is_over or self.failure):
             return False
         now_ns = self._tick_ns - TICK_NS
@@ -194,8 +186,8 @@ class Station(Endpoint):
 
     @property
     def _streams(self) -> bool:
-        """Whether set-points are due: in flight, and as zeros before a mode that requires a stream
-        of them.
+        """Whether set-points are due: in flight, and as zeros before a mode that requires a
+        stream.
         """
         flies = self._epoch_ns is not None and not self._is_over
         return flies or (self._launch is not None and self._launch.streams_zeros)
@@ -213,7 +205,6 @@ class Station(Endpoint):
                 self._fly(self._epoch_ns, now_ns)
 
     def _tick(self, now_ns: int) -> None:
-        """Send the requests that are due besides set-points."""
         launch = self._launch
         self._wait(now_ns)
         if launch is None or self._failure:
@@ -265,9 +256,7 @@ class Station(Endpoint):
         )
 
     def _fly(self, epoch_ns: int, now_ns: int) -> None:
-        """Send the set-point of the present step, unless a pilot or the autopilot flies the
-        vehicle.
-        """
+        """Send the set-point of the present step, unless a pilot or the autopilot flies."""
         launch = self._launch
         assert launch is not None
         step = min((now_ns - epoch_ns) // self._dt_ns, self._steps - 1)
@@ -292,9 +281,7 @@ class Station(Endpoint):
 
     @property
     def _obeys(self) -> bool:
-        """Whether the vehicle was armed and in the mode that follows set-points, by its newest
-        message.
-        """
+        """Whether the vehicle was armed and in the mode for set-points, by its newest message."""
         assert self._flavour is not None
         return self._condition.armed and self._condition.mode == self._flavour.guided
 

@@ -83,15 +83,12 @@ def _number(
 
 
 def flags(law: Law) -> list[str]:
-    """Arguments of `skytether station` that choose a law."""
     numbers = {"--lead": law.lead_s, "--gain": law.gain}
     given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
     return [f"--law={law.name}", *given]
 
 
 class Heard(NamedTuple):
-    """Position received from the vehicle."""
-
     time_s: float
     """Time of flight at which it was measured [s]."""
     position: Array

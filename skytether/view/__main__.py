@@ -29,8 +29,6 @@ NICE = 5
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Options of `skytether page`."""
-
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folders of flights, each with the feeds and control sockets of its processes."""
     page: str = HOST_PORT

@@ -24,7 +24,6 @@ from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.telemetry.record import RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Bytes that an MCAP file begins and ends with."""
 ENCODING = "msgpack"
 """Encoding of the messages that are read back; others are written for other programs."""
 
@@ -142,7 +141,6 @@ class Container:
             self.lost_bytes = self._size - whole_bytes
 
     def _unpacked(self) -> Iterator[McapRecord]:
-        """Records, including those within chunks."""
         left_bytes = SPARE_BYTES + RATIO_MAX * self._size
         stream: Any = self
         for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:

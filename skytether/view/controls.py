@@ -17,7 +17,6 @@ Values = Mapping[str, Any]
 Read = Callable[[Values], float | None]
 Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
-"""Keys of both network directions."""
 ALL_LOST = " & loss(1)"
 """Text appended to a direction's impairments to lose every packet."""
 LOST = ("loss(1)", "loss(1.0)")
@@ -43,12 +42,10 @@ class Knob:
 
 
 def texts(values: Values) -> dict[str, str]:
-    """Network directions as texts, by key; empty where they may not change."""
     return {way: values[way] for way in WAYS if way in values}
 
 
 def cut(values: Values) -> dict[str, Any]:
-    """Changes that lose every packet from now on."""
     return {way: f"{text}{ALL_LOST}" if text else LOST[0] for way, text in texts(values).items()}
 
 
@@ -58,7 +55,6 @@ def is_cut(values: Values) -> bool:
 
 
 def healed(values: Values) -> dict[str, Any]:
-    """Changes that undo `cut`."""
     changed = {way: text.removesuffix(ALL_LOST) for way, text in texts(values).items()}
     return {
         way: _with(way, text, "loss", 0.0) if text.endswith(LOST) else text
@@ -67,12 +63,10 @@ def healed(values: Values) -> dict[str, Any]:
 
 
 def _with(key: str, text: str, at: str, number: float) -> str:
-    """Text of a key with one argument replaced."""
     return dotted.TEXTS[key].with_argument(text, at, number)
 
 
 def _number(values: Values, key: str, at: str) -> float | None:
-    """Argument in the text of a key; None if it has none of that name."""
     try:
         return float(dotted.TEXTS[key].argument(values[key], at))
     except (KeyError, GrammarError):
@@ -121,7 +115,6 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
 
 
 def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
-    """Slider for an argument of a policy in the trigger."""
     key = "control.trigger"
 
     def write(values: Values, number: float) -> dict[str, Any]:
@@ -131,7 +124,6 @@ def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
 
 
 def knobs(axes: int) -> tuple[Knob, ...]:
-    """Sliders for a vehicle with `axes` axes that do not depend on the trigger."""
     wind, steady = "vehicle.wind", "vehicle.steady_wind_mps"
     lossy = "Share of packets that are lost, both ways"
     least = "Smallest delay of a packet, each way"

@@ -67,7 +67,6 @@ def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
 
 
 def csv(columns: Columns) -> str:
-    """Table as CSV text; unknown values are empty."""
     values = [_known(name, column) for name, column in columns.items()]
     return to_csv(list(columns), zip(*values, strict=True))
 

@@ -13,7 +13,6 @@ from skytether.shared.law.model import Array
 
 WORLD = "world"
 INFO, WARNING = 2, 3
-"""Levels of a log message."""
 
 Json = dict[str, Any]
 
@@ -83,7 +82,6 @@ SCHEMAS: Mapping[str, Json] = {
         timestamp=_TIME, level=_WHOLE, message=_TEXT, name=_TEXT, file=_TEXT, line=_WHOLE
     ),
 }
-"""JSON schema of each kind of message, by name."""
 
 VEHICLE_M, POINT_M, LINE_M = 0.12, 0.09, 0.015
 """Sizes of a vehicle, of a point, and of a line's thickness [m]."""
@@ -95,7 +93,6 @@ BLUE, RED, GREY, GREEN = (
 
 
 def log(time_ns: int, process: str, message: str, level: int) -> Json:
-    """Message foxglove.Log: a sentence of a process."""
     return {
         "timestamp": _time(time_ns),
         "level": level,
@@ -142,16 +139,10 @@ def vehicle(time_ns: int, name: str, state: Array) -> Json:
 
 
 def point(time_ns: int, name: str, state: Array) -> Json:
-    """Message foxglove.SceneUpdate: a vehicle's desired position."""
     return _scene(time_ns, name, spheres=[_sphere(_pose(state), POINT_M, RED)])
 
 
 def line(time_ns: int, name: str, positions: Array, color: Json) -> Json:
-    """Message foxglove.SceneUpdate: a path.
-
-    Args:
-        positions: points of the path [m]; shape (n, axes).
-    """
     drawn = {
         "type": 0,
         "pose": {"position": _vector(()), "orientation": _facing(0.0)},

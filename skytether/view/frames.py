@@ -48,7 +48,6 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
 
 
 def _begins(flight: Record) -> Indices:
-    """Time of step 0 of each vehicle [ns], by its number."""
     known = {
         event.vehicle: time_ns
         for time_ns, _, event in reversed(flight.events)

@@ -48,7 +48,6 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
-    """Scenario of a flight, each value from the process that owns the key."""
     table = to_table(first.scenario)
     for each in recordings:
         terms = first.scenario.terms(), each.scenario.terms()
@@ -74,7 +73,6 @@ def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
 
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
-    """Rows of each part, from all recordings."""
     pieces: dict[str, list[Table]] = {}
     for each in recordings:
         for part, rows in each.parts.items():

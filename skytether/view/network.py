@@ -11,13 +11,9 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.record import Rows as Table
 
 SPAN_S = 60.0
-"""Time that is kept [s]."""
 BIN_NS = 250 * MILLISECOND_NS
-"""Width of a bin of the ring buffer [ns]."""
 BINS = int(SPAN_S * SECOND_NS) // BIN_NS
-"""Number of bins of the ring buffer."""
 DELAY_BIN_NS = 20 * MILLISECOND_NS
-"""Width of a bin of the delay histogram [ns]."""
 DELAY_BINS = 100
 """Number of bins of the delay histogram; the last bin contains all longer delays."""
 DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
@@ -33,7 +29,6 @@ class Traffic:
     loss: float
     """Share of its packets that were lost; NaN without packets."""
     delay_ms_p50: float
-    """Median delay of its packets that arrived [ms]; NaN without packets."""
     delay_ms_p99: float
 
 
@@ -62,7 +57,6 @@ class Network:
         """Time at which a packet last arrived, by direction [ns]."""
 
     def take(self, rows: Table, *, time_ns: int) -> None:
-        """Add rows of netem's part."""
         at = self._at(time_ns)
         if at is None:
             return
@@ -81,7 +75,6 @@ class Network:
             self.heard_ns[int(each)] = time_ns
 
     def wait(self, waiting: Array, *, time_ns: int) -> None:
-        """Set the number of packets that netem is delaying in each direction; shape (2,)."""
         at = self._at(time_ns)
         if at is not None:
             self._waiting[at] = waiting
@@ -140,7 +133,7 @@ class Network:
         return self._by_second(self._bytes[:, direction], now_ns)
 
     def losses(self, direction: int, now_ns: int) -> Array:
-        """Share of packets lost in each of the last SPAN_S seconds; NaN without packets; shape
+        """Share of packets lost in each of the last SPAN_S seconds; NaN without any; shape
         (SPAN_S,).
         """
         packets = self._by_second(self._packets[:, direction], now_ns)
@@ -152,9 +145,7 @@ class Network:
         return self._by_second(self._waiting[:, direction], now_ns)
 
     def delays_s(self, direction: int, now_ns: int) -> Array:
-        """Mean delay in each of the last SPAN_S seconds [s]; NaN without packets; shape
-        (SPAN_S,).
-        """
+        """Mean delay in each of the last SPAN_S seconds [s]; NaN without any; shape (SPAN_S,)."""
         through = self._packets[:, direction] - self._lost[:, direction]
         total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
         count = self._by_second(through, now_ns)

@@ -23,15 +23,12 @@ SEEN = 4.0
 SPARE = 6
 """Number of zeros left at the end of a cropped plot."""
 HEIGHT = 150
-"""Height of a plot [pixels]."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
 TIME = "time of flight [s]"
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
-"""Invisible series that widens a plot's range: changing the range itself would redraw from
-scratch.
-"""
+"""Invisible series that widens a plot's range: changing the range itself would redraw all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +64,6 @@ class Plot:
     lines: tuple[PlotLine, ...]
     grid: Values = lambda look: look.curves.time_s
     across: str = TIME
-    """Label of the horizontal axis."""
     log: bool = False
     crop: bool = False
     """Whether trailing zeros are cropped."""
@@ -164,11 +160,9 @@ APART = Plot(
         PlotLine("nearest", lambda look: look.state.nearest_m(look.vehicle, POINTS)),
     ),
 )
-"""Distance to the nearest other vehicle of a mission."""
 
 
 def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
-    """Plots of a vehicle with so many axes, alone or on a mission."""
     return (
         *((APART,) if mission else ()),
         *(Plot(f"{name} [m]", _axis(axis), equal=True) for axis, name in enumerate("xyz"[:axes])),
@@ -192,7 +186,6 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
 
 
 def of_network(*, solves: bool) -> tuple[Plot, ...]:
-    """Plots of the network, and of computing time where plans are solved."""
     packets = (
         Plot(
             "Age of the observation flown by, and delays [s]",
@@ -216,7 +209,6 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
 
 
 def of_link() -> tuple[Plot, ...]:
-    """Plots of both directions of a network, for any protocol."""
     return (
         _ways("Packets in a second", Network.rates),
         _ways("Payload in a second [kB]", Network.loads, 1e-3),
@@ -293,7 +285,7 @@ class Plots:
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
-        """Redraw the flights; the first determines the times."""
+        """The first flight determines the times."""
         drawn = []
         for plot in self._plots:
             data = [plot.grid(looks[0])]
@@ -319,7 +311,6 @@ def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:
-    """Data with only SPARE trailing zeros."""
     used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
     return [values[: max(used) + SPARE] for values in data]
 

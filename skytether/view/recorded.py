@@ -31,7 +31,6 @@ from skytether.view.recording import BEGUN, FEED, About, Begun
 from skytether.view.rows import check_columns, check_values
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
-"""Longest time from the first frame of a recording to its last [ns]."""
 TIME_NS_MAX = 2**62
 """Largest time of a frame, and largest offset of a clock [ns]."""
 
@@ -42,7 +41,6 @@ class Recorded:
     about: About
     """Name of the scenario, seed, version and clock."""
     scenario: Scenario
-    """Scenario at the beginning of the flight."""
     frames: Sequence[Timed]
     """Frames in order of time; times count from the first frame [ns]."""
     parts: Mapping[str, Table]
@@ -54,12 +52,11 @@ class Recorded:
 
     @cached_property
     def summary(self) -> Summary | None:
-        """Summary of the flight; None if no step was flown."""
+        """None if no step was flown."""
         return summary_of(self.scenario, self.about, self.parts, self.figures)
 
     @cached_property
     def figures(self) -> dict[str, dict[str, Any]]:
-        """Newest figures of each process."""
         return {
             process: frame.figures
             for _, process, frame in self.frames
@@ -129,9 +126,7 @@ class _Frames:
         self._scenario = scenario
         self._frames: list[tuple[str, Frame]] = []
         self._columns: dict[tuple[str, str], np.dtype[np.void]] = {}
-        """Columns by process and part."""
         self._begun_ns: dict[str, int] = {}
-        """Start of each process [ns]."""
         self._rows: dict[str, list[tuple[int, Table]]] = {}
         """Time [ns] and rows of each frame with rows of a part, by the part's name."""
 
@@ -191,10 +186,7 @@ def _columns(described: str) -> np.dtype[np.void]:
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Check the scenario of a process; equal texts, which may come thousands of times, only once.
-
-    Raises:
-        ConfigError: the scenario is invalid.
-        ValueError: the text is no TOML.
+    """Check the scenario of a process; equal texts, which may come thousands of times, only
+    once.
     """
     check(toml.loads(scenario), "the scenario of a process", any_network=True)

@@ -51,15 +51,11 @@ BEGUN, FEED = "/recording", "/feed/"
 OURS = "skytether"
 """Name of the metadata, and of the writing library."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
-"""Names of the attachments."""
 VEHICLES_MAX = 64
 """Most vehicles that are drawn; of further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
-"""Size of messages after which a chunk is written [B]."""
 POINTS_MAX = 400
-"""Most points of a drawn trajectory."""
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, *Failure.__args__
-"""Events that are shown as warnings."""
 
 _TOPICS = {"client": "flown", "server": "decided", "plan": "plan"}
 _SAID = {
@@ -75,16 +71,13 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     """Facts about a recording, also kept in its metadata."""
 
     scenario: str
-    """Name of the scenario."""
     seed: int
     version: str
-    """Version of Skytether that recorded the flight."""
     began: str
     """Time of day at the beginning, ISO 8601; empty in virtual time."""
     offset_ns: int
     """Time of a message minus time of its frame [ns]."""
     secure: bool
-    """Whether the link was encrypted."""
 
 
 class Begun(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,15 +85,10 @@ class Begun(msgspec.Struct, frozen=True, kw_only=True):
 
     about: About
     scenario: str
-    """Scenario at the beginning, as TOML."""
 
 
 class Recording:
     """Recording that is being written as an MCAP file.
-
-    Args:
-        file: file opened for writing.
-        about: facts for its metadata.
 
     Raises:
         OSError: the file cannot be written; any method may raise this.
@@ -112,11 +100,9 @@ class Recording:
         self._scenario = scenario
         self._offset_ns = about.offset_ns
         self._tables: dict[tuple[str, str], rows.RowTable] = {}
-        """Columns of each part, by process and part."""
         self._channels: dict[str, int] = {}
         self._schemas: dict[bytes, int] = {}
         self._shown: set[int] = set()
-        """Vehicles whose trajectory has been drawn."""
         self._now_ns = 0
         toml = to_toml(scenario)
         begun = Begun(about=about, scenario=toml.decode())
@@ -185,7 +171,6 @@ class Recording:
                 self._draw_row(part, number, row)
 
     def _draw_row(self, part: str, number: int, row: np.void) -> None:
-        """Add the drawn messages of a row."""
         at, name, now_ns = f"/vehicle/{number}", f"vehicle {number}", self._now_ns
         match part:
             case "client":
@@ -217,7 +202,6 @@ class Recording:
         self._put(topic, name, foxglove.SCHEMAS[name], message)
 
     def _put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
-        """Add a message of JSON, for other programs."""
         known = 0
         if topic not in self._channels:
             written = msgspec.json.encode({"title": name, **schema})
@@ -247,7 +231,6 @@ def trajectory(scenario: Scenario) -> Array:
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
-    """JSON schema of figures; groups that are still empty are left out."""
     kinds = {bool: "boolean", int: "integer", float: "number", str: "string"}
     properties = {
         key: _schema_of(each) if isinstance(each, Mapping) else {"type": kinds[type(each)]}

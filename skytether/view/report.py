@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
 EVENTS_MAX = 400
 WIDTH = 9.0
-"""Width of a figure [inch]."""
 LETTERS = 9
-"""Size of letters in every figure [points]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,21 +35,16 @@ class ReportedFlight:
 
     scenario: Scenario
     client: Rows
-    """Rows of the vehicle."""
     server: Rows
-    """Rows of the server about the vehicle."""
     netem: Rows
-    """Rows of the network."""
     epoch_ns: int
     """Time of step 0 [ns; netem's clock]."""
 
     @property
     def time_s(self) -> Array:
-        """Time of each of the vehicle's rows [s]."""
         return self.time_of(self.client)
 
     def time_of(self, rows: Rows) -> Array:
-        """Time of rows that have a step [s]."""
         time_s: Array = rows["step"] * self.scenario.control.dt
         return time_s
 
@@ -128,7 +121,6 @@ def _colour(mode: Mode) -> str:
 
 
 def path(flown: ReportedFlight) -> Picture:
-    """Path from above, coloured by mode."""
     with lettered(WIDTH, 6.0, LETTERS) as figure:
         plane = figure.subplots()
         draw_reference(plane, flown.scenario, flown.client, flown.server)
@@ -147,7 +139,6 @@ def path(flown: ReportedFlight) -> Picture:
 
 
 def timeline(flown: ReportedFlight) -> Picture:
-    """Figures over time, with the modes as background."""
     with lettered(WIDTH, 10.5, LETTERS) as figure:
         axes = figure.subplots(5, 1, sharex=True)
         for draw, below in zip((_positions, _error, _trigger, _ages, _packets), axes, strict=True):
@@ -183,7 +174,6 @@ def with_gaps(steps: NDArray[np.int64], values: Array) -> Array:
 def _over_time(
     below: "Axes", flown: ReportedFlight, rows: Rows, values: Array, *form: str, **style: Any
 ) -> None:
-    """Draw values of rows over time, with gaps where there are no rows."""
     time_s = with_gaps(rows["step"], flown.time_of(rows))
     below.plot(time_s, with_gaps(rows["step"], values), *form, **style)
 
@@ -244,7 +234,6 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
 
 
 def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
-    """Legend of the modes that occur."""
     from matplotlib.patches import Patch
 
     names: dict[str, list[str]] = {}

@@ -36,7 +36,6 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "compared": {figure: str(figure) for figure in Compared},
     "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
 }
-"""Words for the codes of some columns."""
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest time of a step [s]: a scenario lasts for a day at most."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
@@ -93,12 +92,9 @@ class RowTable:
 
     def __init__(self, columns: np.dtype[np.void]) -> None:
         self.columns = columns
-        """Columns of the rows."""
         self._plain = plain(columns)
         self.names: tuple[str, ...] = self._plain.names or ()
-        """Names of the plain columns."""
         self.schema = {"type": "object", "properties": dict(map(self._property, self.names))}
-        """JSON schema of a message."""
 
     def _property(self, name: str) -> tuple[str, dict[str, Any]]:
         column = self._plain[name]
@@ -106,7 +102,6 @@ class RowTable:
         return name, {"type": "array", "items": kind} if column.shape else kind
 
     def messages(self, rows: Rows) -> list[dict[str, Any]]:
-        """Messages, one per row."""
         flat = np.ascontiguousarray(rows).view(self._plain)
         values = zip(*(flat[name].tolist() for name in self.names), strict=True)
         return [
@@ -116,7 +111,6 @@ class RowTable:
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether a number is finite, or all numbers of a list are."""
     return all(map(isfinite, value)) if isinstance(value, list) else isfinite(value)
 
 

@@ -29,21 +29,15 @@ GRID_REACH = 3.0
 BELOW = 1e-3
 """Depth of the grid below everything else, relative to the extent of the flight."""
 TRAIL_S = 20.0
-"""Length of the drawn trail [s]."""
 GOAL_S = 1.0
 """Age up to which a desired position is shown [s]; an older one is out of date."""
 TRAIL_POINTS = 240
-"""Most points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
-"""Most points of all trails of a flight."""
 ROUND_S = 600.0
-"""Length of the drawn desired trajectory, at most [s]."""
 SIZE = 0.05
-"""Size of a vehicle, relative to the extent of the flight."""
 WIDE, NARROW = 1.5, 0.65
 """Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
 FOV_RAD = 0.7
-"""Vertical field of view [rad]."""
 
 
 def in_space(points: Array) -> NDArray[np.float32]:
@@ -219,7 +213,6 @@ class _Marker:
         self._shown = ""
 
     def show(self, track: VehicleTrack, title: str) -> None:
-        """Move the marker to the vehicle, in the colour of its mode."""
         assert track.row is not None
         self._frame.position = in_space(track.row["state"][None, :, 0])[0]
         does = track.does
@@ -307,7 +300,6 @@ class Scene:
     """Scene with the flights of a page.
 
     Args:
-        server: viser's server.
         states: states of flights, all with known scenarios.
         titles: titles of the flights; empty for a single flight.
     """
@@ -320,7 +312,6 @@ class Scene:
         scene = server.scene
         scene.set_up_direction("+z")
         self.ground = grid(self.middle, self.reach_m)
-        """Grid lines on the ground, see `grid`."""
         camera = server.initial_camera
         camera.fov = FOV_RAD
         camera.position, camera.look_at = self.camera(WIDE)

@@ -44,19 +44,14 @@ from skytether.view.rows import check_columns, check_values, planned
 SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; with more steps per minute, only every n-th is kept."""
 VEHICLES_MAX = 64
-"""Most vehicles of a flight that are shown."""
 ZONED, GUIDED = "mission.zones", "mission.goals"
-"""Keys of a mission's zones, and of its goals changed in flight."""
 PLANS_MAX = 8
 """Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
-"""Most events that are kept."""
 LED = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
-"""Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
-"""Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
 """Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
 
@@ -71,11 +66,8 @@ class Word:
     """State of a vehicle or a link, for display."""
 
     word: str
-    """Single word, such as GOOD or BRAKE."""
     text: str
-    """Explanation, without a full stop."""
     colour: str
-    """Name of the colour: grey, green, amber, red or blue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +75,6 @@ class Curves:
     """Last minute of a vehicle on a time grid; NaN where unknown."""
 
     time_s: Array
-    """Time of flight [s]; shape (n,)."""
     position: Array
     """True position [m]; shape (n, axes)."""
     reference: Array
@@ -99,11 +90,7 @@ class Curves:
 
 
 class VehicleTrack:
-    """Last minute of one vehicle.
-
-    Args:
-        scenario: scenario that it flies.
-    """
+    """Last minute of one vehicle."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number
@@ -133,7 +120,6 @@ class VehicleTrack:
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
         self.planned = 0
-        """Number of steps seen that the server has planned for."""
         self.sent = 0
         """Number of those steps at which the server sent a horizon."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
@@ -144,7 +130,6 @@ class VehicleTrack:
     # -- what comes in -----------------------------------------------------------------------
 
     def fly(self, rows: Table) -> None:
-        """Add rows of the client's part."""
         at = self._at(rows["step"])
         taken = at >= 0
         ring, at = self._ring, at[taken]
@@ -154,7 +139,6 @@ class VehicleTrack:
         self.row = rows[-1].copy()
 
     def plan(self, rows: Table) -> None:
-        """Add rows of the server's part."""
         at = self._at(rows["step"])
         taken = at >= 0
         ring, at, rows = self._ring, at[taken], rows[taken]
@@ -170,7 +154,6 @@ class VehicleTrack:
             self._seen = rows[-1].copy()
 
     def lead(self, rows: Table) -> None:
-        """Add rows of the part "plan", of which the newest are kept."""
         self._plans.extend(row.copy() for row in rows[-PLANS_MAX:])
 
     def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -187,7 +170,6 @@ class VehicleTrack:
 
     @property
     def time_s(self) -> float:
-        """Time of flight of the newest known step [s]; 0 before the first."""
         return max(0.0, float(self._ring["slot"].max()) * self._slot_s)
 
     @property
@@ -196,7 +178,6 @@ class VehicleTrack:
 
     @property
     def does(self) -> Word:
-        """Mode of the vehicle and its reason, in words."""
         mode = self.mode
         if self.row is None:
             return Word("INIT", "no data yet", GREY)
@@ -233,7 +214,7 @@ class VehicleTrack:
         return reference
 
     def goal(self, seconds: float) -> Array | None:
-        """Newest desired position of the last seconds [m]; None if none is known."""
+        """Newest desired position of the last seconds [m]; None if there is none."""
         known = self.goals(seconds)
         known = known[~np.isnan(known[:, 0])]
         return known[-1] if len(known) else None
@@ -332,7 +313,6 @@ class _Process:
     opened: Opened
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
-    """Time of its newest frame [ns]."""
     seen_ns: int = -1
     """Time up to which incoming frames are repetitions [ns]."""
     figures: dict[str, Any] = field(default_factory=dict)
@@ -346,15 +326,12 @@ class State:
         self._begin()
 
     def _begin(self) -> None:
-        """Forget the previous flight."""
         self.name = ""
-        """Name of the scenario; empty before the first frame."""
         self.scenario = Scenario()
         """Scenario of the first process that sent frames; the client's once it sends any."""
         self.duration_s = 0.0
         """Length of the flight [s]: the client's, if a client sends frames."""
         self.vehicles: dict[int, VehicleTrack] = {}
-        """Vehicles by number."""
         self.omitted = 0
         """Number of dropped rows, of vehicles beyond VEHICLES_MAX."""
         self._zones: str | None = None
@@ -363,7 +340,6 @@ class State:
         self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
         """Newest events, oldest first: time of flight [s] and sentence."""
         self.newest_ns = 0
-        """Time of the newest frame [ns]."""
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
 
@@ -394,7 +370,6 @@ class State:
                 self.network.wait(np.nan_to_num(waiting), time_ns=frame.time_ns)
 
     def lose(self, process: str) -> None:
-        """Record that a process's feed has ended."""
         self._lost.add(process)
 
     def _open(self, process: str, opened: Opened) -> None:
@@ -488,7 +463,6 @@ class State:
 
     @property
     def title(self) -> str:
-        """Title of the scenario, or else its name."""
         return self.scenario.title or self.name
 
     @property
@@ -542,11 +516,9 @@ class State:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Names of the processes whose feeds have ended."""
         return tuple(sorted(self._lost))
 
     def figures(self, process: str) -> dict[str, Any]:
-        """Newest figures of a process; empty if there are none."""
         known = self._processes.get(process)
         return known.figures if known else {}
 

@@ -23,9 +23,7 @@ _UDP = 17
 
 
 def traces(packets: Rows) -> Mapping[str, str]:
-    """Delay traces that the impairment `trace` replays, as CSV by name, one per direction and
-    flow.
-    """
+    """Delay traces that the impairment `trace` replays, as CSV, by direction and flow."""
     csv = {}
     for way, direction in WAYS.items():
         for flow in np.unique(packets["flow"]):

@@ -20,11 +20,8 @@ CSS = {
     "blue": "var(--mantine-color-blue-7)",
     "violet": "var(--mantine-color-violet-7)",
 }
-"""Colours of words, by name."""
 NEWEST = 3
-"""Number of events shown beside a vehicle's state."""
 SAID_SHOWN = 50
-"""Most events that are shown."""
 
 FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
 """Counters of netem for a direction, and their titles."""
@@ -37,7 +34,6 @@ _DIM = "color:var(--mantine-color-dimmed)"
 
 
 def badge(word: Word) -> str:
-    """Word in its colour, with its explanation."""
     chip = (
         f"background:{CSS[word.colour]};color:#fff;border-radius:0.25em;padding:0.05em 0.5em;"
         "font-weight:600;margin-right:0.5em;display:inline-block"
@@ -51,7 +47,6 @@ def number(value: float, form: str, unit: str = "") -> str:
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
-    """State of a vehicle and its link, in words and numbers."""
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} No flight yet.</div>'
     if not state.flies:
@@ -99,7 +94,6 @@ def _carried(state: State, now_ns: int, title: str) -> str:
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:
-    """Table of names and values, one per line."""
     lines = "".join(
         f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
         f"<td>{escape(value)}</td></tr>"
@@ -109,15 +103,12 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _gone(state: State) -> str:
-    """Sentence on processes whose feeds have ended; empty for none."""
     names = ", ".join(state.lost)
     return f'<div style="color:{CSS["red"]}">no feed of {names}</div>' if names else ""
 
 
 def _newest(state: State) -> str:
-    """Newest events, newest first, a line each, always NEWEST lines so that the page does not
-    move.
-    """
+    """The box has a fixed height, so that the page does not move."""
     cut = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
         f'<div style="{cut}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
@@ -132,7 +123,6 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of a vehicle on a mission; empty without a mission."""
     if not state.scenario.is_mission:
         return []
     asked = f"at least {state.scenario.mission.separation_m:g} m"
@@ -152,7 +142,6 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of the vehicle's autopilot; empty without one."""
     says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
     if not says:
         return []
@@ -195,7 +184,6 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
 
 
 def said(states: Sequence[tuple[str, State]]) -> str:
-    """Newest events, newest first, one per line."""
     events = [
         (time_s, f"{title} {text}".strip())
         for title, state in states
@@ -210,7 +198,6 @@ def said(states: Sequence[tuple[str, State]]) -> str:
 
 
 def note(text: str) -> str:
-    """Remark in small print."""
     return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
 
 
@@ -228,12 +215,6 @@ def answers(given: Sequence[tuple[str, bool]]) -> str:
 
 
 def legend(titles: Sequence[str], *, has_zones: bool) -> str:
-    """Meaning of the lines on the map.
-
-    Args:
-        titles: titles of the flights, in the order of their colours.
-        has_zones: whether a fence or zones are drawn.
-    """
     marks = [("─", "reference", GOAL_RGB), ("+", "start", GOAL_RGB)]
     for title, rgb in zip(titles, cycle(FLIGHT_RGB), strict=False):
         marks += [("─", f"{title} flown".strip(), rgb), ("━", f"{title} plan".strip(), rgb)]

@@ -37,9 +37,7 @@ class Visitor:
     """Request of a browser, as far as access depends on it."""
 
     host: str
-    """Address that the browser connects from."""
     path: str
-    """Path and query of the request."""
     headers: Mapping[str, str]
     """Headers of the request; names in any case."""
 
@@ -63,7 +61,6 @@ def _has_token(visitor: Visitor, token: str) -> bool:
 
 
 def _named(visitor: Visitor) -> tuple[str, str, str]:
-    """Host name in the request, the same with its port, and the website's origin."""
     headers = {name.lower(): value for name, value in visitor.headers.items()}
     host = headers.get("host", "")
     return host_name(host), host, headers.get("origin", "")

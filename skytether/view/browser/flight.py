@@ -18,21 +18,18 @@ class PageFlight:
     """Flight on a page.
 
     Args:
-        title: its title; empty for a single flight.
-        folder: folder of its control sockets; None if nothing can be changed.
+        title: empty for a single flight.
+        folder: folder of the control sockets; None if nothing can be changed.
     """
 
     def __init__(self, title: str = "", folder: Path | None = None) -> None:
         self.title = title
         self.state = State()
         self.lock = threading.Lock()
-        """Lock for use of the state."""
         self.values: dict[str, dict[str, Any]] = {}
         """Keys that may change and their known values, by process."""
         self.answer = ""
-        """Answer to the newest request; empty before any."""
         self.refused = False
-        """Whether the newest request was refused."""
         self._before: dict[str, Any] = {}
         """Values to restore when the link is healed."""
         self.operator = Operator(folder, self._answered) if folder else None
@@ -48,14 +45,12 @@ class PageFlight:
             self.ask(process, {})
 
     def lose(self, process: str) -> None:
-        """Record that a process's feed has ended."""
         with self.lock:
             self.state.lose(process)
 
     # -- changes -----------------------------------------------------------------------------
 
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
-        """Ask a process for new values of its keys."""
         if self.operator:
             self.operator.ask(process, values)
 
@@ -71,11 +66,9 @@ class PageFlight:
 
     @property
     def is_cut(self) -> bool:
-        """Whether every packet is lost."""
         return controls.is_cut(self.values.get("netem", {}))
 
     def cut(self) -> None:
-        """Lose every packet from now on."""
         values = self.values.get("netem")
         if values and not self.is_cut:
             changed = controls.cut(values)

@@ -39,9 +39,7 @@ CONNECTIONS_MAX = 32
 """Most connections at once, including those that only load the page or have sent no request yet."""
 MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
-"""Most websocket frames of a message."""
 FRAMES_MAX = 1024
-"""Most websocket frames queued for parsing."""
 UNREAD_BYTES = 128 * 1024
 """Size of the kernel's send buffer for a browser that does not read [B]; the kernel doubles it."""
 RATE_HZ = 200.0
@@ -68,8 +66,6 @@ _QUIET.disabled = True  # invalid bytes from the network must not print a traceb
 
 
 class _Outline(msgspec.Struct):
-    """Fields of a message that are checked."""
-
     type: str
     updates: dict[str, msgspec.Raw] = {}
 
@@ -78,7 +74,6 @@ _OUTLINE = msgspec.msgpack.Decoder(_Outline)
 
 
 def is_taken(message: bytes) -> bool:
-    """Whether a message is one that the page's elements send."""
     try:
         outline = _OUTLINE.decode(message)
     except (msgspec.MsgspecError, RecursionError, ValueError):
@@ -96,24 +91,20 @@ class Guard:
     def __init__(self, token: str) -> None:
         self._token = token
         self.counts: Counter[TurnedAway] = Counter()
-        """Number of refusals and dropped messages, by reason."""
         self.connections = 0
         self.browsers = 0
-        """Number of open websockets."""
         self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
     # -- what is counted ---------------------------------------------------------------------
 
     def count(self, why: TurnedAway) -> None:
-        """Count a refusal, or a dropped message."""
         with self._lock:
             self.counts[why] += 1
             if str(self.counts[why]).strip("0") == "1":  # report the first, tenth, hundredth
                 self._news.add(why)
 
     def events(self) -> list[BrowserRefused]:
-        """Events since the last call."""
         with self._lock:
             news, self._news = self._news, set()
             return [BrowserRefused(why=str(why), count=self.counts[why]) for why in news]
@@ -173,7 +164,6 @@ class Guard:
         handle: Callable[[sockets.ServerConnection], Awaitable[None]],
         connection: sockets.ServerConnection,
     ) -> None:
-        """Run viser's handler for a browser."""
         if connection.subprotocol != PROTOCOL:
             self.count(TurnedAway.VERSION)
             await connection.close(CloseCode.PROTOCOL_ERROR, f"Version mismatch: {PROTOCOL}")
@@ -221,9 +211,7 @@ class _Connection(sockets.ServerConnection):
             self._cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
-        """End the connection if pings come while answers are not read: each would queue an
-        answer.
-        """
+        """End a connection that sends pings without reading the answers, which would queue up."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
             self._cut(TurnedAway.ROOM)
         super().process_event(event)
@@ -264,7 +252,6 @@ class _Connection(sockets.ServerConnection):
 
 
 def _unframed(_: sockets.ServerConnection, __: Request, response: Response) -> None:
-    """Forbid that an answer is shown in a frame."""
     response.headers.update(HEADERS)
 
 

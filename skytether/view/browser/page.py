@@ -21,7 +21,6 @@ from skytether.view.browser.panel import More, Panel
 from skytether.view.scene import Scene
 
 MOVES_HZ = 25
-"""Rate at which vehicles' markers move [1/s]."""
 MOVES_TO_A_DRAWING = 5
 """Number of marker updates per redraw of lines, plots and words."""
 
@@ -41,8 +40,7 @@ def _silence() -> contextlib.redirect_stdout[io.StringIO]:
 def stop(server: viser.ViserServer) -> None:
     """Stop a viser server, and wait until its thread has printed its last line.
 
-    viser itself waits for a second, and could print when standard output is used for something
-    else.
+    viser itself waits only for a second, and could print into another output later.
     """
     thread = server._websock_server._server_thread
     with _silence():
@@ -89,11 +87,9 @@ class Page:
 
     @property
     def port(self) -> int:
-        """Port that the page listens on."""
         return self._server.get_port()
 
     def events(self) -> Sequence[BrowserRefused]:
-        """Events about browsers since the last call."""
         return self._guard.events()
 
     def close(self) -> None:
@@ -162,7 +158,6 @@ class Page:
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
     def _begin(self, shown: tuple[object, ...]) -> None:
-        """Build the scene again, for another flight."""
         self._server.scene.reset()
         for client in self._server.get_clients().values():
             client.gui.reset()

@@ -74,9 +74,7 @@ class Panel:
     """Panel of one browser.
 
     Args:
-        client: the browser.
         flights: flights on the page, all with known scenarios.
-        may_play: whether the browser may change the flight.
         unlock: checks a token and returns whether it is right; None if the page has no token.
         more: adds further controls for a browser that may change the flight; the function that it
             returns is called at each redraw.
@@ -111,7 +109,6 @@ class Panel:
         self._add_plots(tabs or gui.add_panel())
 
     def _add_words(self, more: More | None, *, may_play: bool) -> None:
-        """Add the flights' status, and the controls."""
         gui, flights = self._client.gui, self._flights
         self._status = [gui.add_html("") for _ in flights]
         flying = [each for each in flights if each.state.flies]
@@ -153,7 +150,6 @@ class Panel:
         solves = any(not each.control.properties.splines for each in scenarios)
         flies = any(each.state.flies for each in flights)
         self._nobody = None if flies else VehicleTrack(0, scenarios[0])
-        """Placeholder for a vehicle where only netem is known."""
         if flies:
             with panel.add_tab("Flight"):
                 self._plots.append(
@@ -257,7 +253,6 @@ class _Slider:
                 ask(knob, float(self._slider.value))
 
     def show(self, values: Values) -> None:
-        """Set the slider to the value, unless the user is moving it."""
         number = self.knob.read(values)
         self._slider.visible = number is not None
         if number is None or time.monotonic() - self._moved_s < HELD_S:
@@ -272,14 +267,12 @@ class _Question:
     """Question that confirms a change which may end the flight; one at a time.
 
     Args:
-        gui: elements of the browser.
         warning: consequence of the change.
     """
 
     def __init__(self, gui: viser.GuiApi, warning: str) -> None:
         self._gui, self._warning = gui, warning
         self._shown: Any = None
-        """Window with the question, or None."""
 
     def ask(
         self,
@@ -291,7 +284,6 @@ class _Question:
         """Ask for confirmation, unless a question is shown already.
 
         Args:
-            title: the question.
             yes: text of the button that confirms.
             change: called if the user confirms.
             leave: called if not.
@@ -315,8 +307,6 @@ class _Question:
 
 
 class _Network:
-    """Text fields of both network directions, which the browser changes together."""
-
     def __init__(
         self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None], *, flies: bool
     ) -> None:
@@ -335,7 +325,6 @@ class _Network:
             ask({way: text.value for way, text in self._texts.items()})
 
     def show(self, values: Values) -> None:
-        """Show the directions after they have changed."""
         known = texts(values)
         self._folder.visible = bool(known)
         if known != self._known:
@@ -384,7 +373,6 @@ class Controls:
                 flight.heal()
 
     def _let_fly(self) -> None:
-        """Add the controls that need a flight, and not only netem."""
         gui, scenario = self._client.gui, self._flights[0].state.scenario
         self._trigger = gui.add_dropdown(
             "Trigger",
@@ -444,7 +432,6 @@ class Controls:
             flight.ask(knob.process, changed)
 
     def show(self) -> None:
-        """Update the controls and the newest answer."""
         flight = self._flights[0]
         if self._flights[0].state.flies:
             self._show_flight(flight)
@@ -493,7 +480,6 @@ class _Mission:
         self._flight, self._state, self._ask = flights[0], flights[0].state, ask
         self._known, self._vehicle = self._state.zones, vehicle
         self._corners: list[NDArray[Any]] = []
-        """Clicked corners of a box."""
         gui = client.gui
         with gui.add_folder("Mission"):
             self._text = gui.add_text("Zones", self._known, hint=ZONES)
@@ -523,12 +509,10 @@ class _Mission:
                     self._draw(at)
 
     def _goal(self) -> NDArray[Any] | None:
-        """The chosen vehicle's goal [m; shape (axes,)]; None if it is not known."""
         track = self._state.vehicles.get(self._vehicle())
         return track.goal(GOAL_S) if track else None
 
     def _drag(self, place: NDArray[Any], held: bool) -> None:
-        """Set the goal to the place where the user has dropped the handle."""
         if not held:
             self._guide(place)
 
@@ -540,7 +524,6 @@ class _Mission:
         self._ask({GUIDED: format_goals(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
-        """Add a corner of a box; the second corner completes it."""
         self._corners.append(at)
         if len(self._corners) == 2:
             (x0, y0), (x1, y1) = np.sort(np.round(self._corners, 2), axis=0)
@@ -549,7 +532,6 @@ class _Mission:
             self._ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
 
     def show(self) -> None:
-        """Show the zones after they have changed, and the chosen vehicle's goal."""
         self._handle.show(self._goal())
         if self._state.zones != self._known:
             self._known = self._state.zones
@@ -590,7 +572,6 @@ class _Handle:
 
     @property
     def place(self) -> NDArray[Any]:
-        """Position of the handle [m]; shape (3,)."""
         return np.asarray(self._handle.position)
 
     def stay(self) -> None:
@@ -598,11 +579,9 @@ class _Handle:
         self._free_s = time.monotonic() + HELD_S
 
     def put(self, place: NDArray[Any]) -> None:
-        """Move the handle to a position [m; shape (3,)]."""
         self._handle.position = place
 
     def show(self, goal: NDArray[Any] | None) -> None:
-        """Move the handle to a goal [m; shape (axes,)], unless the user holds the handle."""
         if goal is None or self._held or time.monotonic() < self._free_s:
             return
         place = in_space(goal[None])[0]
@@ -634,6 +613,5 @@ class _Lead:
             flight.ask("server", {LED: [np.round(place[: self._axes], 3).tolist()]})
 
     def show(self) -> None:
-        """Move the handle to the target, unless it is being dragged."""
         for track in list(self._flights[0].state.vehicles.values())[:1]:
             self._handle.show(track.goal(LEAD_S))

@@ -18,21 +18,12 @@ from skytether.view.network import SPAN_S
 from skytether.view.state import State
 
 TICK_S = 0.04
-"""Time from one batch of frames to the next [s]."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
-"""Speeds offered to the user, relative to real time."""
 Placed = tuple[int, int, str, Frame]
 """Time of a frame since its flight's first [ns], index of its flight, process, and the frame."""
 
 
 class Player:
-    """Player of recorded frames.
-
-    Args:
-        flights: flights on the page.
-        frames: frames of each flight, in order.
-    """
-
     def __init__(self, flights: Sequence[PageFlight], frames: Sequence[Sequence[Timed]]) -> None:
         self._flights = flights
         self._openings: list[Placed] = []
@@ -50,15 +41,14 @@ class Player:
         self._begin_ns = begin[0] if begin else 0
         self._times_ns = [each[0] for each in self._frames]
         self.end_ns = self._times_ns[-1] if self._times_ns else 0
-        """Time of the last frame since the first [ns]."""
+        """Time of the last frame since the first."""
         self._lock = threading.Lock()
         self._at_ns = 0
         self._next = 0
         self.speed = 1.0
-        """Playback speed relative to real time."""
         self.plays = True
         self._wanted_ns: int | None = None
-        """Time that the user has requested [ns]; None once it is shown."""
+        """Time that the user has requested; None once it is shown."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -66,15 +56,14 @@ class Player:
 
     @property
     def at_ns(self) -> int:
-        """Time shown, since the first frame [ns]."""
+        """Since the first frame."""
         return self._at_ns
 
     def now_ns(self) -> int:
-        """Time shown, on the clock of the first flight [ns]."""
+        """On the clock of the first flight."""
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:
-        """Jump to a time since the first frame [ns]."""
         with self._lock:
             for flight in self._flights:
                 with flight.lock:
@@ -85,7 +74,6 @@ class Player:
             self._go(at_ns)
 
     def advance(self, passed_ns: int) -> None:
-        """Play the frames of the next `passed_ns`."""
         with self._lock:
             self._go(min(self._at_ns + passed_ns, self.end_ns))
 

@@ -21,7 +21,6 @@ from skytether.view.browser.play import PROCESSES
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
-"""Interval at which Ctrl-C is checked [s]."""
 PORTS, PORTS_TRIED = 65536, 100
 """Number of ports that exist, and of those that are tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
@@ -51,9 +50,6 @@ def page(
     Args:
         at: address to listen at; if its port is taken, the next free one.
         now_ns, more: see `Page`.
-
-    Raises:
-        CommandError: the address cannot be listened at.
     """
     host, port = at
     free = next_free(host, port)
@@ -66,11 +62,7 @@ def page(
 
 
 def next_free(host: str, port: int) -> int:
-    """First free port, from `port` on; 0, which takes any free port, stays 0.
-
-    Raises:
-        CommandError: no port is free, or the host is not this machine.
-    """
+    """First free port, from `port` on; 0, which takes any free port, stays 0."""
     for candidate in range(port, min(port + PORTS_TRIED, PORTS)):
         try:
             found = socket.getaddrinfo(
@@ -104,9 +96,6 @@ def until_told(
     Args:
         at, flights, now_ns, more: see `page`.
         log: form of the log.
-
-    Raises:
-        CommandError: the address cannot be listened at.
     """
     with (
         interruptible() as interrupted,
