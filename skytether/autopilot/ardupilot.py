@@ -14,7 +14,7 @@ from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Smallest value of a gain or limit, whatever its parameter says."""
+"""Lower bound of every gain and limit, also if the parameter is smaller."""
 LANDED_S = 2.0
 """Time on the ground after which a landing ends [s], as measured."""
 STATION_ACTIONS = {

@@ -299,8 +299,8 @@ class Autopilot(Endpoint):
         value = parameters.from_wire(message.param_value, kind, bytewise=self._flavour.bytewise)
         if value is not None:
             self.flight.set(name, round(value) if isinstance(before, int) else float(value))
-        for each in self._peers.values():
-            self._send(each, self._telemetry.parameter(name))
+        for receiver in self._peers.values():
+            self._send(receiver, self._telemetry.parameter(name))
 
     def _on_mode(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         self._acknowledge(
@@ -316,9 +316,9 @@ class Autopilot(Endpoint):
         if not mask & POSITION_IGNORED:
             position = turned((message.x, message.y, message.z))
         numbers = (*velocity, *(position or ()))
-        wanted = position is not None or not mask & VELOCITY_IGNORED
+        is_usable = position is not None or not mask & VELOCITY_IGNORED
         if (
-            wanted
+            is_usable
             and mask & ACCELERATION_IGNORED == ACCELERATION_IGNORED
             and message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
             and all(map(isfinite, numbers))
@@ -331,8 +331,8 @@ class Autopilot(Endpoint):
     def _on_command(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         long = message.get_type() == "COMMAND_LONG"
         seventh = message.param7 if long else message.z
-        given = (message.param1, message.param2, message.param3, seventh)
-        result = self._obey(message.command, given, peer)
+        parameters = (message.param1, message.param2, message.param3, seventh)
+        result = self._obey(message.command, parameters, peer)
         self._counts["commands" if result is Result.ACCEPTED else "rejected"] += 1
         self._acknowledge(peer, message, message.command, result)
 

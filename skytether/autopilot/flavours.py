@@ -45,7 +45,7 @@ class SimulatedFlavour:
     """Whether integer parameters are sent as bits, see `mavlink.parameters`."""
     gains: Gains
     frame: str
-    """Frame in the autopilot's own simulator, or the nearest one."""
+    """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
     """Time from the start until it may be armed, in which position and filters settle."""
     words_for_stations: bool

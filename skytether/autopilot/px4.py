@@ -24,7 +24,7 @@ from skytether.quadrotor.quadrotor import Quadrotor
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Smallest value of a gain, whatever its parameter says."""
+"""Lower bound of every gain, also if the parameter is smaller."""
 SILENCE_LAG_S = 0.2
 """Time from the end of COM_OF_LOSS_T until PX4 acts [s], as measured."""
 OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}

@@ -74,11 +74,13 @@ def together(options: DuelOptions) -> list[Scenario]:
         message = f"got {len(options.scenarios)} scenario, expected two or more"
         raise CommandError(message, command.CONFIGURATION)
     overrides = {"duration": options.duration, "seed": options.seed}
-    asked = {key: value for key, value in overrides.items() if value is not None}
-    first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **asked)
+    changes = {key: value for key, value in overrides.items() if value is not None}
+    first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **changes)
     same = {key: getattr(first, key) for key in ("duration", "seed", "settle", "network")}
-    laid = (msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios)
-    return [checked(each, name) for each, name in zip(laid, options.scenarios, strict=True)]
+    scenarios = (
+        msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios
+    )
+    return [checked(each, name) for each, name in zip(scenarios, options.scenarios, strict=True)]
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
@@ -110,9 +112,9 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> N
         on_second = stack.enter_context(terminal.progress(title, scenarios[0].duration))
         pool = stack.enter_context(ThreadPoolExecutor(len(names)))
         flights = list(pool.map(fly, scenarios, sockets))
-    for scenario, name, flown in zip(scenarios, names, flights, strict=True):
-        if not len(flown.client):
+    for scenario, name, record in zip(scenarios, names, flights, strict=True):
+        if not len(record.client):
             raise CommandError("interrupted before the first step", command.INTERRUPTED)
         title = f"{name}, over UDP on loopback, seed {scenario.seed}"
-        parts = flown.client, flown.server, flown.netem
-        terminal.finish(summarise(scenario, name, *parts, figures=flown.figures), title)
+        parts = record.client, record.server, record.netem
+        terminal.finish(summarise(scenario, name, *parts, figures=record.figures), title)

@@ -69,7 +69,7 @@ class FleetOptions(ScenarioOptions):
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """Summary of a fleet's flight and its CPU costs; None for what was not measured."""
+    """Summary of a fleet's flight and its CPU costs; None for figures that were not measured."""
 
     scenario: str
     seed: int
@@ -201,8 +201,8 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     except (OSError, ValueError) as error:
         raise CommandError(f"--mission: {mission}: {error}", command.CONFIGURATION) from None
     shape = ["--reference.shape", "mission", "--reference.file", mission]
-    flown = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
-    return ["swap", *shape, *flown, *rest]
+    duration_flags = ["--model.axes", str(axes), "--duration", f"{lasts_s + AFTER_S:g}"]
+    return ["swap", *shape, *duration_flags, *rest]
 
 
 def _virtually(
@@ -303,10 +303,10 @@ def _separations(scenario: Scenario, flown: Record) -> tuple[Array, Array] | Non
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
-    each = [client[client["vehicle"] == number] for number in numbers]
+    rows_by_vehicle = [client[client["vehicle"] == number] for number in numbers]
     began_s = [vehicles[str(number)]["began_s"] for number in numbers]
     times_s, nearest_m = separations(
-        each, began_s, scenario.control.dt, scenario.mission.height_scale
+        rows_by_vehicle, began_s, scenario.control.dt, scenario.mission.height_scale
     )
     return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
@@ -316,7 +316,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
     client, counted = flown.client, flown.figures
     server = flown.server if options.virtual else None
     servers = [counted[name] for name in counted if name.startswith("server")]
-    measured = [each for each in counted.values() if "cpu_s" in each]
+    measured = [counters for counters in counted.values() if "cpu_s" in counters]
     steps = sum(server["counts"].get("steps", 0) for server in servers)
     spent_us = {
         stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
@@ -326,23 +326,29 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
     if measured:
         spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
     duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
-    each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
-    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in each]
-    known = [value for value in rmse if value is not None]
+    rows_by_vehicle = [
+        client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])
+    ]
+    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in rows_by_vehicle]
+    finite_rmse = [value for value in rmse if value is not None]
     links = (counted["netem"]["uplink"], counted["netem"]["downlink"])
     packets = sum(link["packets"] for link in links)
-    cpu_us = {name: each["cpu_s"] * 1e6 for name, each in counted.items() if "cpu_s" in each}
+    cpu_us = {
+        name: counters["cpu_s"] * 1e6 for name, counters in counted.items() if "cpu_s" in counters
+    }
     return FleetSummary(
         scenario=options.scenario,
         seed=scenario.seed,
-        vehicles=len(each),
+        vehicles=len(rows_by_vehicle),
         workers=len(servers),
         duration_s=duration_s,
         steps=len(client),
         secure=options.secure,
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
-        rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        rmse_xy=(min(finite_rmse), float(np.median(finite_rmse)), max(finite_rmse))
+        if finite_rmse
+        else None,
         separation_m=scenario.mission.separation_m if scenario.is_mission else None,
         least_separation_m=least_m,
         left_tube=sum(server["counts"].get("left_tube", 0) for server in servers)
@@ -352,12 +358,12 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
-        + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
+        + sum(counters["kernel_drops"] + counters["send_errors"] for counters in measured),
         drops=drops(counted),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
-        client_missed=sum(int(rows["missed"][-1]) for rows in each),
+        client_missed=sum(int(rows["missed"][-1]) for rows in rows_by_vehicle),
         machine_missed=machine.missed if machine else None,
         machine_late_ms_max=machine.max_s * 1e3 if machine else None,
         server_cpu_us=spent_us,

@@ -46,8 +46,8 @@ def keygen(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", options.vehicles, len(VEHICLES))
     vehicles = range(options.first, options.first + options.vehicles)
     if not (vehicles[0] in VEHICLES and vehicles[-1] in VEHICLES):
-        given = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
-        raise CommandError(f"--first: got {given}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
+        numbers = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
+        raise CommandError(f"--first: got {numbers}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
     if options.key_id is not None and options.key_id not in NUMBERS:
         raise CommandError(
             f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION
@@ -80,8 +80,8 @@ def make(
     present = keys.load(file) if add else keys.Keyring(str(file), {})
     lines = []
     for vehicle in vehicles:
-        own = _number(present, vehicle, number)
-        lines.append(keys.write(vehicle, own, secrets.token_bytes(SECRET_BYTES)))
+        key_number = _number(present, vehicle, number)
+        lines.append(keys.write(vehicle, key_number, secrets.token_bytes(SECRET_BYTES)))
     _write(file, lines, add=add)
 
 

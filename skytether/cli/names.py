@@ -1,4 +1,4 @@
-"""`skytether triggers`, `skytether reports` and so on: list what a scenario can name."""
+"""`skytether triggers`, `skytether reports` and so on: list the names for a scenario's keys."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -54,9 +54,9 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
         last = ""
         assert child.stdout is not None
         for line in child.stdout:
-            said = line_of(line)
-            if said is not None:
-                say(str(said.event))
+            logged = line_of(line)
+            if logged is not None:
+                say(str(logged.event))
             else:
                 last = line.decode(errors="replace").strip() or last
         if not ended.is_set():

@@ -96,11 +96,11 @@ def probe(argv: Sequence[str]) -> None:
     With --from it analyses a log or captures of another program.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
-    given = bool(options.target) + (options.listen is not None) + bool(options.files)
-    if given != 1:
+    sources = bool(options.target) + (options.listen is not None) + bool(options.files)
+    if sources != 1:
         message = (
-            f"got {'both' if given else 'neither'}, expected either HOST:PORT to measure the path "
-            "to, or --listen HOST:PORT, or --from FILE"
+            f"got {'both' if sources else 'neither'}, expected either HOST:PORT to measure the "
+            "path to, or --listen HOST:PORT, or --from FILE"
         )
         raise CommandError(message, CONFIGURATION)
     if options.files:
@@ -189,12 +189,12 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         )
     measured = prober.measured()
     try:
-        found = outcome(measured, options.target, secure=link.secure)
+        result = outcome(measured, options.target, secure=link.secure)
     except ValueError as error:
         raise CommandError(f"too little was measured: {error}") from None
-    _conclude(options, measured, found)
+    _conclude(options, measured, result)
     if not prober.finished:
-        seconds = found.told.seconds
+        seconds = result.told.seconds
         raise CommandError(
             f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
         )
@@ -227,11 +227,11 @@ def _read(options: ProbeOptions) -> None:
             path = recorded_in(read[0])
             log = "round trips" if path.halved else "one way"
             measured = recorded.of_log(path)
-        found = outcome(measured, names, secure=False, log=log)
+        result = outcome(measured, names, secure=False, log=log)
     except ValueError as error:
         where = f"{names}: " if captures else ""
         raise CommandError(f"--from: {where}{error}", CONFIGURATION) from None
-    _conclude(options, measured, found)
+    _conclude(options, measured, result)
 
 
 def _content(path: Path) -> bytes:
@@ -242,7 +242,7 @@ def _content(path: Path) -> bytes:
         raise CommandError(f"--from: {path}: cannot be read: {reason}", CONFIGURATION) from None
 
 
-# -- what is checked, written and printed ---------------------------------------------------------
+# -- checks and output ---------------------------------------------------------------------------
 
 
 def _say(event: Event) -> None:
@@ -251,14 +251,14 @@ def _say(event: Event) -> None:
 
 def _check(options: ProbeOptions) -> None:
     """Refuse impossible measurements, and files that cannot be written."""
-    for flag, given, least, most in (
+    for flag, value, least, most in (
         ("--seconds", options.seconds, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
         ("--bytes", options.bytes, BYTES_MIN, PAYLOAD_BYTES_MAX),
         ("--id", options.number, 0, 65_535),
     ):
-        if not least <= given <= most:
-            raise CommandError(f"{flag}: got {given:g}, expected {least:g} to {most:g}", 2)
+        if not least <= value <= most:
+            raise CommandError(f"{flag}: got {value:g}, expected {least:g} to {most:g}", 2)
     probes = options.seconds * options.rate
     if probes > PROBES_MAX:
         message = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
@@ -328,7 +328,7 @@ def _missing(delays: Delays) -> int:
 
 
 def _of_log(path: PathFigures) -> str:
-    """Sentences about the limits of a log: what is not in it, and the assumption instead."""
+    """Sentences about data that a log lacks, and the assumptions instead."""
     if path.log == "one way":
         return "Clocks: unknown. The file has the delays of one direction, which are used for both."
     return (
@@ -382,8 +382,8 @@ def _models(ways: dict[str, DirectionFigures]) -> "Table":
     from rich.text import Text
 
     table = Table(title="models, the best first", title_justify="left")
-    for each in ("", "model", "BIC, above the best"):
-        table.add_column(Text(each))
+    for heading in ("", "model", "BIC, above the best"):
+        table.add_column(Text(heading))
     for name, way in ways.items():
         for what, models in (("delay", way.delay_models), ("loss", way.loss_models)):
             for model in models[:MODELS_SHOWN]:
@@ -397,9 +397,9 @@ def _table(ways: dict[str, DirectionFigures]) -> "Table":
     from rich.text import Text
 
     table = Table(title="measured", title_justify="left")
-    for each in ("", *ways):
-        table.add_column(Text(each))
+    for heading in ("", *ways):
+        table.add_column(Text(heading))
     shown = [_figures(way) for way in ways.values()]
     for name in shown[0]:
-        table.add_row(Text(name), *(Text(each[name]) for each in shown))
+        table.add_row(Text(name), *(Text(texts[name]) for texts in shown))
     return table

@@ -73,7 +73,7 @@ class Child:
     process: asyncio.subprocess.Process
     reader: "asyncio.Task[None]" = field(init=False)
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
-    """Last lines of its output, events as sentences."""
+    """Last lines of its output, with events as sentences."""
     address: Address = ("", 0)
     failed: bool = False
     """Whether the process has reported an event after which it could not fly."""
@@ -169,13 +169,13 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
             continue
         if not line:
             return
-        said = line_of(line)
-        if said is None:
+        logged = line_of(line)
+        if logged is None:
             child.said.append(line.decode(errors="replace").rstrip())
             continue
-        if not isinstance(said.event, Counted):  # counters do not say why a process ended
-            child.said.extend(f"{said.process}: {said.event}".splitlines())
-        on_event(said)
+        if not isinstance(logged.event, Counted):  # counters do not say why a process ended
+            child.said.extend(f"{logged.process}: {logged.event}".splitlines())
+        on_event(logged)
 
 
 def feeds_in(folder: Path) -> dict[str, Path]:
@@ -259,8 +259,8 @@ def run(
         interrupted=interrupted,
         on_event=hear,
     )
-    told = parts / "client.json"  # created at the start, and written at the end
-    if interrupted() and not (told.exists() and told.stat().st_size):
+    client_figures = parts / "client.json"  # created at the start, and written at the end
+    if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
         raise CommandError("interrupted before the first step", INTERRUPTED)
     return shortfalls
 
@@ -327,7 +327,7 @@ def record_of(
         server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
-        figures={name: json.loads(told) for name, told in counted.items() if told},
+        figures={name: json.loads(text) for name, text in counted.items() if text},
         events=tuple(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
@@ -381,6 +381,8 @@ async def _fly(
         for child in children:
             code = child.process.returncode
             # Shortfalls are reported at the end, together with the flight's summary.
-            flown = child.name == flies and (code == 0 or (child.fell_short and not child.failed))
-            if code is not None and not flown:
+            has_flown = child.name == flies and (
+                code == 0 or (child.fell_short and not child.failed)
+            )
+            if code is not None and not has_flown:
                 raise CommandError(child.last_words())

@@ -127,7 +127,7 @@ class Live:
         self._path = path
         self._tell = tell
         self._fault: str | None = None
-        """First fault: what is missing in the recording."""
+        """First fault of the recording."""
         self._growing: files.Growing | None = None
         self._recording: Recording | None = None
         """None once the file has failed."""

@@ -17,7 +17,7 @@ from skytether.shell.options import read, toml_value
 @dataclass(frozen=True)
 class SetOptions:
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Socket that server, netem or client was given as --control."""
+    """Control socket: the path given to server, netem or client as --control."""
     changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
     """Keys and values, as in network.uplink.loss=0.3; a value is TOML, or else a string."""
 

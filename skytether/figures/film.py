@@ -74,7 +74,7 @@ def _frames(
     from PIL import Image
 
     dt_s, steps = scenario.control.dt, client["step"]
-    shown = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
+    frame_steps = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
     tracks = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
 
     figure = blank(6.4, 3.2)
@@ -104,7 +104,7 @@ def _frames(
         nearest.set_xlabel("time [s]")
         nearest.set_ylabel("distance [m]")
         nearest.legend(loc="upper right", fontsize=7)
-    for step in shown:
+    for step in frame_steps:
         figure.suptitle(f"{title}: {step * dt_s:.0f} s", fontsize=8)
         for rows, trail, place in drawn:
             past = rows["step"] <= step

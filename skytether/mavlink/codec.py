@@ -74,11 +74,11 @@ def _length(data: bytearray, at: int) -> int:
 
     A truncated header counts as the longest frame.
     """
-    left = len(data) - at
+    remaining = len(data) - at
     if data[at] == 0xFD:
-        if left < 3:
+        if remaining < 3:
             return FRAME_BYTES_MAX
         return 12 + data[at + 1] + (13 if data[at + 2] & SIGNED else 0)
     if data[at] == 0xFE:
-        return FRAME_BYTES_MAX if left < 2 else 8 + data[at + 1]
+        return FRAME_BYTES_MAX if remaining < 2 else 8 + data[at + 1]
     return 0

@@ -145,9 +145,9 @@ def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     if way.came.sum() < 2:
         raise ValueError("fewer than two packets arrived")
     time_s, delay_s = _points(way.sent_ns, way.came_ns)
-    found = _alone(way, time_s, delay_s, None)
+    result = _alone(way, time_s, delay_s, None)
     least_s = float(delay_s[way.came].min())
-    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), found, found
+    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), result, result
 
 
 def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
@@ -193,9 +193,9 @@ def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> floa
     if len(times) < 4:
         return DRIFT_MAX
     slopes = np.polyfit(times, offsets, 1)
-    left = np.asarray(offsets) - np.polyval(slopes, times)
+    residuals = np.asarray(offsets) - np.polyval(slopes, times)
     spread = float(np.std(times)) * sqrt(len(times))
-    return sqrt(float(left @ left) / (len(times) - 2)) / spread
+    return sqrt(float(residuals @ residuals) / (len(times) - 2)) / spread
 
 
 def lower_hull(x: Array, y: Array) -> tuple[Array, Array]:
@@ -247,7 +247,7 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
     """
     centred = values - np.nanmean(values)
     variance = float(np.nanmean(centred**2))
-    apart, found = [], []
+    apart, correlations = [], []
     typical = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     for lag in range(1, min(lags, len(values) // 4) + 1):
         between = time_s[lag:] - time_s[:-lag]
@@ -256,8 +256,8 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
         if pairs.sum() < 10 or variance <= ALIKE_S**2:
             break
         apart.append(float(between[pairs].mean()))
-        found.append(float(product[pairs].mean()) / variance)
-    return np.array(apart), np.array(found)
+        correlations.append(float(product[pairs].mean()) / variance)
+    return np.array(apart), np.array(correlations)
 
 
 def effective(count: int, correlations: Array) -> float:
@@ -332,10 +332,10 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     if not trains:
         return None
     alone = np.sort(delay_s[way.came & (way.train < 0)])
-    found = [_slope(trains)]
+    estimates = [_slope(trains)]
     if len(trains) >= GROUPS_MIN and len(alone) >= ALONE_MIN:
-        found.append(_likeliest(trains, alone, *found[0]))
-    time_s, error = min(found, key=lambda each: each[1])
+        estimates.append(_likeliest(trains, alone, *estimates[0]))
+    time_s, error = min(estimates, key=lambda each: each[1])
     spread_s = time_s * max(float(places[-1]) for places, _ in trains)
     if spread_s < SPREAD_MIN_S or time_s < 4.0 * error:
         return None
@@ -353,9 +353,9 @@ def _slope(trains: Trains) -> tuple[float, float]:
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx
-    left = sum(float((y - slope * x) @ (y - slope * x)) for x, y in centred)
+    residual = sum(float((y - slope * x) @ (y - slope * x)) for x, y in centred)
     free = max(sum(len(x) - 1 for x, _ in centred) - 1, 1)
-    return slope, sqrt(left / free / sxx)
+    return slope, sqrt(residual / free / sxx)
 
 
 def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:

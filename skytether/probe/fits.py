@@ -40,10 +40,10 @@ class FittedImpairment:
     """Bayesian information criterion: the smaller, the better."""
 
     def text(self, correlation_s: float = 0.0) -> str:
-        shown = [f"{number:.5g}" for number in self.numbers]
+        arguments = [f"{number:.5g}" for number in self.numbers]
         if correlation_s and self.name != "constant":
-            shown.append(f"correlation_s={correlation_s:.3g}")
-        return f"{self.name}({', '.join(shown)})"
+            arguments.append(f"correlation_s={correlation_s:.3g}")
+        return f"{self.name}({', '.join(arguments)})"
 
 
 # -- delays -------------------------------------------------------------------------------------
@@ -138,10 +138,10 @@ def _paper(delay_s: Array) -> Found | None:
     if span < 20.0 * RESOLUTION_S:
         return None
     shift = delay_s - first
-    some = shift[:: max(1, len(shift) // 2000)]
+    sample = shift[:: max(1, len(shift) // 2000)]
 
     def concentration(slot_s: float) -> float:
-        return abs(complex(np.mean(np.exp(2j * pi * some / slot_s))))
+        return abs(complex(np.mean(np.exp(2j * pi * sample / slot_s))))
 
     # Slots at equal distances of 1/slot: a peak is as wide as 1/span.
     inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
@@ -157,8 +157,8 @@ def _paper(delay_s: Array) -> Found | None:
     phase = float(np.angle(np.mean(np.exp(2j * pi * shift / slot)))) * slot / (2.0 * pi)
     places = np.rint((shift - phase) / slot)
     slot, begin = (float(each) for each in np.polyfit(places, delay_s, 1))
-    left = delay_s - begin - slot * places
-    error = max(float(np.std(left)), RESOLUTION_S)
+    residuals = delay_s - begin - slot * places
+    error = max(float(np.std(residuals)), RESOLUTION_S)
     places -= places.min()
     begin = float(np.mean(delay_s - slot * places))
 
@@ -176,7 +176,7 @@ def _paper(delay_s: Array) -> Found | None:
         return None
     before = max(befores[:200], key=likelihood)
     numbers = max(begin - before * slot, 0.0), slot, float(np.mean(places)) + before
-    return "paper", numbers, 4, likelihood(before) + _normal_likelihood(left, error)
+    return "paper", numbers, 4, likelihood(before) + _normal_likelihood(residuals, error)
 
 
 # -- losses -------------------------------------------------------------------------------------
@@ -193,11 +193,11 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
         time_s: times of sending, in the order of sending; shape (n,).
         lost: whether each was lost; shape (n,).
     """
-    count, gone = len(lost), int(np.sum(lost))
-    if count < PAIRS_MIN or gone in (0, count):
+    count, lost_count = len(lost), int(np.sum(lost))
+    if count < PAIRS_MIN or lost_count in (0, count):
         return []
-    share = gone / count
-    bernoulli = gone * log(share) + (count - gone) * log(1.0 - share)
+    share = lost_count / count
+    bernoulli = lost_count * log(share) + (count - lost_count) * log(1.0 - share)
     fits = [FittedImpairment("loss", (share,), log(count) - 2.0 * bernoulli)]
     between = np.maximum(np.diff(time_s), 0.0)
     before, after = lost[:-1].astype(bool), lost[1:].astype(bool)

@@ -102,9 +102,11 @@ class Listener(Endpoint):
     def _hear(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
         if isinstance(message, ProbeHello):
-            room = self._gives_way(datagram.peer, now_ns) is not None
-            room = room or len(self._sessions) < SESSIONS_MAX
-            welcome = ProbeWelcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
+            has_room = self._gives_way(datagram.peer, now_ns) is not None
+            has_room = has_room or len(self._sessions) < SESSIONS_MAX
+            welcome = ProbeWelcome(
+                message.nonce, self._cookie(message.nonce, datagram.peer), has_room
+            )
             packet = call.line.seal(encode(welcome))
             if len(packet) > len(datagram.payload):
                 raise ProtocolError(Drop.LENGTH)
@@ -130,10 +132,10 @@ class Listener(Endpoint):
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
         if session is None:
             if len(self._sessions) >= SESSIONS_MAX:
-                gone = self._gives_way(peer, now_ns)
-                if gone is None:
+                replaced = self._gives_way(peer, now_ns)
+                if replaced is None:
                     raise ProtocolError(Drop.FULL)
-                del self._sessions[gone]
+                del self._sessions[replaced]
             session = self._sessions[name] = ProbeSession(now_ns, host_of(peer))
         session.heard_ns = now_ns
         self._sessions.move_to_end(name)

@@ -52,7 +52,7 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     quantiles_s: dict[str, float]
     """Quantiles of the delay, by probability."""
     correlation: list[tuple[float, float]]
-    """Time between two packets [s], and correlation of their delays."""
+    """Time between two packets [s] and the correlation of their delays, by lag."""
     correlation_s: float
     """Time in which the correlation falls to 1/e; 0 without significant correlation."""
     rate_bytes_per_s: float | None
@@ -133,7 +133,7 @@ def outcome(
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
     clocks, down, up = (analysis.delays_of_log if log else analysis.delays)(measured)
     delays = {"uplink": up, "downlink": down}
-    told = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
+    directions = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
     near = measured.downlink.sent_ns
     path = PathFigures(
         listener=listener,
@@ -146,10 +146,10 @@ def outcome(
         offset_doubt_s=clocks.doubt_s,
         drift_ppm=clocks.drift * 1e6,
         drift_doubt_ppm=clocks.drift_doubt * 1e6,
-        round_trip_mean_s=told["uplink"].mean_s + told["downlink"].mean_s,
+        round_trip_mean_s=directions["uplink"].mean_s + directions["downlink"].mean_s,
         round_trip_least_s=clocks.least_sum_s,
         unreported=measured.unreported,
-        **told,
+        **directions,
     )
     return ProbeOutcome(clocks, delays, path)
 
@@ -219,7 +219,7 @@ def trace(delays: Delays) -> str:
     begin = float(delays.time_s[0])
     for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # a trace has one packet for each instant: the first
+        if at > last:  # a trace has at most one packet per time: the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"

@@ -147,7 +147,7 @@ class Prober(Endpoint):
         self._trains = 0
         self._dropped: Counter[Drop] = Counter()
 
-    # -- what comes ----------------------------------------------------------------------------
+    # -- incoming ------------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         try:
@@ -204,7 +204,7 @@ class Prober(Endpoint):
                 probe = self._logged_number[answer.number]
                 self._longest_ns = max(self._longest_ns, now_ns - self._sent_ns[probe])
 
-    # -- what is sent --------------------------------------------------------------------------
+    # -- outgoing -----------------------------------------------------------------------------
 
     def wake(self, *, now_ns: int) -> None:
         if self._done:
@@ -280,7 +280,7 @@ class Prober(Endpoint):
     def finished(self) -> bool:
         return self._done
 
-    # -- what was measured ---------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------
 
     @property
     def probed_s(self) -> float:

@@ -67,11 +67,11 @@ def of_captures(near: bytes, far: bytes) -> MeasuredPath:
     Raises:
         ValueError: one cannot be read, or they have too few packets in common.
     """
-    here, there = _directions(near), _directions(far)
-    where = {payload: ends for ends, packets in there.items() for _, payload in packets}
+    near_flows, far_flows = _directions(near), _directions(far)
+    where = {payload: ends for ends, packets in far_flows.items() for _, payload in packets}
     shared = Counter(
         (ends, where[payload])
-        for ends, packets in here.items()
+        for ends, packets in near_flows.items()
         for _, payload in packets
         if payload in where
     )
@@ -79,7 +79,7 @@ def of_captures(near: bytes, far: bytes) -> MeasuredPath:
         raise ValueError("no UDP packet is in both captures with its payload")
     ends, far_ends = shared.most_common(1)[0][0]
     flow = [
-        _as_sent(here.get(one, []), there.get(other, []))
+        _as_sent(near_flows.get(one, []), far_flows.get(other, []))
         for one, other in ((ends, far_ends), (ends[::-1], far_ends[::-1]))
     ]
     ahead_ns = [_ahead_ns(*direction) for direction in flow]
@@ -98,21 +98,21 @@ def _as_sent(near: Packets, far: Packets) -> tuple[Packets, Packets]:
     If a kernel splits packets late (UDP segmentation offload), a capture has several as one.
     """
 
-    def cut(packets: Packets, others: Packets) -> Packets:
-        known = {payload for _, payload in others}
-        sizes = [size for size, _ in Counter(map(len, known)).most_common(SIZES_MAX)]
+    def split(packets: Packets, others: Packets) -> Packets:
+        whole = {payload for _, payload in others}
+        sizes = [size for size, _ in Counter(map(len, whole)).most_common(SIZES_MAX)]
         found: Packets = []
         for time_ns, payload in packets:
             pieces = [payload]
-            for size in sizes if payload not in known else []:
+            for size in sizes if payload not in whole else []:
                 parts = [payload[at : at + size] for at in range(0, len(payload), size)]
-                if not known.isdisjoint(parts):
+                if not whole.isdisjoint(parts):
                     pieces = parts
                     break
             found += [(time_ns, piece) for piece in pieces]
         return found
 
-    return cut(near, far), cut(far, near)
+    return split(near, far), split(far, near)
 
 
 def _ahead_ns(near: Packets, far: Packets) -> float:
@@ -141,22 +141,22 @@ def _way(sent: Packets, came: Packets) -> tuple[Way, int]:
     arrivals = defaultdict[bytes, list[int]](list)
     for time_ns, payload in came:
         arrivals[payload].append(time_ns)
-    own = [(time_ns, payload) for time_ns, payload in sent if counts[payload] == 1]
-    both = [place for place, (_, payload) in enumerate(own) if payload in arrivals]
-    if len(both) < 2 or 2 * len(own) < len(sent):
+    unique = [(time_ns, payload) for time_ns, payload in sent if counts[payload] == 1]
+    both = [place for place, (_, payload) in enumerate(unique) if payload in arrivals]
+    if len(both) < 2 or 2 * len(unique) < len(sent):
         raise ValueError(
-            f"of {len(sent)} packets of a direction {len(own)} have a unique payload: "
+            f"of {len(sent)} packets of a direction {len(unique)} have a unique payload: "
             "expected most; a capture on one interface has each packet once"
         )
-    own = own[both[0] : both[-1] + 1]
-    if len(own) > PROBES_MAX:
-        raise ValueError(f"got {len(own)} packets of a direction, expected at most {PROBES_MAX}")
-    heard = [arrivals.get(payload, []) for _, payload in own]
+    unique = unique[both[0] : both[-1] + 1]
+    if len(unique) > PROBES_MAX:
+        raise ValueError(f"got {len(unique)} packets of a direction, expected at most {PROBES_MAX}")
+    heard = [arrivals.get(payload, []) for _, payload in unique]
     way = Way(
-        np.array([time_ns for time_ns, _ in own], np.int64),
+        np.array([time_ns for time_ns, _ in unique], np.int64),
         np.array([times_ns[0] if times_ns else 0 for times_ns in heard], np.int64),
         np.array([bool(times_ns) for times_ns in heard]),
-        np.full(len(own), -1, np.int64),
+        np.full(len(unique), -1, np.int64),
         sum(max(len(times_ns) - 1, 0) for times_ns in heard),
     )
     return way, len(sent) - sum(counts[payload] == 1 for _, payload in sent)
@@ -218,13 +218,13 @@ def _pcapng(content: bytes) -> Iterator[Record]:
             (link,) = struct.unpack_from(order + "H", block)
             interfaces.append((link, _ticks_per_s(order, block[8:])))
         elif kind == 6 and len(block) >= 20:  # enhanced packet
-            interface, high, low, kept, _ = struct.unpack_from(order + "IIIII", block)
+            interface, high, low, length, _ = struct.unpack_from(order + "IIIII", block)
             if interface < len(interfaces):
                 link, per_s = interfaces[interface]
                 time_ns = ((high << 32) | low) * SECOND_NS // per_s
                 if time_ns > TIME_MAX_NS:
                     raise ValueError(f"got a packet at {time_ns / SECOND_NS:.3g} s since 1970")
-                yield time_ns, link, block[20 : 20 + kept]
+                yield time_ns, link, block[20 : 20 + length]
         at += size
 
 

@@ -92,15 +92,15 @@ def encode(message: Message, size: int = 0) -> bytes:
     """
     fields: tuple[Any, ...] = message
     if isinstance(message, ProbeAnswer):
-        room = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
-        arrivals = message.arrivals[: max(0, room // _ARRIVAL.size)]
+        free_bytes = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
+        arrivals = message.arrivals[: max(0, free_bytes // _ARRIVAL.size)]
         fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in arrivals)
     if isinstance(message, ProbeWelcome):
         return msgpack.packb((VERSION, 2, *message))
     bare = _packed(type(message), fields, b"")
-    room = size - len(bare)
+    free_bytes = size - len(bare)
     # The msgpack header of more than 255 padding bytes is one byte longer.
-    return _packed(type(message), fields, _PADDING[: max(0, room - (room > 255))])
+    return _packed(type(message), fields, _PADDING[: max(0, free_bytes - (free_bytes > 255))])
 
 
 def _packed(kind: type[Message], fields: tuple[Any, ...], padding: bytes) -> bytes:

@@ -231,8 +231,8 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     errors = np.array([-roll, -pitch, -yaw])
     inertia = np.array([frame.roll_inertia, frame.pitch_inertia, frame.yaw_inertia])
     for i in range(3):
-        asked = frame.attitude_gain * errors[i] * (0.4 if i == 2 else 1.0)
-        turning = frame.rate_gain * (asked - rates[i]) - frame.rate_damping * quad.turning[i]
+        rate = frame.attitude_gain * errors[i] * (0.4 if i == 2 else 1.0)
+        turning = frame.rate_gain * (rate - rates[i]) - frame.rate_damping * quad.turning[i]
         torque[i] = inertia[i] * turning
     return frame.mass_kg * max(thrust, 0.0)
 

@@ -36,7 +36,7 @@ SEGMENTS_MAX = 64
 SEGMENTED_BYTES_MAX = 65_000
 """Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
-"""Largest payload of a datagram of which at least two are sent as one [B]."""
+"""Largest payload of a datagram that is sent together with another as one [B]."""
 
 _STRIDE = 65_536 + 4096 + 64
 """Distance of two receive buffers [B]: the longest datagram, and an odd number of cache lines, so
@@ -46,7 +46,7 @@ _STARTS = range(0, _STRIDE * BATCH_MAX, _STRIDE)
 _SOL_UDP, _UDP_SEGMENT = 17, 103
 _HEADER = struct.Struct("@QI4xQQQQi4xI4x")
 """Layout of `struct mmsghdr`: address of the name and its size, address and number of the buffers,
-address and size of control data, flags, size of what was received or sent."""
+address and size of control data, flags, size of the payload received or sent."""
 _BUFFER = struct.Struct("@QQ")
 """Layout of `struct iovec`: address of a buffer and its size."""
 _MSG_DONTWAIT = 0x40
@@ -104,14 +104,14 @@ class _Headers:
     def __init__(self, stride: int, size: int, name_bytes: int) -> None:
         # An anonymous mapping takes memory only for pages that were written to: a process that
         # receives one datagram at a time uses one page. A bytearray or huge pages would take 9 MB.
-        room = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        memory = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with contextlib.suppress(OSError):  # a kernel without huge pages
-            room.madvise(mmap.MADV_NOHUGEPAGE)
-        self.room = memoryview(room)
+            memory.madvise(mmap.MADV_NOHUGEPAGE)
+        self.room = memoryview(memory)
         self.names = bytearray(name_bytes * BATCH_MAX)
         buffers, headers = bytearray(_BUFFER.size * BATCH_MAX), bytearray(_HEADER.size * BATCH_MAX)
         stamps = bytearray(_STAMP.size * BATCH_MAX)
-        parts = room, self.names, buffers, stamps
+        parts = memory, self.names, buffers, stamps
         at, names_at, buffers_at, stamps_at = (_address(each) for each in parts)
         for i in range(BATCH_MAX):
             _BUFFER.pack_into(buffers, i * _BUFFER.size, at + i * stride, size)
@@ -123,9 +123,9 @@ class _Headers:
         self.sizes = memoryview(buffers).cast("Q")[1::2]
         """Shape (BATCH_MAX,) [B]."""
         self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
-        """Sizes of what was received; shape (BATCH_MAX,) [B]."""
+        """Sizes of received payloads; shape (BATCH_MAX,) [B]."""
         self.stamp_sizes = memoryview(headers).cast("Q")[5 :: _HEADER.size // 8]
-        """Sizes of the control data [B]; the kernel lowers each to what it has written."""
+        """Sizes of the control data [B]; the kernel lowers each to the size that it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
         """Arrival times by CLOCK_REALTIME: seconds, and nanoseconds beyond them; shape
@@ -185,10 +185,10 @@ class DatagramBatch:
         ahead_ns, now_ns = _clocks()
         if count <= 0:
             return [], [], []
-        room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
+        memory, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
         lengths = rows.done[:count].tolist()
         payloads = [
-            room[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
+            memory[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
         ]
         columns = rows.stamp_sizes, rows.stamps_s, rows.stamps_ns
         times = zip(*(column[:count].tolist() for column in columns), strict=True)
@@ -209,10 +209,10 @@ class DatagramBatch:
         rows, count, at, name_bytes = self._out, len(payloads), 0, self._name_bytes
         if max(map(len, payloads)) > SIZE_MAX or any(len(peer) != name_bytes for peer in peers):
             return 0
-        room, sizes = rows.room, rows.sizes
+        memory, sizes = rows.room, rows.sizes
         for i, payload in enumerate(payloads):
             size = sizes[i] = len(payload)
-            room[at : at + size] = payload
+            memory[at : at + size] = payload
             at += SIZE_MAX
         rows.names[: count * name_bytes] = b"".join(peers)
         return max(0, self._send(sock.fileno(), rows.first, count, _MSG_DONTWAIT))

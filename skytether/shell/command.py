@@ -131,10 +131,10 @@ def parse(
 
 def address(flag: str, text: str) -> Address:
     """Address given to a flag as HOST:PORT, with an IPv6 host in brackets."""
-    found = parse_address(text)
-    if found is None:
+    parsed = parse_address(text)
+    if parsed is None:
         raise CommandError(f"{flag}: got {text!r}, expected {HOST_PORT}", CONFIGURATION)
-    return found
+    return parsed
 
 
 def flight_warnings(scenario: Scenario) -> list[Event]:
@@ -243,12 +243,12 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     # a fault of the machine: a full disk, too few open files, a broken pipe
     except OSError as error:
         # the reader of our output has closed it, as `head` does
-        gone = isinstance(error, BrokenPipeError)
+        is_closed = isinstance(error, BrokenPipeError)
         with suppress(OSError):
             sys.stdout.flush()
-            return RUN if gone else _refuse(prog, _reason(error), RUN)
+            return RUN if is_closed else _refuse(prog, _reason(error), RUN)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return RUN if gone else _refuse(prog, _reason(error), RUN)
+        return RUN if is_closed else _refuse(prog, _reason(error), RUN)
     return 0
 
 

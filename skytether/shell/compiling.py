@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-# for type checking alone: what flies aboard has no kernels
+# for type checking only: the vehicle's client has no kernels
 if TYPE_CHECKING:
     from skytether.shared.base.kernel import Missing
 
@@ -25,14 +25,14 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
         kernels: kernels to compile; those that take longest should come first.
         on_done: called after each kernel, from any thread.
     """
-    kept = deque(each for each in kernels if each.is_stored)
-    cores = min(len(os.sched_getaffinity(0)), len(kept))
+    queue = deque(each for each in kernels if each.is_stored)
+    cores = min(len(os.sched_getaffinity(0)), len(queue))
     if cores > 1:
         with ThreadPoolExecutor(cores) as helpers:
             for _ in range(cores):
-                helpers.submit(_have_compiled, kept, on_done)
+                helpers.submit(_have_compiled, queue, on_done)
     for each in kernels:
-        # Reads from disk what the other processes have compiled, and compiles where they failed.
+        # Loads code that other processes have compiled, and compiles kernels for which they failed.
         each.compile()
         if cores < 2 or not each.is_stored:
             on_done()

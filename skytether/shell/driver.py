@@ -141,7 +141,7 @@ class Shell:
         self._crowded: dict[int, DatagramBatch] = {}
         """Arrays by the number of each socket that is read in batches."""
         self._heard_ns = 0
-        """Newest time that the endpoint was given [ns]; times must not decrease."""
+        """Newest time passed to the endpoint [ns]; times must not decrease."""
         self._woken_ns = 0
         self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
@@ -218,22 +218,22 @@ class Shell:
     def _hear(self, number: int) -> None:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
-        room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
+        buffer, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch, is_refused = self._stopwatch, False
         try:
             for count in range(BURST_MAX):
                 stopwatch.start()
                 try:
-                    size, sender = receive(room)
+                    size, sender = receive(buffer)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
                     is_refused |= count == 0  # the socket was readable, so an error was pending
                     break
-                except OSError:  # an earlier packet of ours found the peer's port closed
+                except OSError:  # ICMP: the peer's port was closed when an earlier packet arrived
                     is_refused = True
                     continue
                 stopwatch.lap("receive")
-                hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+                hear(Datagram(buffer[:size].tobytes(), peer, number), now_ns=clock_ns())
             if is_refused:
                 for reason in refusals(self._sockets[number]):
                     self.endpoint.undelivered(number, reason)
@@ -278,7 +278,8 @@ class Shell:
             self._after()
 
     def _read_slice(self) -> None:
-        """Read what has come to crowded sockets since the last slice, at most BATCHES_MAX each.
+        """Read the datagrams at crowded sockets since the last slice, at most BATCHES_MAX calls
+        each.
 
         Handling datagrams in a row takes half the time of waking the process for each, with cold
         caches. The kernel's timestamps give the arrival time of each.
@@ -342,20 +343,20 @@ class Shell:
         self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
     ) -> tuple[list[bytes], list[Address], list[int]]:
         """Datagrams that came over an interface which still exists."""
-        kept: list[bytes] = []
+        received: list[bytes] = []
         peers: list[Address] = []
         kept_ns: list[int] = []
         for payload, raw, came_ns in zip(payloads, raws, stamps_ns, strict=True):
             with contextlib.suppress(OSError):
                 peers.append(self._names.heard(raw))
-                kept.append(payload)
+                received.append(payload)
                 kept_ns.append(came_ns)
-        return kept, peers, kept_ns
+        return received, peers, kept_ns
 
     def _wake(self) -> None:
         self._armed = None
         try:
-            if self._crowded:  # handle datagrams that have arrived before what is due
+            if self._crowded:  # datagrams that have arrived come before due work
                 self._read_slice()
             now_ns, due_ns = time.monotonic_ns(), self.endpoint.next_wake_ns()
             if due_ns is not None and due_ns <= now_ns:
@@ -440,11 +441,11 @@ class Shell:
             self._on_event(HostMissing(host=host, reason=reason))
         while self._names.may_change:
             await asyncio.sleep(RESOLVE_EVERY_S)
-            found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
+            addresses: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
             # A thread and no executor: the loop waits for executors at its end, and a lookup may
             # take 20 s.
-            threading.Thread(target=self._look_up, args=(found,), daemon=True).start()
-            self._learn(await found)
+            threading.Thread(target=self._look_up, args=(addresses,), daemon=True).start()
+            self._learn(await addresses)
 
     def _learn(self, addresses: dict[Address, Address]) -> None:
         late = [

@@ -74,10 +74,10 @@ class Collected(Collector):
         if self._snapshot is None:
             return
         figures, taken_s = self._snapshot
-        told, unknown = families(self._kind, figures)
+        metrics, unknown = families(self._kind, figures)
         age_s.add_sample(age_s.name, {}, time.monotonic() - taken_s)
         unmapped.add_sample(unmapped.name, {}, float(len(unknown)))
-        yield from (age_s, unmapped, *told)
+        yield from (age_s, unmapped, *metrics)
 
     def trouble(self) -> str:
         if self._snapshot is None:

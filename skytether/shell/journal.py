@@ -1,4 +1,4 @@
-"""Journal of what an operator has set in flight, beside the control socket of its process.
+"""Journal of values that an operator has set in flight, beside the process's control socket.
 
 Values set by `skytether set` or on the page (zones, goals, whether a vehicle is armed) survive a
 restart of the process. A value is written before it is acknowledged, and read when the process
@@ -56,7 +56,7 @@ class Journal:
         self.scenario = scenario
 
     def read(self) -> SettingsRecalled | None:
-        """Restore what was set in an earlier run; None if there is no journal.
+        """Restore values that were set in an earlier run; None if there is no journal.
 
         Raises:
             CommandError: the journal cannot be used.
@@ -111,7 +111,7 @@ class Journal:
 
 
 class TakenUp(NamedTuple):
-    """Scenario of a process that starts, with what was set in an earlier run."""
+    """Scenario of a process that starts, with the values set in an earlier run."""
 
     journal: Journal | None
     """None without a control socket."""
@@ -120,7 +120,7 @@ class TakenUp(NamedTuple):
 
 
 def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
-    """Restore what was set in an earlier run, from the journal beside a control socket.
+    """Restore values that were set in an earlier run, from the journal beside a control socket.
 
     Args:
         control: path of the control socket; None without one.

@@ -50,11 +50,11 @@ class Limit:
             kinds: if empty, all.
             now_ns: None ends every second.
         """
-        told = []
+        events = []
         for kind in kinds or tuple(self._seconds):
             second = self._seconds.get(kind)
             if second is not None and (now_ns is None or now_ns >= second.end_ns):
                 del self._seconds[kind]
                 if second.omitted:
-                    told.append(Omitted(kind=kind, count=second.omitted))
-        return told
+                    events.append(Omitted(kind=kind, count=second.omitted))
+        return events

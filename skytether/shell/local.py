@@ -36,19 +36,21 @@ class Local:
                 self.socket.bind(str(path))
             finally:
                 os.umask(before)
-            made = path.lstat()
+            status = path.lstat()
         except OSError as error:
             self.socket.close()
-            taken = "another process listens there" if error.errno == EADDRINUSE else error.strerror
-            raise LocalError(f"{path}: cannot create the socket: {taken or error}") from None
-        self._made = made.st_dev, made.st_ino
+            reason = (
+                "another process listens there" if error.errno == EADDRINUSE else error.strerror
+            )
+            raise LocalError(f"{path}: cannot create the socket: {reason or error}") from None
+        self._made = status.st_dev, status.st_ino
 
     def close(self) -> None:
         """Remove the socket, if the path still leads to it."""
         self.socket.close()
         with suppress(OSError):
-            found = self._path.lstat()
-            if (found.st_dev, found.st_ino) == self._made:
+            status = self._path.lstat()
+            if (status.st_dev, status.st_ino) == self._made:
                 self._path.unlink()
 
 
@@ -59,10 +61,10 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
         OSError: the path is in use.
     """
     try:
-        found = path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
+    if not stat.S_ISSOCK(status.st_mode) or status.st_uid != os.geteuid():
         raise OSError("expected a new path, or a socket that an ended process left behind")
     with socket.socket(socket.AF_UNIX, kind) as caller:
         caller.setblocking(False)  # a listener whose queue is full counts as alive

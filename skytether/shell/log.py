@@ -68,8 +68,8 @@ class Log:
 
     def hear(self, event: Event) -> None:
         """Log an event of an endpoint, within the limit of each kind."""
-        for told in self._limit.admit(event, now_ns=time.monotonic_ns()):
-            self.say(told)
+        for admitted in self._limit.admit(event, now_ns=time.monotonic_ns()):
+            self.say(admitted)
 
     def say(self, event: Event) -> None:
         """Log an event in one write of whole lines: several workers may share the output."""

@@ -110,14 +110,14 @@ class MemoryFile:
             return None
         except OSError as error:
             raise MemoryRefused(f"{self._path}: {error.strerror or error}") from None
-        found = self._opened(content)
+        envelope = self._opened(content)
         for name, expected in self._identity.items():
-            given = found.identity.get(name, "")
-            if given != expected:
-                said = f"{name}: got {given or 'nothing'}, expected {expected}"
-                raise MemoryRefused(f"{self._path}: it was kept by another flight: {said}")
-        is_now = bool(self._host) and found.host == self._host
-        return found.content, found.written_ns if is_now else None
+            written = envelope.identity.get(name, "")
+            if written != expected:
+                mismatch = f"{name}: got {written or 'nothing'}, expected {expected}"
+                raise MemoryRefused(f"{self._path}: it was kept by another flight: {mismatch}")
+        is_now = bool(self._host) and envelope.host == self._host
+        return envelope.content, envelope.written_ns if is_now else None
 
     def _opened(self, held: bytes) -> _Envelope:
         digest, body = held[len(MAGIC) :][:DIGEST_BYTES], held[len(MAGIC) + DIGEST_BYTES :]
@@ -157,9 +157,9 @@ class MemoryFile:
 
     def news(self) -> NotKept | None:
         """Event that says why the file cannot be written; None if it can, or that was reported."""
-        failure, told = self._failure, self._told
+        failure, reported = self._failure, self._told
         self._told = failure
-        return NotKept(reason=failure) if failure and failure != told else None
+        return NotKept(reason=failure) if failure and failure != reported else None
 
     def close(self) -> None:
         """Write the rest, within a bounded time, and release the file's lock."""
@@ -178,17 +178,17 @@ class MemoryFile:
                     self._changed.wait()
                 if self._wanted is None:
                     return
-                held = self._wanted
+                content = self._wanted
             try:
                 with files.replacing(
                     self._path, is_input=True, mode=0o600, is_synced=False
                 ) as file:
-                    file.write(held)
+                    file.write(content)
                 self._failure = ""
             except OSError as error:
                 self._failure = f"{self._path}: {error.strerror or error}"
             with self._changed:
-                is_newest = self._wanted is held
+                is_newest = self._wanted is content
                 if is_newest and not self._failure:
                     self._wanted = None
                 elif self._failure:

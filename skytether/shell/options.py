@@ -46,7 +46,7 @@ class Argument:
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, laid over defaults; `help_` says what the command does.
+    """Options of a command line, laid over defaults; `help_` describes the command.
 
     Raises:
         ConfigError: a plug-in cannot be imported.

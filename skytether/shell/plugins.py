@@ -118,12 +118,12 @@ def _import(plugin: Plugin) -> None:
             for name in [name for name, entry in table.items() if entry.source == path]:
                 del table[name]
         _guarded(run, f"{FLAG}: {path}", path)
-        version, found = hashlib.blake2b(code, digest_size=8).hexdigest(), 0
+        version, added = hashlib.blake2b(code, digest_size=8).hexdigest(), 0
         for table in TABLES:
             for name, entry in table.items():
                 if entry.source == path:
-                    table[name], found = replace(entry, version=version), found + 1
-        if not found:
+                    table[name], added = replace(entry, version=version), added + 1
+        if not added:
             kinds = "@trigger, @scheme, @reference, @vehicle or @impairment"
             expected = f"{kinds} on a function or class, see docs"
             raise ConfigError(f"{FLAG}: {path}: adds nothing, expected {expected}")
@@ -141,10 +141,10 @@ def _load_installed() -> None:
             version = f"{dist.name} {dist.version}" if dist else ""
             where = f"entry point {point.name} = {point.value} of {version}"
             with _tables(where):
-                made = _guarded(point.load, where)
-                there = table.get(point.name)
-                if there is None or there.make is not made:
-                    table.add(made, point.name)
+                function = _guarded(point.load, where)
+                present = table.get(point.name)
+                if present is None or present.make is not function:
+                    table.add(function, point.name)
                 table[point.name] = replace(table[point.name], version=version)
 
 

@@ -244,7 +244,7 @@ def begin(
     warnings: Sequence[Event] = (),
     keeps_rows: bool = False,
 ) -> Iterator[Process]:
-    """Restore what was set in an earlier run, and open record and feed during the block.
+    """Restore values set in an earlier run, and open record and feed during the block.
 
     Args:
         name, options, secure, warnings: see `Process`.
@@ -335,8 +335,8 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
             raise CommandError(f"--feed: {error}", CONFIGURATION) from None
         try:
             if record:
-                told = record, at, process, options.scenario, options.config
-                stack.enter_context(recorder_process.recorder(*told, secure=secure))
+                arguments = record, at, process, options.scenario, options.config
+                stack.enter_context(recorder_process.recorder(*arguments, secure=secure))
             stack.enter_context(closing(feed))
             yield feed
             stack.close()

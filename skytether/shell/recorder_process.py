@@ -32,7 +32,7 @@ class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecorderError(Exception):
-    """The recording is incomplete; the message is one line that says what is missing."""
+    """The recording is incomplete; the message is one line with the reason."""
 
 
 @contextmanager
@@ -82,11 +82,11 @@ def recorder(
         pass
     finally:
         try:
-            _, said = child.communicate(timeout=PATIENCE_S)
+            _, errors = child.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             child.kill()
-            _, said = child.communicate()
-            said = said or b"its recorder did not end"
+            _, errors = child.communicate()
+            errors = errors or b"its recorder did not end"
     if child.returncode:
-        lines = said.decode(errors="replace").splitlines()
+        lines = errors.decode(errors="replace").splitlines()
         raise RecorderError(lines[-1] if lines else f"{path}: its recorder was killed")

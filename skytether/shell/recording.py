@@ -53,16 +53,16 @@ class RecordFile:
         self._ended = True
 
     def fault(self) -> str | None:
-        """Sentence that says what is missing in the record, or None; valid after `end`."""
+        """Sentence about missing rows, or None; valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
         writer, row_bytes = self._writer, self.recorder.columns.itemsize
-        kept, rows = (
+        recorded, rows = (
             max(count - self._header_bytes, 0) // row_bytes
             for count in (writer.written, writer.offered)
         )
-        return f"{self._name}: {reason}: {kept} of {rows} rows are recorded"
+        return f"{self._name}: {reason}: {recorded} of {rows} rows are recorded"
 
     @property
     def is_empty(self) -> bool:

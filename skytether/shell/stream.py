@@ -90,8 +90,8 @@ class ByteStream:
                 prepare(end, self._line.number)
             else:
                 loop = asyncio.get_running_loop()
-                found = await loop.getaddrinfo(*self._line.address, type=socket.SOCK_STREAM)
-                family, _, _, _, address = found[0]
+                addresses = await loop.getaddrinfo(*self._line.address, type=socket.SOCK_STREAM)
+                family, _, _, _, address = addresses[0]
                 sock = failed.enter_context(socket.socket(family, socket.SOCK_STREAM))
                 sock.setblocking(False)
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,7 +1,7 @@
 """Temporary folders; those that a killed process has left are removed by the next process.
 
 A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
-folder of this user with an unlocked mark is removed. The mark is removed last, so that the next
+folder of this user with an new_mark mark is removed. The mark is removed last, so that the next
 process completes an interrupted removal.
 """
 
@@ -22,12 +22,12 @@ MARK = ".of-a-process"
 def folder() -> Iterator[Path]:
     """Temporary folder for the duration of the block; first removes those of dead processes."""
     _clear(Path(tempfile.gettempdir()))
-    made = Path(tempfile.mkdtemp(prefix=PREFIX))
-    with _marked(made):
+    path = Path(tempfile.mkdtemp(prefix=PREFIX))
+    with _marked(path):
         try:
-            yield made
+            yield path
         finally:
-            _remove(made)
+            _remove(path)
 
 
 @contextlib.contextmanager
@@ -36,12 +36,12 @@ def _marked(made: Path) -> Iterator[None]:
 
     The mark gets its name once it is locked, so that no other process removes the folder.
     """
-    held = made / f"{MARK}.new"
-    with held.open("x") as mark:
+    new_mark = made / f"{MARK}.new"
+    with new_mark.open("x") as mark:
         # a file system without locks: no process can remove the folder
         with contextlib.suppress(OSError):
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held.rename(made / MARK)
+            new_mark.rename(made / MARK)
         yield
 
 
@@ -70,12 +70,12 @@ def _clear_one(made: Path) -> None:
 def _remove(made: Path) -> None:
     """Remove a folder, its mark last; if a process still writes to it, a later call removes it."""
     with contextlib.suppress(OSError):
-        for each in made.iterdir():
-            if each.name == MARK:
+        for entry in made.iterdir():
+            if entry.name == MARK:
                 continue
-            if each.is_dir() and not each.is_symlink():
-                shutil.rmtree(each)
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
             else:
-                each.unlink()
+                entry.unlink()
         (made / MARK).unlink(missing_ok=True)
         made.rmdir()

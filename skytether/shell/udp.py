@@ -269,11 +269,11 @@ class Names:
         """Add a peer whose name need not be resolvable yet; blocks for at most FIND_S."""
         self._names.append(peer)
         self.missing[peer] = "no answer yet"
-        found: dict[Address, Address] = {}
+        addresses: dict[Address, Address] = {}
 
         def find() -> None:
             try:
-                found[peer] = look_up(peer)
+                addresses[peer] = look_up(peer)
             except OSError as error:
                 self.missing[peer] = error.strerror or str(error)
 
@@ -282,7 +282,7 @@ class Names:
         thread = threading.Thread(target=find, daemon=True)
         thread.start()
         thread.join(FIND_S)
-        self.learn(dict(found))
+        self.learn(dict(addresses))
 
     def add(self, peer: Address) -> None:
         """Add a peer; blocks.
@@ -330,9 +330,9 @@ class Names:
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
         """Peers, as by `heard`; raises the same."""
-        known = list(map(self._heard.get, raws))
-        if None not in known:
-            return cast("list[Address]", known)
+        peers = list(map(self._heard.get, raws))
+        if None not in peers:
+            return cast("list[Address]", peers)
         return list(map(self.heard, raws))
 
     def kernel(self, peer: Address) -> tuple[Any, ...]:

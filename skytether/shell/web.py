@@ -1,4 +1,4 @@
-"""Rules for what is served over HTTP: the page and the metrics.
+"""Rules for HTTP servers: the page and the metrics.
 
 Any website can make a browser on this machine connect here: in an invisible frame, or by pointing a
 domain of its own at this machine (DNS rebinding). So no answer may be shown in a frame, and the

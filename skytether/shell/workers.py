@@ -48,7 +48,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     for sock in sockets:
         sock.close()
 
-    ending, told = False, set()
+    ending, terminated = False, set()
 
     def pass_on(number: int, _: object) -> None:
         nonlocal ending
@@ -56,7 +56,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
             if ending:  # a second SIGTERM would interrupt a worker's orderly end
                 return
             number, ending = signal.SIGTERM, True
-        told.add(-number)
+        terminated.add(-number)
         for child in children:
             if child.is_alive() and child.pid:
                 os.kill(child.pid, number)
@@ -69,7 +69,9 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     for child in children:
         child.join()
     # A worker that got SIGTERM before it could end in order has not failed.
-    return max(0 if child.exitcode in told else abs(child.exitcode or 0) for child in children)
+    return max(
+        0 if child.exitcode in terminated else abs(child.exitcode or 0) for child in children
+    )
 
 
 def _work(

@@ -86,9 +86,9 @@ class Writer:
             try:
                 count = os.write(self._file.fileno(), rest)
             except BlockingIOError:  # another process has made the pipe non-blocking
-                room = select.poll()
-                room.register(self._file, select.POLLOUT)
-                room.poll()
+                poll = select.poll()
+                poll.register(self._file, select.POLLOUT)
+                poll.poll()
             except OSError as error:
                 self._file = error
             else:

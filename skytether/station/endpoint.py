@@ -121,7 +121,7 @@ class Station(Endpoint):
     def _is_over(self) -> bool:
         return self._step >= self._steps
 
-    # -- what comes --------------------------------------------------------------------------
+    # -- incoming ----------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         for message in self._codec.decode(datagram.payload):
@@ -166,18 +166,18 @@ class Station(Endpoint):
             case "COMMAND_ACK":
                 launch.hear(message)
             case "STATUSTEXT" if text := self._texts.take(message):
-                shown = "".join(each if each.isprintable() else "?" for each in text)
+                printable_text = "".join(each if each.isprintable() else "?" for each in text)
                 if message.severity <= dialect.MAV_SEVERITY_WARNING:
-                    launch.hear_text(shown)
+                    launch.hear_text(printable_text)
                 self._events.append(
-                    AutopilotText(vehicle=VEHICLE, text=shown, severity=message.severity)
+                    AutopilotText(vehicle=VEHICLE, text=printable_text, severity=message.severity)
                 )
 
     def _fail(self, doing: str, why: str) -> None:
         self._failure = NotTakenOff(vehicle=VEHICLE, doing=doing, why=why)
         self._events.append(self._failure)
 
-    # -- what goes ---------------------------------------------------------------------------
+    # -- outgoing ---------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int | None:
         if self.finished:

@@ -84,8 +84,8 @@ def _number(
 
 def flags(law: Law) -> list[str]:
     numbers = {"--lead": law.lead_s, "--gain": law.gain}
-    given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
-    return [f"--law={law.name}", *given]
+    arguments = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
+    return [f"--law={law.name}", *arguments]
 
 
 class Heard(NamedTuple):

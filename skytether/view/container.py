@@ -119,7 +119,7 @@ class Container:
         self._file.seek(0)
         whole_bytes = len(MAGIC)
         topics: dict[int, str] = {}
-        left = SPARE_MESSAGES + self._size // INDEXED_BYTES
+        messages_left = SPARE_MESSAGES + self._size // INDEXED_BYTES
         try:
             for record in self._unpacked():
                 match record:
@@ -130,8 +130,8 @@ class Container:
                     case Message(channel_id=number) if number not in topics:
                         raise ValueError(f"a message before its channel {number}")
                     case Message(channel_id=number) if topic := topics[number]:
-                        left -= 1
-                        if left < 0:
+                        messages_left -= 1
+                        if messages_left < 0:
                             raise ValueError("it has more messages than fit into its size")
                         yield topic, record.data
                 whole_bytes = self._file.tell()
@@ -154,8 +154,8 @@ class Container:
             if left_bytes < 0:
                 raise ValueError("its chunks are larger than any flight's, for a file of its size")
             if record.compression not in {"", "zstd"}:
-                found = record.compression[:20]
-                raise ValueError(f"a chunk is compressed with {found!r}, expected zstd")
+                compression = record.compression[:20]
+                raise ValueError(f"a chunk is compressed with {compression!r}, expected zstd")
             packed = zstandard.frame_content_size if record.compression else len
             if packed(record.data) not in {-1, size}:
                 raise ValueError("a chunk's content has another size than it says")

@@ -191,7 +191,7 @@ TRIGGERS = (
     "deviation | silence(1)",
     "state_gap",
 )
-"""Triggers offered to the user, if the scheme computes what they compare."""
+"""Triggers offered to the user, if the scheme computes the figures that they compare."""
 
 
 def triggers(scheme: str, present: str) -> tuple[str, ...]:

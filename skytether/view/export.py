@@ -31,14 +31,14 @@ STEPS = ("in_force", "observed_step")
 def tables(recorded: Recorded) -> dict[str, Columns]:
     """Tables of a recording, by name; `time_s` counts from the first message."""
     parts = recorded.parts
-    made = {
+    result = {
         part: {"time_s": recorded.times_ns[part] / SECOND_NS}
         | dict(_in_ms(name, column) for name, column in readable(rows).items())
         for part, rows in parts.items()
     }
     if "client" in parts:
         client, server = parts["client"], parts.get("server")
-        made["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
+        result["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
     events = [
         (time_ns / SECOND_NS, process, type(event).__name__, str(event))
         for time_ns, process, event in recorded.events()
@@ -46,8 +46,8 @@ def tables(recorded: Recorded) -> dict[str, Columns]:
     if events:
         names = ("time_s", "process", "type", "text")
         columns = zip(*events, strict=True)
-        made["events"] = dict(zip(names, map(np.array, columns), strict=True))
-    return made
+        result["events"] = dict(zip(names, map(np.array, columns), strict=True))
+    return result
 
 
 def _in_ms(name: str, column: NDArray[Any]) -> tuple[str, NDArray[Any]]:

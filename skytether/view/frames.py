@@ -32,15 +32,17 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
     ]
     toml = to_toml(scenario).decode()
     for process in dict.fromkeys(PROCESSES.values()):
-        own = described({p: rows.dtype for p, rows in parts.items() if PROCESSES[p] == process})
-        opened = Opened(process=process, name=name, scenario=toml, parts=own, wall_ns=0, time_ns=0)
+        columns = described({p: rows.dtype for p, rows in parts.items() if PROCESSES[p] == process})
+        opened = Opened(
+            process=process, name=name, scenario=toml, parts=columns, wall_ns=0, time_ns=0
+        )
         yield 0, process, opened
-    said = (
+    events = (
         (each.time_ns, each.process, Said(time_ns=each.time_ns, event=each.event))
         for each in flight.events
     )
     end_ns = 0
-    for timed in merge(said, *streams, key=lambda each: each[0]):
+    for timed in merge(events, *streams, key=lambda each: each[0]):
         end_ns = timed[0]
         yield timed
     for process, figures in flight.figures.items():
@@ -48,12 +50,12 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
 
 
 def _begins(flight: Record) -> Indices:
-    known = {
+    begins = {
         event.vehicle: time_ns
         for time_ns, _, event in reversed(flight.events)
         if isinstance(event, Flying)
     }
-    return np.array([known.get(n, 0) for n in range(max(known, default=0) + 1)], dtype=np.int64)
+    return np.array([begins.get(n, 0) for n in range(max(begins, default=0) + 1)], dtype=np.int64)
 
 
 def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Indices:

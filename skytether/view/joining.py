@@ -49,13 +49,13 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     table = to_table(first.scenario)
-    for each in recordings:
-        terms = first.scenario.terms(), each.scenario.terms()
+    for recorded in recordings:
+        terms = first.scenario.terms(), recorded.scenario.terms()
         if different := catalogue.differences(*terms):
             message = f"it is of another flight than {first.path}: {different[0]}"
-            raise RecordingError(f"{each.path}: {message}")
-        owners = {OWNERS.get(part) for part in each.parts}
-        values = flat(to_table(each.scenario))
+            raise RecordingError(f"{recorded.path}: {message}")
+        owners = {OWNERS.get(part) for part in recorded.parts}
+        values = flat(to_table(recorded.scenario))
         set_keys({key: value for key, value in values if KEYS[key].owner in owners}, table)
     return check(table, "the scenarios together")
 
@@ -74,8 +74,8 @@ def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
     pieces: dict[str, list[Table]] = {}
-    for each in recordings:
-        for part, rows in each.parts.items():
+    for recorded in recordings:
+        for part, rows in recorded.parts.items():
             pieces.setdefault(part, []).append(rows)
     for part, tables in pieces.items():
         if len({table.dtype for table in tables}) > 1:

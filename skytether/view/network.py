@@ -65,13 +65,13 @@ class Network:
         np.add.at(self._bytes[at], direction, size)
         np.add.at(self._lost[at], direction, lost)
         through = ~lost
-        there, delay_ns = direction[through], rows["delay_ns"][through]
-        np.add.at(self._delay_ns[at], there, delay_ns)
+        directions, delay_ns = direction[through], rows["delay_ns"][through]
+        np.add.at(self._delay_ns[at], directions, delay_ns)
         bins = np.minimum(delay_ns // DELAY_BIN_NS, DELAY_BINS - 1)
-        np.add.at(self._delays[at], (there, bins), 1)
+        np.add.at(self._delays[at], (directions, bins), 1)
         planned = (direction == UPLINK) & (size >= self._horizon_bytes)
         self._horizons[at] += (int(planned.sum()), int(size[planned].sum()))
-        for each in np.unique(there):
+        for each in np.unique(directions):
             self.heard_ns[int(each)] = time_ns
 
     def wait(self, waiting: Array, *, time_ns: int) -> None:

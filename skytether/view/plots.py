@@ -247,8 +247,8 @@ class Plots:
             for line in plot.lines:
                 if line.once and place:
                     continue
-                own = css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
-                rgb = line.rgb if line.rgb and (line.once or len(titles) == 1) else own
+                colour = css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
+                rgb = line.rgb if line.rgb and (line.once or len(titles) == 1) else colour
                 label = " ".join(filter(None, ("" if line.once else title, line.label)))
                 shown: uplot.Series = {
                     "label": label or "flown",
@@ -318,7 +318,7 @@ def cropped(data: Sequence[Array]) -> list[Array]:
 def begun(data: Sequence[Array]) -> list[Array]:
     """Data from the first known value on."""
     missing = [np.isnan(values) for values in data[1:]]
-    begin = [int(np.argmin(gone)) for gone in missing if gone.any() and not gone.all()]
+    begin = [int(np.argmin(unknown)) for unknown in missing if unknown.any() and not unknown.all()]
     first = min(min(begin, default=0), len(data[0]) - 2)
     return [values[first:] for values in data]
 

@@ -139,7 +139,7 @@ class Recording:
                 self._put_rows(frame.part, table, made)
 
     def flush(self) -> None:
-        """Write all that was added; after this, a kill does not lose it."""
+        """Write everything added so far, which then survives a kill of the process."""
         self._writer.flush()
 
     def finish(self, summary: Summary | None) -> None:
@@ -204,17 +204,17 @@ class Recording:
     def _put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
         known = 0
         if topic not in self._channels:
-            written = msgspec.json.encode({"title": name, **schema})
-            if written not in self._schemas:
-                self._schemas[written] = self._writer.register_schema(name, "jsonschema", written)
-            known = self._schemas[written]
+            encoded = msgspec.json.encode({"title": name, **schema})
+            if encoded not in self._schemas:
+                self._schemas[encoded] = self._writer.register_schema(name, "jsonschema", encoded)
+            known = self._schemas[encoded]
         self._add(topic, "json", known, msgspec.json.encode(message))
 
     def _add(self, topic: str, encoding: str, schema: int, content: bytes) -> None:
         """Add a message; its channel is written before the first message of a topic."""
         if topic not in self._channels:
-            made = self._writer.register_channel(topic, encoding, schema)
-            self._channels[topic] = made
+            channel = self._writer.register_channel(topic, encoding, schema)
+            self._channels[topic] = channel
         self._writer.add_message(self._channels[topic], self._now_ns, content, self._now_ns)
 
 

@@ -95,7 +95,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     table = Table(
         "summary", "Summary", "Figures of the whole flight.", "", ("figure", "value"), rows
     )
-    made = {
+    facts = {
         "scenario": about.scenario,
         "seed": str(scenario.seed),
         "flown": where,
@@ -110,7 +110,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         "pictures": [path(flown), timeline(flown)],
         "events": events[:EVENTS_MAX],
         "untold": max(0, len(events) - EVENTS_MAX),
-        "made": made,
+        "made": facts,
         "toml": to_toml(scenario).decode(),
     }
     return rendered("view/report.html.jinja", drawn=drawn)

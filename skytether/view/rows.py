@@ -137,11 +137,11 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
     plain(columns)
     names = columns.names or ()
     for name in expected.names or ():
-        given = columns[name] if name in names else None
-        if name == "inputs" and given is not None and len(given.shape) == 2:
-            given = np.dtype((given.base, (given.shape[0], 1)))
-        if given != expected[name]:
-            raise ValueError(f"{part}: the column {name} is {given}, expected {expected[name]}")
+        kind = columns[name] if name in names else None
+        if name == "inputs" and kind is not None and len(kind.shape) == 2:
+            kind = np.dtype((kind.base, (kind.shape[0], 1)))
+        if kind != expected[name]:
+            raise ValueError(f"{part}: the column {name} is {kind}, expected {expected[name]}")
 
 
 def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
@@ -170,25 +170,27 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
         else:
             continue
         if low < least.get(name, 0) or high > bound:
-            got = low if low < least.get(name, 0) else high
-            raise ValueError(f"{part}: {name}: got {got}, expected {least.get(name, 0)} to {bound}")
+            extreme = low if low < least.get(name, 0) else high
+            raise ValueError(
+                f"{part}: {name}: got {extreme}, expected {least.get(name, 0)} to {bound}"
+            )
 
 
 def readable(rows: Rows) -> Columns:
     """Plain columns of rows, with words for codes, and one column per input of a plan."""
     flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
-    made: Columns = {}
+    result: Columns = {}
     for name in flat.dtype.names or ():
         if flat.dtype[name].shape:
-            made |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
+            result |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
         elif name in WORDS:
             words = WORDS[name]
-            made[name] = np.array(
+            result[name] = np.array(
                 [words.get(number, str(number)) for number in flat[name].tolist()], dtype=np.str_
             )
         else:
-            made[name] = flat[name]
-    return made
+            result[name] = flat[name]
+    return result
 
 
 def arrays(rows: Rows) -> Columns:

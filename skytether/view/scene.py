@@ -126,12 +126,12 @@ def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
         low[: len(fenced.low_m)], high[: len(fenced.high_m)] = fenced.low_m, fenced.high_m
         corners = np.array([low, high])
         for x, y, z in np.ndindex(2, 2, 1 if scenario.model.axes == 2 else 2):
-            here = np.array([corners[x, 0], corners[y, 1], corners[z, 2]])
+            corner = np.array([corners[x, 0], corners[y, 1], corners[z, 2]])
             for axis, at in enumerate((x, y, z)):
                 if at == 0 and corners[0, axis] != corners[1, axis]:
-                    there = here.copy()
-                    there[axis] = corners[1, axis]
-                    pieces.append(np.array([[here, there]], np.float32))
+                    opposite = corner.copy()
+                    opposite[axis] = corners[1, axis]
+                    pieces.append(np.array([[corner, opposite]], np.float32))
     if fenced.radius_m:
         angle = np.linspace(0.0, 2 * np.pi, 97)
         around = begin[:2] + fenced.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)

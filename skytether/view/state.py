@@ -127,21 +127,21 @@ class VehicleTrack:
         self._seen: np.void | None = None
         """Newest row of the server's part; None without any."""
 
-    # -- what comes in -----------------------------------------------------------------------
+    # -- incoming frames ---------------------------------------------------------------------
 
     def fly(self, rows: Table) -> None:
         at = self._at(rows["step"])
-        taken = at >= 0
-        ring, at = self._ring, at[taken]
-        ring["position"][at] = rows["state"][taken, :, 0]
-        age_ns = rows["age_ns"][taken]
+        is_kept = at >= 0
+        ring, at = self._ring, at[is_kept]
+        ring["position"][at] = rows["state"][is_kept, :, 0]
+        age_ns = rows["age_ns"][is_kept]
         ring["age_s"][at] = np.where(age_ns >= 0, age_ns / SECOND_NS, np.nan)
         self.row = rows[-1].copy()
 
     def plan(self, rows: Table) -> None:
         at = self._at(rows["step"])
-        taken = at >= 0
-        ring, at, rows = self._ring, at[taken], rows[taken]
+        is_kept = at >= 0
+        ring, at, rows = self._ring, at[is_kept], rows[is_kept]
         ring["reference"][at] = rows["reference"][:, :, 0]
         ring["figure"][at] = compared(rows)
         ring["threshold"][at] = rows["threshold"]
@@ -160,13 +160,13 @@ class VehicleTrack:
         """Ring index of each step, cleared if it is new; -1 for a step that is not kept."""
         slots = steps // self._stride
         at = slots % self._slots
-        there = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
-        new = slots > there
+        newest = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
+        new = slots > newest
         self._ring[at[new]] = self._empty
         self._ring["slot"][at[new]] = slots[new]
         return np.where(slots == self._ring["slot"][at], at, -1)
 
-    # -- what is shown -----------------------------------------------------------------------
+    # -- display ----------------------------------------------------------------------------
 
     @property
     def time_s(self) -> float:
@@ -247,16 +247,16 @@ class VehicleTrack:
 
     def _along(self, plan: np.void) -> Array:
         positions = planned(self._scenario, plan)
-        flown = 0 if self.row is None else int(self.row["step"] - plan["begins"])
-        return positions[min(max(flown, 0), len(positions)) :]
+        steps_flown = 0 if self.row is None else int(self.row["step"] - plan["begins"])
+        return positions[min(max(steps_flown, 0), len(positions)) :]
 
     def path(self, points: int) -> Array:
         """Positions at evenly spaced times of the last minute [m]; shape (points, axes).
 
         The last one is the newest known position; unknown positions are NaN.
         """
-        flown = ~np.isnan(self._ring["position"][:, 0])
-        last = int(self._ring["slot"].max(where=flown, initial=-1))
+        is_known = ~np.isnan(self._ring["position"][:, 0])
+        last = int(self._ring["slot"].max(where=is_known, initial=-1))
         slots = last - np.arange(points)[::-1] * (self._slots / points)
         position: Array = self._at_slots(np.maximum(slots, -1).astype(np.int64))["position"]
         return position
@@ -275,8 +275,8 @@ class VehicleTrack:
 
     def error_m(self, seconds: float) -> float:
         """Root mean square distance to the reference in the last seconds [m]; NaN if unknown."""
-        kept = self._kept(seconds)
-        away = kept["position"] - kept["reference"]
+        slots = self._kept(seconds)
+        away = slots["position"] - slots["reference"]
         squares = (away**2).sum(axis=1)
         squares = squares[~np.isnan(squares)]
         return float(np.sqrt(squares.mean())) if len(squares) else np.nan
@@ -289,9 +289,9 @@ class VehicleTrack:
 
     def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
         """Slots by number; an empty slot for one that is not kept."""
-        found = self._ring[slots % self._slots]
-        found[(found["slot"] != slots) | (slots < 0)] = self._empty
-        return found
+        rows = self._ring[slots % self._slots]
+        rows[(rows["slot"] != slots) | (slots < 0)] = self._empty
+        return rows
 
 
 def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
@@ -343,7 +343,7 @@ class State:
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
 
-    # -- what comes in -----------------------------------------------------------------------
+    # -- incoming frames ---------------------------------------------------------------------
 
     def take(self, process: str, frame: Frame) -> None:
         """Apply a frame of a process; frames that belong to no flight are dropped.
@@ -445,7 +445,7 @@ class State:
             return
         self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
 
-    # -- what is shown -----------------------------------------------------------------------
+    # -- display ----------------------------------------------------------------------------
 
     @property
     def flies(self) -> bool:

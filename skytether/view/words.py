@@ -109,9 +109,9 @@ def _gone(state: State) -> str:
 
 def _newest(state: State) -> str:
     """The box has a fixed height, so that the page does not move."""
-    cut = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+    style = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
-        f'<div style="{cut}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
+        f'<div style="{style}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
         for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
     )
     return f'<div style="height:{1.45 * NEWEST}em">{lines}</div>'
@@ -125,13 +125,13 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
     if not state.scenario.is_mission:
         return []
-    asked = f"at least {state.scenario.mission.separation_m:g} m"
+    required = f"at least {state.scenario.mission.separation_m:g} m"
     nearest = number(float(state.nearest_m(vehicle)[-1]), ".2f", " m")
     bound_ms, clock_m = state.clock(vehicle)
     return [
         (
             "nearest other vehicle",
-            f"{nearest}, {asked}",
+            f"{nearest}, {required}",
         ),
         ("waits for", state.waits(vehicle) or "–"),
         (

@@ -34,7 +34,7 @@ class TurnedAway(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """Request of a browser, as far as access depends on it."""
+    """Fields of a browser's request on which its access depends."""
 
     host: str
     path: str
@@ -82,5 +82,5 @@ def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
 def may_play(visitor: Visitor, token: str) -> bool:
     if _has_token(visitor, token):
         return True
-    here = is_loopback(visitor.host) and is_loopback(_named(visitor)[0])
-    return here and refusal(visitor, token) is None
+    is_here = is_loopback(visitor.host) and is_loopback(_named(visitor)[0])
+    return is_here and refusal(visitor, token) is None

@@ -96,7 +96,7 @@ class Guard:
         self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
-    # -- what is counted ---------------------------------------------------------------------
+    # -- counters ---------------------------------------------------------------------------
 
     def count(self, why: TurnedAway) -> None:
         with self._lock:

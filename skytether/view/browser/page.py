@@ -103,8 +103,8 @@ class Page:
         while not self._closed.wait(max(0.0, due_s - time.monotonic())):
             due_s = max(due_s + 1 / MOVES_HZ, time.monotonic())
             clients = self._server.get_clients()
-            for gone in self._panels.keys() - clients.keys():
-                del self._panels[gone]
+            for number in self._panels.keys() - clients.keys():
+                del self._panels[number]
             if not clients:
                 continue
             moves += 1
@@ -139,7 +139,7 @@ class Page:
                         panel.show(now_ns)
 
     def _reads(self, number: int) -> bool:
-        """Whether a browser has read what it was sent; nothing is drawn for one that has not."""
+        """Whether a browser has read everything sent; if not, nothing is drawn for it."""
         connection = self._connections.get(number)
         return connection is not None and not connection.paused
 

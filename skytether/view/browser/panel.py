@@ -65,7 +65,7 @@ const label = [...document.querySelectorAll('label')].find(each => each.textCont
 const prefers = matchMedia('(prefers-color-scheme: light)').matches;
 if (prefers && !label.control.checked) label.control.click();
 ">"""
-"""HTML that makes the page light in a browser that prefers it; only the browser knows."""
+"""HTML that makes the page light if the browser prefers that; the server cannot tell."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
@@ -459,8 +459,8 @@ class Controls:
         if armed != self._armed.value:
             assign(self._armed, armed)
         flies_real = flight.state.scenario.vehicle.kind == "mavlink"
-        said = flight.values.get("client", {})
-        self._after_leap.visible = flies_real and "vehicle.after_leap" in said
+        values = flight.values.get("client", {})
+        self._after_leap.visible = flies_real and "vehicle.after_leap" in values
         if self._lead:
             self._lead.show()
         if self._mission:

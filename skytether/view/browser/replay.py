@@ -29,12 +29,14 @@ class Player:
         self._openings: list[Placed] = []
         self._frames: list[Placed] = []
         begin = []
-        for own in frames:
-            later = (time_ns for time_ns, _, frame in own if not isinstance(frame, Opened))
+        for flight_frames in frames:
+            later = (
+                time_ns for time_ns, _, frame in flight_frames if not isinstance(frame, Opened)
+            )
             begin.append(next(later, 0))
         placed = (
-            [(time_ns - begin[place], place, name, frame) for time_ns, name, frame in own]
-            for place, own in enumerate(frames)
+            [(time_ns - begin[place], place, name, frame) for time_ns, name, frame in flight_frames]
+            for place, flight_frames in enumerate(frames)
         )
         for each in merge(*placed, key=lambda item: item[0]):
             (self._openings if isinstance(each[3], Opened) else self._frames).append(each)

@@ -55,20 +55,20 @@ def page(
     free = next_free(host, port)
     token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
     with closing(Page(host, free, flights, token=token, more=more, now_ns=now_ns)) as shown:
-        here = address_text("127.0.0.1" if host in ANYWHERE else host, shown.port)
-        query = f"/?websocket=ws://{here}/?token={token}" if token else ""
-        taken = address_text(*at) if port and shown.port != port else ""
-        yield shown, PageServed(address=f"http://{here}{query}", taken=taken)
+        page_address = address_text("127.0.0.1" if host in ANYWHERE else host, shown.port)
+        query = f"/?websocket=ws://{page_address}/?token={token}" if token else ""
+        taken_address = address_text(*at) if port and shown.port != port else ""
+        yield shown, PageServed(address=f"http://{page_address}{query}", taken=taken_address)
 
 
 def next_free(host: str, port: int) -> int:
     """First free port, from `port` on; 0, which takes any free port, stays 0."""
     for candidate in range(port, min(port + PORTS_TRIED, PORTS)):
         try:
-            found = socket.getaddrinfo(
+            addresses = socket.getaddrinfo(
                 host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )
-            family, kind, _, _, address = found[0]
+            family, kind, _, _, address = addresses[0]
             with socket.socket(family, kind) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
