@@ -366,9 +366,7 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Set the interval of a message to a peer; 0 restores the default, below 0 stops the
-        stream.
-        """
+        """Set the interval of a message to a peer; 0 restores the default, below 0 stops it."""
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
         if interval_us == 0.0:

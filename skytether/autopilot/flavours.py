@@ -53,9 +53,7 @@ class SimulatedFlavour:
     spool_s: float
     """Time from the take-off command until it climbs."""
     wander_mps: float
-    """Standard deviation, along each axis, of the error of the velocity estimate that the loops
-    use.
-    """
+    """Standard deviation, along each axis, of the error of the velocity that the loops use."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]

@@ -89,9 +89,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations of a mission's vehicles further than `mission.tube_m` from their motions; with
-    any, the separation is not guaranteed.
-    """
+    """Observations outside `mission.tube_m`; the separation is guaranteed only if there is none."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float

@@ -242,9 +242,7 @@ def _really(
 
 
 def _missing(scenario: Scenario, flown: Record) -> str | None:
-    """Sentence that says what could not be recorded, and how much was; None if nothing is
-    missing.
-    """
+    """Sentence about rows that could not be recorded; None if the record is complete."""
     if not flown.incomplete:
         return None
     reasons = "; ".join(f"{part.file}: {part.reason}" for part in flown.incomplete)

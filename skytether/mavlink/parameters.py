@@ -42,9 +42,7 @@ def to_wire(value: float, *, bytewise: bool) -> float:
 
 
 def from_wire(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Value of a parameter from the wire, an int for integer types; None if it is no such
-    number.
-    """
+    """Value of a parameter from the wire, an int for integer types; None if it is invalid."""
     if kind not in INTEGERS:
         return value if kind == FLOAT and math.isfinite(value) else None
     if bytewise:

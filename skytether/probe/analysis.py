@@ -57,18 +57,14 @@ class Clocks:
     """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, assuming that both directions have half of the least round-trip
-    time.
-    """
+    """Offset at the first probe, if both directions have half of the least round-trip time."""
     drift: float
     """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
     drift_doubt: float
     least_sum_s: float
     """Sum of the two least delays."""
     doubt_s: float
-    """Largest error of the offset, and so of all one-way delays: half of the least delays, less
-    known fixed times.
-    """
+    """Largest error of all one-way delays: half of the least delays, less known fixed times."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,9 +25,7 @@ SLOTS = 4000
 """Number of slot lengths that are tried for the paper's distribution."""
 PAIRS_MIN = 20
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Bounds of the redraw time of a Gilbert-Elliott channel: shortest, in mean times between packets,
-and longest [s].
-"""
+"""Bounds of a channel's redraw time: in mean times between packets, and in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +103,7 @@ def _with_least(delay_s: Array, name: str) -> Found:
 
 
 def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best lognormal distribution over
-    `least_s`.
-    """
+    """Log-likelihood, mean and standard deviation of the best lognormal law over `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     logs = np.log(over)
     mu, sigma = float(np.mean(logs)), max(float(np.std(logs)), 1e-6)
@@ -131,9 +127,7 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Least delay plus a Poisson number of slots, with a normal error; None if no slots are
-    visible.
-    """
+    """Least delay plus a Poisson number of slots, with a normal error; None without slots."""
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
         return None
@@ -163,9 +157,7 @@ def _paper(delay_s: Array) -> Found | None:
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Log-likelihood of the Poisson distribution if `before` slots below the least delay are
-        empty.
-        """
+        """Log-likelihood of the Poisson law if `before` slots below the least delay are empty."""
         counts, times = np.unique(places + before, return_counts=True)
         mean = float(np.mean(places)) + before
         logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]

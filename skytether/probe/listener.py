@@ -36,9 +36,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of
-the host with the most.
-"""
+"""Most measurements at once; see `Listener._gives_way` for a further one."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536

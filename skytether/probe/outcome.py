@@ -16,13 +16,9 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest reported correlation time, in times between two packets; a shorter one is left out of
-the text.
-"""
+"""Shortest correlation time in the text, in times between two packets."""
 ORDERED_SHARE = 0.01
-"""Share of reordered packets, predicted for independent delays, above which a path without
-reordering is called ordered.
-"""
+"""Predicted share of reordered packets above which a path without any is called ordered."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
@@ -78,9 +74,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """Content of a log; empty for a measurement. Both directions get half of its round-trip times,
-    or its one-way delays.
-    """
+    """Content of a log, "" for a measurement; round-trip times are halved for each direction."""
     seconds: float
     bytes: int
     """UDP payload of a packet [B]; 0 if a log does not have it."""
@@ -97,9 +91,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     round_trip_least_s: float
     """Sum of both least delays."""
     unreported: int
-    """Arrivals that the listener dropped before it could report them, or captured packets left
-    out.
-    """
+    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
     uplink: DirectionFigures
     """From the listener to the prober."""
     downlink: DirectionFigures

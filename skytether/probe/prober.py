@@ -49,9 +49,7 @@ HELLO_BYTES = 64
 PATIENCE_NS = 10 * SECOND_NS
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Shortest and longest wait for the last answers [ns]; between them, twice the longest round-trip
-time.
-"""
+"""Bounds of the wait for the last answers [ns]: twice the longest round-trip time in between."""
 
 Longs = NDArray[np.int64]
 
@@ -82,9 +80,7 @@ class MeasuredPath:
     size: int
     period_ns: int
     unreported: int
-    """Arrivals that the listener dropped before it could report them, or captured packets left
-    out.
-    """
+    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
 
 
 class Prober(Endpoint):

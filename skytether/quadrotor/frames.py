@@ -10,9 +10,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """Quadrotor in X configuration: rotors 1 front right, 2 back left, 3 front left, 4 back
-    right.
-    """
+    """Quadrotor in X configuration: rotors front right, back left, front left, back right."""
 
     mass_kg: float
     roll_inertia: float
@@ -49,9 +47,7 @@ class Frame(NamedTuple):
     rate_gain: float
     """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Gain on measured angular acceleration, subtracted from the command to reduce the rotors'
-    lag.
-    """
+    """Gain on measured angular acceleration, subtracted to reduce the rotors' lag."""
 
     @property
     def hover(self) -> float:

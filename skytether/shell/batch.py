@@ -26,9 +26,7 @@ from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 NEAR_NS, READINGS = 5_000, 4
-"""Longest time between two readings of a clock for them to count as simultaneous [ns], and number
-of attempts.
-"""
+"""Longest time between two readings that count as simultaneous [ns], and number of attempts."""
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
@@ -128,9 +126,7 @@ class _Headers:
         """Sizes of the control data [B]; the kernel lowers each to the size that it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
-        """Arrival times by CLOCK_REALTIME: seconds, and nanoseconds beyond them; shape
-        (BATCH_MAX,).
-        """
+        """Arrival times by CLOCK_REALTIME: seconds, and the rest [ns]; shape (BATCH_MAX,)."""
 
 
 def _address(room: bytearray | mmap.mmap) -> int:

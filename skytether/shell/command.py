@@ -166,9 +166,7 @@ def unsealed(*addresses: Address) -> CommandError:
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Raise this process's limit of open files for so many sockets; refuse more than the system
-    allows.
-    """
+    """Raise this process's limit of open files for so many sockets, or refuse the number."""
     most = sockets_max()
     if given > most:
         needed = f"got {given}, which takes {given + SPARE_FILES} open files"

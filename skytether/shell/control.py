@@ -24,9 +24,7 @@ from skytether.shell.local import Local
 
 REST_S = 0.01
 RESTS = 20
-"""Smallest ratio of the pause to the time that the request took: requests take at most 1/21 of the
-endpoint's time.
-"""
+"""Ratio of the pause to the time of the request: requests take at most 1/21 of all time."""
 PATIENCE_S = 5.0
 ANSWER_BYTES_MAX = 65_536
 

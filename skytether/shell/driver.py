@@ -44,13 +44,9 @@ from skytether.shell.udp import (
 BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
 TOGETHER_MIN = 4
-"""Smallest number of datagrams that go through one `sendmmsg`, and that keep a socket crowded:
-fewer are faster one by one.
-"""
+"""Smallest number of datagrams worth a batch call: fewer are faster one by one."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Number of datagrams within the endpoint's `patience_ns` that makes a socket crowded, which means
-that it is read in batches.
-"""
+"""Number of datagrams within `patience_ns` from which on a socket is read in batches."""
 BATCHES_MAX = 4
 """Most batches read from one socket before timers and other sockets have their turn."""
 SOCKET = itemgetter(2)
@@ -132,9 +128,7 @@ class Shell:
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """One buffer for all datagrams: copying out of it is faster than allocating one for
-        each.
-        """
+        """One buffer for all datagrams: copying out of it is faster than allocating many."""
         self._batches: dict[int, DatagramBatch | None] = {}
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}

@@ -42,9 +42,7 @@ ROWS_BYTES_MAX = 256 * 1024
 SEND_BYTES_MAX = 64 * 1024
 GATHER_S = 0.01
 REST_S = 0.02
-"""Pause between two accepted readers [s], which bounds the cost of one that reconnects in a
-loop.
-"""
+"""Pause between two accepted readers [s], which bounds the cost of reconnecting in a loop."""
 PATIENCE_S = 0.5
 
 READ_BYTES = 256 * 1024

@@ -88,9 +88,7 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._told = ""
-        """Reasons why the newest content could not be written, and the one reported last; "" if it
-        was.
-        """
+        """Reason why the newest content could not be written, and reason reported last."""
 
     @property
     def path(self) -> Path:

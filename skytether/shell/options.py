@@ -34,9 +34,7 @@ class Argument:
     """Annotation of a field: its form on the command line."""
 
     name: str | None = None
-    """Name of the flag, if different from the field's; empty: the fields of the field's value are
-    flags themselves.
-    """
+    """Name of the flag, if different from the field's; "": its value's fields are flags."""
     metavar: str | None = None
     help: str | None = None
     """Text of the help, if different from the field's docstring."""

@@ -94,9 +94,7 @@ def flags() -> list[str]:
 
 
 def use(plugins: Iterable[Plugin]) -> None:
-    """Import installed plug-ins, and files read already, perhaps by another process; raises as
-    `load`.
-    """
+    """Import installed plug-ins, and files read already, perhaps by another process."""
     _load_installed()
     for plugin in plugins:
         if _loaded.get(plugin.path) != plugin:

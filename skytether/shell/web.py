@@ -32,7 +32,5 @@ def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a host is a number or localhost, which no website's owner can point at this
-    machine.
-    """
+    """Whether a host is a number or localhost, so no website's owner can point it here."""
     return name == "localhost" or numeric(name) is not None

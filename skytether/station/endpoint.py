@@ -186,9 +186,7 @@ class Station(Endpoint):
 
     @property
     def _streams(self) -> bool:
-        """Whether set-points are due: in flight, and as zeros before a mode that requires a
-        stream.
-        """
+        """Whether set-points are due: in flight, and as zeros before a mode that needs them."""
         flies = self._epoch_ns is not None and not self._is_over
         return flies or (self._launch is not None and self._launch.streams_zeros)
 

@@ -28,9 +28,7 @@ ENCODING = "msgpack"
 """Encoding of the messages that are read back; others are written for other programs."""
 
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
-"""Largest size of a decompressed chunk [B]; Skytether ends a chunk at the first message beyond 256
-KiB.
-"""
+"""Largest size of a decompressed chunk [B]; Skytether writes 256 KiB and a message."""
 SPARE_BYTES = 16 * 1024 * 1024
 """Total decompressed size of chunks that any file may have, however small it is [B]."""
 RATIO_MAX = 50

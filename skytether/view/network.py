@@ -133,7 +133,7 @@ class Network:
         return self._by_second(self._bytes[:, direction], now_ns)
 
     def losses(self, direction: int, now_ns: int) -> Array:
-        """Share of packets lost in each of the last SPAN_S seconds; NaN without any; shape
+        """Share of packets lost in each of the last SPAN_S seconds; NaN if none; shape
         (SPAN_S,).
         """
         packets = self._by_second(self._packets[:, direction], now_ns)

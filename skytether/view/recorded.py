@@ -186,7 +186,5 @@ def _columns(described: str) -> np.dtype[np.void]:
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Check the scenario of a process; equal texts, which may come thousands of times, only
-    once.
-    """
+    """Check the scenario of a process; equal texts, of which there may be many, only once."""
     check(toml.loads(scenario), "the scenario of a process", any_network=True)

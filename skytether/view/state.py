@@ -453,9 +453,7 @@ class State:
         return any(name != "netem" for name in self._processes)
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before the flight; of netem alone, its running
-        time.
-        """
+        """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
