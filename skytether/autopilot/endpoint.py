@@ -34,6 +34,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 SYSTEM, COMPONENT = 1, int(dialect.MAV_COMP_ID_AUTOPILOT1)
+"""System and component id of the autopilot."""
 PEERS_MAX = 8
 """Most peers at once; a new one replaces the one that was silent longest."""
 PATIENCE_NS = SECOND_NS

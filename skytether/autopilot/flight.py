@@ -274,12 +274,10 @@ class PilotedVehicle(ABC):
         """Enter the mode that climbs; returns whether this is possible."""
 
     @abstractmethod
-    def limits(self) -> OwnSpeeds:
-        pass
+    def limits(self) -> OwnSpeeds: ...
 
     @abstractmethod
-    def gains(self) -> Gains:
-        pass
+    def gains(self) -> Gains: ...
 
     @abstractmethod
     def is_station(self, system: int, kind: int) -> bool:

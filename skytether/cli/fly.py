@@ -41,7 +41,9 @@ from skytether.view.browser.access import HOST_PORT
 UNSEEN = Fault, ReferenceTooFast
 """Events of a flight in virtual time that are printed after it."""
 PRINTED = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
+"""Events that are printed during the flight."""
 POLL_S = 0.2
+"""Interval at which Ctrl-C is checked while the page stays open."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Modes before the first plan is flown, which are not printed."""
 

@@ -13,6 +13,7 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 STOP_S = 5.0
+"""Longest time for the page to end after SIGTERM."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"

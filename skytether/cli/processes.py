@@ -56,7 +56,9 @@ START_S = 120.0
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
+"""Longest time for a process to end after SIGTERM."""
 POLL_S = 0.2
+"""Interval at which Ctrl-C is checked."""
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 

@@ -22,6 +22,7 @@ from skytether.station.joined import joined, summary_of
 from skytether.station.laws import Law, LawOptions
 
 TOLD = AutopilotRefused, AutopilotText, Fault
+"""Events that are printed during the flight."""
 
 
 @dataclass(frozen=True)

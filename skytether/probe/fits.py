@@ -21,9 +21,11 @@ RESOLUTION_S = 50e-6
 CONSTANT_S = 0.5e-3
 """Largest standard deviation of delays that are called constant [s]."""
 LEASTS = 60
+"""Number of candidates for a delay distribution's lower bound."""
 SLOTS = 4000
 """Number of slot lengths that are tried for the paper's distribution."""
 PAIRS_MIN = 20
+"""Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
 """Bounds of a channel's redraw time: in mean times between packets, and in seconds."""
 

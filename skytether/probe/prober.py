@@ -40,6 +40,7 @@ BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 PROBES_MAX = 1_000_000
 """Most probes: as many as a trace has rows."""
 TRAIN = 16
+"""Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
 """Number of regular probe slots that a train takes: twice its number of packets."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
@@ -47,6 +48,7 @@ TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 HELLO_BYTES = 64
 """Size of a HELLO without keys: its WELCOME is shorter [B]."""
 PATIENCE_NS = 10 * SECOND_NS
+"""Longest wait for a first answer."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
 """Bounds of the wait for the last answers [ns]: twice the longest round-trip time in between."""

@@ -110,6 +110,7 @@ CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 first entry extends the curve below charge 0.
 """
 CELL_FULL_V = 4.2
+"""Voltage of a full cell at rest."""
 
 
 class Quad(NamedTuple):

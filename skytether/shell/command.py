@@ -74,12 +74,10 @@ class CommandError(Exception):
 
 class Options(Protocol):
     @property
-    def scenario(self) -> str:
-        pass
+    def scenario(self) -> str: ...
 
     @property
-    def config(self) -> Scenario:
-        pass
+    def config(self) -> Scenario: ...
 
 
 T = TypeVar("T")

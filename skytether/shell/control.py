@@ -23,9 +23,11 @@ from skytether.shell.journal import Journal
 from skytether.shell.local import Local
 
 REST_S = 0.01
+"""Shortest pause after a request."""
 RESTS = 20
 """Ratio of the pause to the time of the request: requests take at most 1/21 of all time."""
 PATIENCE_S = 5.0
+"""Longest time to wait for an answer."""
 ANSWER_BYTES_MAX = 65_536
 
 

@@ -50,7 +50,9 @@ CROWD_MIN = 2 * TOGETHER_MIN
 BATCHES_MAX = 4
 """Most batches read from one socket before timers and other sockets have their turn."""
 SOCKET = itemgetter(2)
+"""Socket number of a datagram."""
 CAME = itemgetter(0)
+"""Arrival time, from a pair of time and datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""

@@ -35,9 +35,12 @@ from skytether.shell.web import HEADERS, host_name, is_ours
 CONNECTIONS_MAX = 8
 """Most connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
+"""Longest time for a request and its answer."""
 REQUEST_BYTES_MAX = 8192
 POLL_S = 0.1
+"""Interval at which connections that take too long are closed."""
 REST_S = 0.02
+"""Pause between two accepted connections."""
 FRESH_S = 3.0
 """Age from which figures count as stale, and the process as stuck [s]."""
 BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"

@@ -39,14 +39,19 @@ WAITING_BYTES_MAX = 4 * 1024 * 1024
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Most bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
+"""Size of rows after which a frame is full."""
 SEND_BYTES_MAX = 64 * 1024
+"""Most bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
+"""Time for which frames are collected before they are sent."""
 REST_S = 0.02
 """Pause between two accepted readers [s], which bounds the cost of reconnecting in a loop."""
 PATIENCE_S = 0.5
+"""Longest time to wait at the end until readers have received everything."""
 
 READ_BYTES = 256 * 1024
 AGAIN_S = 1.0
+"""Time between two attempts to connect to a process."""
 
 
 class _Part:

@@ -20,9 +20,11 @@ from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 256 * 1024
+"""Most bytes of lines that wait to be written."""
 TOGETHER_BYTES = 4096
 """Most bytes in one write: PIPE_BUF, which a pipe takes whole even with several writers."""
 PATIENCE_S = 0.5
+"""Longest time to wait at the end until all lines are written."""
 
 LogFormat = Literal["text", "json"]
 

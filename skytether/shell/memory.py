@@ -29,6 +29,7 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 AGAIN_S = 1.0
+"""Time after which a failed write is tried again."""
 
 
 class MemoryRefused(ValueError):

@@ -238,6 +238,7 @@ LEFT_OUT = {
         "by_vehicle/{vehicle}/autopilot/mode",  # its number is exported
     ),
 }
+"""Figures that are deliberately not exported."""
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:

@@ -37,6 +37,7 @@ GROUPS = {
     "skytether.vehicles": VEHICLES,
     "skytether.impairments": IMPAIRMENTS,
 }
+"""Tables that plug-ins extend, by group of entry points."""
 
 
 class Plugin(NamedTuple):

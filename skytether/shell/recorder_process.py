@@ -17,6 +17,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins, temporary
 
 PATIENCE_S = 30.0
+"""Longest time for a recorder to complete its file."""
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):

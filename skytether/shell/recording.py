@@ -14,9 +14,11 @@ ROOM_BYTES = 32 * 1024 * 1024
 netem's take three times as much memory.
 """
 TOGETHER_BYTES = 256 * 1024
+"""Most bytes of rows in one write."""
 PAUSE_S = 0.02
 """Time for which rows are collected before a write [s], and lost if the process is killed."""
 PATIENCE_S = 3.0
+"""Longest time to wait at the end until all rows are written."""
 
 SLOW = "the disk is too slow"
 

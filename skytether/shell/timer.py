@@ -23,8 +23,7 @@ class Timer(Protocol):
     def set(self, due_ns: int | None) -> None:
         """Arm for `due_ns` [ns; CLOCK_MONOTONIC], replacing an earlier time; None disarms."""
 
-    def close(self) -> None:
-        pass
+    def close(self) -> None: ...
 
 
 class _Itimerspec(ctypes.Structure):

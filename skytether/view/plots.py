@@ -151,7 +151,7 @@ APART = Plot(
     "Nearest other vehicle [m]",
     (
         PlotLine(
-            "asked for",
+            "required",
             lambda look: np.full(POINTS, look.state.scenario.mission.separation_m),
             GREY,
             dash=(4, 4),

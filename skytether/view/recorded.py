@@ -31,6 +31,7 @@ from skytether.view.recording import BEGUN, FEED, About, Begun
 from skytether.view.rows import check_columns, check_values
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
+"""Longest time from the first frame of a recording to its last."""
 TIME_NS_MAX = 2**62
 """Largest time of a frame, and largest offset of a clock [ns]."""
 

@@ -32,9 +32,12 @@ TRAIL_S = 20.0
 GOAL_S = 1.0
 """Age up to which a desired position is shown [s]; an older one is out of date."""
 TRAIL_POINTS = 240
+"""Most points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
 ROUND_S = 600.0
+"""Longest part of the desired trajectory that is drawn."""
 SIZE = 0.05
+"""Size of a vehicle, relative to the extent of the flight."""
 WIDE, NARROW = 1.5, 0.65
 """Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
 FOV_RAD = 0.7

@@ -45,13 +45,16 @@ SLOTS_MAX = 1200
 """Most steps that are kept of a vehicle; with more steps per minute, only every n-th is kept."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
+"""Keys of a mission's zones, and of its goals changed in flight."""
 PLANS_MAX = 8
 """Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
 LED = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
+"""Time over which loss is measured."""
 LOSS_HIGH = 0.3
+"""Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
 """Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
 

@@ -21,6 +21,7 @@ CSS = {
     "violet": "var(--mantine-color-violet-7)",
 }
 NEWEST = 3
+"""Number of events shown beside a vehicle's state."""
 SAID_SHOWN = 50
 
 FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")

@@ -18,6 +18,7 @@ from skytether.view.network import SPAN_S
 from skytether.view.state import State
 
 TICK_S = 0.04
+"""Time between two batches of frames."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
 Placed = tuple[int, int, str, Frame]
 """Time of a frame since its flight's first [ns], index of its flight, process, and the frame."""

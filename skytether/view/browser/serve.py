@@ -21,6 +21,7 @@ from skytether.view.browser.play import PROCESSES
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
+"""Interval at which Ctrl-C is checked."""
 PORTS, PORTS_TRIED = 65536, 100
 """Number of ports that exist, and of those that are tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
