@@ -41,8 +41,8 @@ class AutopilotOptions(ProcessOptions):
     autopilot to speak first: 127.0.0.1:14540 for PX4.
     """
     ready: Annotated[float | None, Argument(metavar="SECONDS")] = None
-    """Time from the start until it may be armed [s]; by default 41.5 for ArduCopter and 4.6 for
-    PX4.
+    """Time from the start until the vehicle may be armed [s]; by default 41.5 for ArduCopter and
+    4.6 for PX4.
     """
     fault: Annotated[
         tuple[str, ...],

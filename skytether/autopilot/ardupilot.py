@@ -101,7 +101,7 @@ class ArduPilot(PilotedVehicle):
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """After GUID_TIMEOUT it brakes, if it moves."""
+        """The vehicle brakes after GUID_TIMEOUT, if it moves."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 

@@ -30,7 +30,7 @@ class FlightMode(Enum):
     RETURN = auto()
     """Flies home, and lands."""
     LAND = auto()
-    """Lands at its present position."""
+    """Lands at the present position."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class SimulatedFlavour:
     frame: str
     """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
-    """Time from the start until it may be armed, in which position and filters settle."""
+    """Time from the start until arming is allowed, in which position and filters settle."""
     words_for_stations: bool
-    """Whether its texts go only to ground stations, as PX4's do."""
+    """Whether texts go only to ground stations, as PX4's do."""
     spool_s: float
-    """Time from the take-off command until it climbs."""
+    """Time from the take-off command until the vehicle climbs."""
     wander_mps: float
     """Standard deviation, along each axis, of the error of the velocity that the loops use."""
     home: tuple[float, float, float]

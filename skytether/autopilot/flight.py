@@ -108,7 +108,7 @@ class PilotedVehicle(ABC):
         self.armed_ns: int | None = None
         self.flying = False
         self.estimates = True
-        """Whether its position estimate is valid, once it is ready."""
+        """Whether the position estimate is valid, apart from the wait after the start."""
         self.drift: Vector = REST
         """True velocity minus the estimated one, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
@@ -251,11 +251,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def why_not_armed(self) -> str:
-        """Reason why it cannot be armed; empty if it can."""
+        """Reason why arming is refused; empty if it is allowed."""
 
     @abstractmethod
     def why_not_guided(self) -> str:
-        """Reason why it cannot be guided; empty if it can."""
+        """Reason why GUIDED is refused; empty if it is allowed."""
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
@@ -263,7 +263,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def takes_setpoints(self) -> bool:
-        """Whether it follows set-points in its present mode."""
+        """Whether set-points are followed in the present mode."""
 
     @abstractmethod
     def altitude_of(self, told: float) -> float | None:
@@ -281,11 +281,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def is_station(self, system: int, kind: int) -> bool:
-        """Whether heartbeats of this system and MAV_TYPE are those of its ground station."""
+        """Whether a system of this id and MAV_TYPE is the vehicle's ground station."""
 
     @abstractmethod
     def return_altitude(self, distance: float) -> float:
-        """Altitude at which it flies home from a distance [m]."""
+        """Altitude for the flight home from a distance [m]."""
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
@@ -297,7 +297,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def idle_s(self) -> float:
-        """Time on the ground after which it disarms [s]; shorter after a landing."""
+        """Time on the ground until the vehicle disarms [s]; shorter after a landing."""
 
     # Motion
 
@@ -368,7 +368,7 @@ class PilotedVehicle(ABC):
         return self._toward((*self._stay_xy(), altitude))
 
     def _stay_xy(self) -> tuple[float, float]:
-        """Horizontal point at which it climbs or lands."""
+        """Horizontal position held during a climb or a landing."""
         if self._held is None:
             self._held = self.quadrotor_wants()
         return self._held[:2]
@@ -388,7 +388,7 @@ class PilotedVehicle(ABC):
         return self._toward(setpoint.position, setpoint.velocity)
 
     def _staying(self) -> Vector:
-        """Brake, and hold the point where it comes to rest."""
+        """Velocity that brakes, then holds the position at which the vehicle came to rest."""
         if self._held is None:
             if hypot(*self.velocity()) > STILL_MPS:
                 return REST
@@ -416,7 +416,7 @@ class PilotedVehicle(ABC):
         return x, y, -(limits.land if z < 10.0 else limits.down)
 
     def _toward(self, point: Vector, velocity: Vector = REST) -> Vector:
-        """Velocity towards a point, slower near it, added to a feed-forward velocity."""
+        """Velocity towards a point, slower near the point, plus a feed-forward velocity."""
         limits = self.limits()
         x, y, z = (to - now for to, now in zip(point, self.quadrotor_wants(), strict=True))
         distance = hypot(x, y)
@@ -454,7 +454,7 @@ class PilotedVehicle(ABC):
             self._wander[:] = 0.0
 
     def quadrotor_wants(self) -> Vector:
-        """Desired position of its loops [m]: the true one, or that of the shaped velocity."""
+        """Position that the control loops track [m]: the true one, or that of the shaped motion."""
         x, y, z = self.quadrotor.wanted_position().tolist()
         return x, y, z
 

@@ -78,7 +78,7 @@ class PX4(PilotedVehicle):
             self.enter(self.flavour.number(FlightMode.GUIDED))
 
     def why_not_armed(self) -> str:
-        """PX4 ends these texts with a tabulator."""
+        """Texts as PX4 sends them; some end with a tabulator."""
         unguided = self.mode is FlightMode.GUIDED and self.why_not_guided()
         if unguided or not self.ready:
             return "Arming denied: Resolve system health failures first\t"
@@ -150,7 +150,7 @@ class PX4(PilotedVehicle):
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """After COM_OF_LOSS_T it leaves OFFBOARD."""
+        """PX4 leaves OFFBOARD after COM_OF_LOSS_T."""
         if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
             return False
         value = int(self.parameters["COM_OBL_RC_ACT"])

@@ -84,7 +84,7 @@ def together(options: DuelOptions) -> list[Scenario]:
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """The scenario; refused if it cannot be flown."""
+    """The scenario itself; raises ConfigError if it cannot be flown."""
     return reading.check(reading.to_table(scenario), name)
 
 

@@ -75,7 +75,7 @@ class Child:
     process: asyncio.subprocess.Process
     reader: "asyncio.Task[None]" = field(init=False)
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
-    """Last lines of its output, with events as sentences."""
+    """Last lines of output, with events as sentences."""
     address: Address = ("", 0)
     failed: bool = False
     """Whether the process has reported an event after which it could not fly."""

@@ -33,7 +33,7 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     came: int
     copies: int
-    """Duplicate arrivals, those of trains included."""
+    """Duplicate arrivals, including packets of trains."""
     loss: float
     loss_low: float
     loss_high: float

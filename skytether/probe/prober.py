@@ -321,7 +321,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers; a lost one was sent when its probe arrived."""
+        """Answers to probes; a lost answer was sent when its probe arrived."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

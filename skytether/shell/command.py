@@ -95,7 +95,7 @@ def parse(
 ) -> O:
     """Parse a command line; returns its options, laid over the scenario that it names.
 
-    The scenario is checked once, in its final values: a flag may repair a contradiction in the
+    The scenario is checked once, with its final values: a flag may repair a contradiction in the
     file.
 
     Args:

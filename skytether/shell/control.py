@@ -97,7 +97,7 @@ class Control:
             answer = msgspec.json.encode(Answer(refused=message))
         self._answer(answer, sender)
         if loop := self._loop:
-            with suppress(RuntimeError):  # it has closed meanwhile
+            with suppress(RuntimeError):  # the loop has closed meanwhile
                 loop.call_soon_threadsafe(self._go_on, fault)
 
     def _go_on(self, fault: str) -> None:

@@ -189,7 +189,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, *_: object) -> None:
-        """Ignore it: the client is gone, or too slow."""
+        """Ignore the error: the client is gone, or too slow."""
 
     def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"

@@ -120,10 +120,10 @@ class Process:
     journal: Journal | None
     warnings: list[Event]
     recording: RecordFile | None
-    """File of its rows; the process waits at the end until they are written."""
+    """File of the endpoint's rows; the process waits at the end until they are written."""
     feed: Feed | None
     recorder: Recorder | None
-    """Recorder of its rows, for a file, a feed or both; None for neither."""
+    """Recorder of the endpoint's rows, for a file, a feed or both; None for neither."""
 
     def fed(self, part: str, columns: np.dtype[np.void]) -> Recorder | None:
         """Recorder of a further part of the record, for the feed only; None without a feed."""

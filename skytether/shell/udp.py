@@ -76,7 +76,7 @@ def leads_back(address: Address, bound: Address) -> bool:
     (host, port), (bound_host, bound_port) = look_up(address), look_up(bound)
     if port != bound_port or (":" in host) != (":" in bound_host):
         return False
-    if _is_unspecified(host):  # packets to it go to loopback
+    if _is_unspecified(host):  # packets to a wildcard address go to loopback
         host = "::1" if ":" in host else "127.0.0.1"
     return host == bound_host or (_is_unspecified(bound_host) and _is_own(host))
 

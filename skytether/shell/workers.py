@@ -92,7 +92,7 @@ def _work(
         try:
             work(number, sock)
         finally:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is ending already
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the worker is ending already
 
 
 def die_with_parent() -> None:

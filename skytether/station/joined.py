@@ -34,7 +34,7 @@ def station_columns(axes: int) -> np.dtype[np.void]:
             ("step", "<i8"),
             ("input", "<f8", (axes,)),  # velocity of the set-point [m/s]
             ("measured", "<f8", (axes,)),  # newest position received [m]; NaN for none
-            ("age_ns", "<i8"),  # its age; -1 for none
+            ("age_ns", "<i8"),  # age of that position; -1 for none
             # whether the station was in control of the autopilot, and so sent a set-point
             ("obeyed", "?"),
             ("late", "<i8"),  # number of positions so far that arrived after newer ones

@@ -90,7 +90,7 @@ def flags(law: Law) -> list[str]:
 
 class Heard(NamedTuple):
     time_s: float
-    """Time of flight at which it was measured [s]."""
+    """Time of flight at the measurement [s]."""
     position: Array
     """Shape (axes,) [m]."""
 

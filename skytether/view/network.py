@@ -18,7 +18,7 @@ DELAY_BIN_NS = 20 * MILLISECOND_NS
 DELAY_BINS = 100
 """Number of bins of the delay histogram; the last bin contains all longer delays."""
 DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
-"""Directions: up to the vehicle, down from it."""
+"""Names of the directions: up to the vehicle, down from the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Traffic:
     packets_per_s: float
     bytes_per_s: float
     loss: float
-    """Share of its packets that were lost; NaN without packets."""
+    """Share of packets that were lost; NaN without packets."""
     delay_ms_p50: float
     delay_ms_p99: float
 

@@ -68,7 +68,7 @@ class Plot:
     crop: bool = False
     """Whether trailing zeros are cropped."""
     equal: bool = False
-    """Whether its range is as wide as that of the other plots with this flag."""
+    """Whether the vertical range is as wide as in all other plots with `equal`."""
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:

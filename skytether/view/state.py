@@ -124,7 +124,7 @@ class VehicleTrack:
         """Newest row of the client's part; None without any."""
         self.planned = 0
         self.sent = 0
-        """Number of those steps at which the server sent a horizon."""
+        """Number of steps seen at which the server sent a horizon."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
         """Newest plans sent to the vehicle, the newest last."""
         self._seen: np.void | None = None
@@ -298,7 +298,7 @@ class VehicleTrack:
 
 
 def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Group of figures within others; empty if it is missing."""
+    """Group of figures within others; empty if missing."""
     for name in names:
         value = figures.get(name)
         figures = value if isinstance(value, dict) else {}
@@ -306,7 +306,7 @@ def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def told(figures: dict[str, Any], *names: str) -> float:
-    """Figure within nested groups; NaN if it is missing."""
+    """Figure within nested groups; NaN if missing."""
     value = group(figures, *names[:-1]).get(names[-1])
     return float(value) if isinstance(value, int | float) else np.nan
 

@@ -59,7 +59,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
     rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of observation flown by", number(track.age_s, ".2f", " s")))
-    rows.append(("age of server's observation", number(track.known_s, ".2f", " s")))
+    rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
     rows += _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms

@@ -28,7 +28,7 @@ MOVES_TO_A_DRAWING = 5
 STOPPED_S = 30.0
 """Time after which a viser server that does not end is abandoned [s]."""
 
-# A browser may leave while it is being drawn for.
+# viser warns if a browser leaves during a redraw.
 warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 

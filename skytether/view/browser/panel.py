@@ -539,7 +539,7 @@ class _Mission:
 
 
 class _Handle:
-    """Handle in the scene that this browser can drag.
+    """Handle in the scene that the user can drag.
 
     Args:
         axes: axes along which it can be dragged.
@@ -590,7 +590,7 @@ class _Handle:
 
 
 class _Lead:
-    """Target that this browser can drag, or place by a click."""
+    """Target that the user can drag, or place by a click."""
 
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights
