@@ -5,8 +5,8 @@
     flight = skytether.fly("demo", duration=20)
     print(flight.summary.rmse_xy)
 
-`docs/python.md` shows all of it. What stands in `__all__` is the library; a name is imported when
-it is first used, so that `import skytether` costs next to nothing.
+`docs/python.md` describes the library, which is the names in `__all__`; a name is imported when it
+is first used, so that `import skytether` is fast.
 """
 
 from importlib import import_module
@@ -52,7 +52,7 @@ _HOMES = {
     "skytether.shared.telemetry.summary": ("Summary",),
     "skytether.sim.world": ("World",),
 }
-"""Names of the library, by the module that each comes from."""
+"""Names of the library, by the module that defines them."""
 
 
 if not TYPE_CHECKING:  # with it, type checkers would accept any name

@@ -1,4 +1,4 @@
-"""The `skytether` command: it hands each subcommand to the module that has it."""
+"""The `skytether` command: it passes each subcommand to the module that implements it."""
 
 import sys
 from collections.abc import Sequence
@@ -12,32 +12,32 @@ reorders and loses their packets.
 
   fly [SCENARIO]        one flight, with everything it needs; the command to start with
   straight [SCENARIO]   the same by set-points sent straight to an autopilot, to compare with
-  fleet [SCENARIO]      many vehicles on one server, and what each costs it
-  crowd [SCENARIO]      how many vehicles fly on one shared air, scheme by scheme
+  fleet [SCENARIO]      many vehicles on one server, and the CPU time of each
+  crowd [SCENARIO]      how many vehicles can share one radio channel, scheme by scheme
   sweep [SCENARIO]      a grid of scenarios, many flights each, on all cores or a cluster
-  envelope [SCENARIO]   the networks and settings that a scenario bears, by random flights
+  envelope [SCENARIO]   the networks and settings that a scenario tolerates, by random flights
   margins [SCENARIO]    whether its loop is stable, and with which vehicles, by flights
-  identify KIND         a vehicle's gain, time constant and dead time, from small steps it flies
-  torture               flights through faults and attacks, and whether anything unsafe is flown
-  adversary [MISSION]   a search for what brings vehicles of a mission together
+  identify KIND         a vehicle's gain, time constant and dead time, from its step responses
+  torture               flights under faults and attacks, and a check that nothing unsafe is flown
+  adversary [MISSION]   a search for faults that bring vehicles of a mission too close
   reproduce             the paper's table and figures, and more, as a report
   compare               schemes and triggers on the same seeds, each at its best weights
   calibrate [SCENARIO]  search for the paper's numbers, or for the best ones
   duel SCENARIO...      two or more scenarios on the same network, side by side on one page
   replay FILE           a recording on the page that showed the flight
-  page FOLDER...        the page of flights in a browser; `fly` serves one by itself
-  report FILE           a recording as a page with figures, for the browser
+  page FOLDER...        the page of flights in a browser; `fly` has its own
+  report FILE           a recording as an HTML page with figures
   export FILE           a recording as tables, CSV or Parquet
   join FILE... --out F  recordings of server, netem and client, as one
-  set PATH KEY=VALUE    change something while it flies, at a process with --control
-  probe HOST:PORT       a real path measured both ways, and flown over; with --listen, its far end
-  scenarios             what can be flown
+  set PATH KEY=VALUE    change keys in flight, at a process with --control
+  probe HOST:PORT       delay and loss of a real path, each way; with --listen, its far end
+  scenarios             scenarios that come with Skytether
   triggers              policies for control.trigger, a sentence each
   reports               policies for vehicle.report, a sentence each
-  schemes               what the server sends, for control.scheme, a sentence each
+  schemes               schemes for control.scheme, a sentence each
   references            shapes for reference.shape, a sentence each
-  impairments           what a network does to packets, a sentence each
-  vehicles              what may fly, for vehicle.kind, a sentence each
+  impairments           effects of a network on packets, a sentence each
+  vehicles              vehicle models for vehicle.kind, a sentence each
   keygen FILE           keys for vehicles, so that nobody else can fly them
   server [SCENARIO]     one process by hand: plans for vehicles
   netem [SCENARIO]      one process by hand: the network
@@ -49,7 +49,6 @@ Each has a --help of its own. `skytether fly demo` flies a demonstration."""
 
 
 def list_scenarios(argv: Sequence[str]) -> None:
-    """Print the scenarios that come with Skytether, a line each."""
     from skytether.shared.scenario import reading
     from skytether.shell.command import CommandError
 
@@ -101,8 +100,9 @@ COMMANDS = {
     "autopilot": "skytether.autopilot.__main__:pilot",
     "station": "skytether.station.__main__:fly",
 }
-"""Function of each subcommand, imported once it is called: netem need not wait for what a server
-compiles."""
+"""Function of each subcommand; imported when called, so that netem does not import the kernels of a
+server.
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -115,7 +115,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def introduce(argv: Sequence[str]) -> None:
-    """Print the commands, or the version."""
     from importlib import metadata
 
     from skytether.shared.base.hint import hint

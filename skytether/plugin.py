@@ -1,7 +1,7 @@
-"""Names that a plug-in imports: the decorators, and the types of what its functions are given.
+"""Names that a plug-in imports: the decorators, and the types of its functions' arguments.
 
-docs/triggers.md has triggers, docs/schemes.md references, docs/vehicles.md vehicles,
-docs/network.md impairments. A scheme imports `skytether.plugin_scheme` beside them.
+docs/triggers.md describes triggers, docs/schemes.md references, docs/vehicles.md vehicles,
+docs/network.md impairments. A scheme also imports `skytether.plugin_scheme`.
 """
 
 from skytether.client.vehicle import Measurement, Vehicle

@@ -1,6 +1,7 @@
 """Names that a plug-in with a scheme imports, beside those of `skytether.plugin`.
 
-They bring the server's packages, which no other plug-in needs. docs/schemes.md has such a plug-in.
+A module of their own, because they import the server's packages, which no other plug-in needs.
+docs/schemes.md has such a plug-in.
 """
 
 from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # first, before the imports below, which take a while
+if __name__ == "__main__":  # called before the imports below, which take a while
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
 
 from collections.abc import Sequence
@@ -27,46 +27,48 @@ BIND = "127.0.0.1:14550"
 
 @dataclass(frozen=True)
 class AutopilotOptions(ProcessOptions):
-    """Options of `skytether autopilot`."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file, of which only `vehicle.frame`,
     `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and `seed` are used."""
     flavour: FlavourName = "ardupilot"
     """Autopilot to simulate: ArduCopter 4.5 or PX4 1.17."""
     bind: str | None = None
-    """HOST:PORT to receive MAVLink at: 127.0.0.1:14550 unless given, or a free port with --to. Each
-    sender of MAVLink there is answered."""
+    """HOST:PORT to receive MAVLink at; by default 127.0.0.1:14550, or a free port with --to. Each
+    sender of MAVLink to it is answered.
+    """
     to: str | None = None
     """HOST:PORT to send heartbeats to from the start, for a companion computer that waits for the
-    autopilot to speak first: 127.0.0.1:14540 for PX4."""
+    autopilot to speak first: 127.0.0.1:14540 for PX4.
+    """
     ready: Annotated[float | None, Argument(metavar="SECONDS")] = None
-    """Time from the start until it may be armed [s]: 41.5 for ArduCopter and 4.6 for PX4 unless
-    given."""
+    """Time from the start until the vehicle may be armed [s]; by default 41.5 for ArduCopter and
+    4.6 for PX4.
+    """
     fault: Annotated[
         tuple[str, ...],
         Argument(
             metavar="NAME@SECONDS",
             append=True,
-            help="Fault to simulate, with its time after arming; may come several times. "
+            help="Fault to simulate, with its time after arming; may be repeated. "
             "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
-            "estimate@20-25: it does not know where it is; "
-            "drift@20-25: its accelerometers fail, it moves and does not notice; "
-            "commander@20-25: somebody else commands it, 3 m/s north, 50 times a second; "
+            "estimate@20-25: it has no position estimate; "
+            "drift@20-25: its accelerometers fail, it drifts and its estimate does not; "
+            "commander@20-25: a second station commands 3 m/s north, 50 times a second; "
             "leap@20: the position that it reports leaps by 12 m.",
         ),
     ] = ()
     insecure: bool = False
-    """Listen even where other machines can reach it: MAVLink has no keys, anybody there can fly
-    it."""
+    """Listen even where other machines can reach it: MAVLink has no keys, so anybody can then fly
+    the vehicle.
+    """
 
 
 def pilot(argv: Sequence[str]) -> None:
     """Simulate a vehicle with an autopilot that speaks MAVLink, until SIGINT or SIGTERM.
 
     It responds to velocities, lost set-points, commands and parameters as measured on ArduCopter or
-    PX4, around a simulated quadrotor. SIGUSR1 prints what was counted so far.
+    PX4, around a simulated quadrotor. SIGUSR1 prints the counters so far.
     """
     options = command.parse(AutopilotOptions(), argv, "skytether autopilot", pilot.__doc__)
     if options.ready is not None and not 0.0 <= options.ready <= 3600.0:
@@ -74,8 +76,8 @@ def pilot(argv: Sequence[str]) -> None:
     to = command.optional_address("--to", options.to)
     bind = command.optional_address("--bind", options.bind or (None if to else BIND))
     if bind and not (options.insecure or is_loopback(look_up(bind))):
-        said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
-        raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
+        message = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
+        raise CommandError(f"--bind: {message}: expected an address of 127.0.0.1, or --insecure", 2)
     peers = [to] if to else []
     with process.begin("autopilot", options, TRUTH_COLUMNS, secure=None) as running:
         endpoint = Autopilot(

@@ -14,7 +14,7 @@ from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Smallest value of a gain or limit, whatever its parameter says."""
+"""Lower bound of every gain and limit, also if the parameter is smaller."""
 LANDED_S = 2.0
 """Time on the ground after which a landing ends [s], as measured."""
 STATION_ACTIONS = {
@@ -37,14 +37,11 @@ FENCE_ACTIONS = {1: FlightMode.RETURN, 2: FlightMode.LAND, 4: FlightMode.HOLD}
 
 
 class ArduPilot(PilotedVehicle):
-    """Flight of ArduCopter."""
-
     refusal = Result.FAILED
     arming_word = "Arming"
     lifts_off_by_setpoint = False
 
     def why_not_armed(self) -> str:
-        """See `PilotedVehicle`."""
         if self.mode in (FlightMode.LAND, FlightMode.RETURN, FlightMode.HOLD):
             return f"Arm: {self.mode_name} mode not armable"
         if not self.ready and self.parameters["ARMING_CHECK"]:
@@ -54,27 +51,24 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def why_not_guided(self) -> str:
-        """See `PilotedVehicle`."""
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """See `PilotedVehicle`; the mode number is the first part."""
+        """The mode number is the first part."""
         return main
 
     def takes_setpoints(self) -> bool:
-        """See `PilotedVehicle`."""
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, told: float) -> float | None:
-        """See `PilotedVehicle`; the altitude is above home."""
+        """The altitude is above home."""
         return told
 
     def enter_takeoff(self) -> bool:
-        """See `PilotedVehicle`; GUIDED itself climbs."""
+        """GUIDED itself climbs."""
         return self.mode is FlightMode.GUIDED
 
     def limits(self) -> OwnSpeeds:
-        """See `PilotedVehicle`."""
         p = self.parameters
         return OwnSpeeds(
             speed=p["WPNAV_SPEED"] / 100.0,
@@ -88,7 +82,6 @@ class ArduPilot(PilotedVehicle):
         )
 
     def gains(self) -> Gains:
-        """See `PilotedVehicle`."""
         p = self.parameters
         return self.flavour.gains._replace(
             jerk=max(p["PSC_JERK_XY"], LEAST),
@@ -100,21 +93,19 @@ class ArduPilot(PilotedVehicle):
         )
 
     def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
-        """See `PilotedVehicle`."""
         return system == self.parameters["SYSID_MYGCS"]
 
     def return_altitude(self, distance: float) -> float:
-        """See `PilotedVehicle`; lower where home is near."""
+        """RTL_ALT, or lower near home."""
         cone = self.parameters["RTL_CONE_SLOPE"] * distance
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """See `PilotedVehicle`; it brakes after GUID_TIMEOUT, if it moves."""
+        """The vehicle brakes after GUID_TIMEOUT, if it moves."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 
     def watch(self) -> None:
-        """See `PilotedVehicle`."""
         p = self.parameters
         if self.station_ns is not None:
             past_s = (self.now_ns - self.station_ns) / SECOND_NS
@@ -137,6 +128,5 @@ class ArduPilot(PilotedVehicle):
                 self.act(action, f"Fence: {action.name.lower()}")
 
     def idle_s(self) -> float:
-        """See `PilotedVehicle`."""
         landed = self.mode in (FlightMode.LAND, FlightMode.RETURN)
         return LANDED_S if landed else self.parameters["DISARM_DELAY"]

@@ -1,4 +1,4 @@
-"""The autopilot as an endpoint: MAVLink in datagrams, and a quadrotor that flies meanwhile.
+"""Autopilot as an endpoint: MAVLink in datagrams, and a quadrotor that flies meanwhile.
 
 Each sender of a MAVLink message becomes a peer, to which the autopilot sends; peers given at the
 start are sent to at once. Each peer has its own streams, as each link of a real autopilot has.
@@ -40,10 +40,8 @@ PEERS_MAX = 8
 PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
-"""Longest time that is simulated at once after a late wake [ns]; beyond it, the flight skips
-time."""
+"""Longest time that is simulated at once after a late wake [ns]; the flight skips the rest."""
 LISTED_EACH_TICK = 2
-"""Number of parameters of a list that are sent per tick."""
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -57,7 +55,6 @@ class Peer:
     """Peer to which the autopilot sends.
 
     Args:
-        address: its address.
         pinned: whether the peer is never replaced, however long it is silent.
         rates: initial rates of its streams [Hz], by message id.
         now_ns: time now, on the autopilot's clock.
@@ -70,7 +67,6 @@ class Peer:
         self.codec = Codec(SYSTEM, COMPONENT)
         self.heard_ns = now_ns
         self.is_station = False
-        """Whether a heartbeat of a ground station came from it."""
         self.listed: int | None = None
         """Number of parameters sent of a requested list; None without a request."""
         self.streams: dict[int, tuple[int, int]] = {}
@@ -85,11 +81,11 @@ class Peer:
 
     def due(self, now_ns: int) -> list[int]:
         """Messages that are due now; each is scheduled again."""
-        found = [number for number, (_, next_ns) in self.streams.items() if next_ns <= now_ns]
-        for number in found:
+        numbers = [number for number, (_, next_ns) in self.streams.items() if next_ns <= now_ns]
+        for number in numbers:
             interval_ns, next_ns = self.streams[number]
             self.streams[number] = interval_ns, max(next_ns + interval_ns, now_ns)
-        return found
+        return numbers
 
 
 class Autopilot(Endpoint):
@@ -97,10 +93,8 @@ class Autopilot(Endpoint):
 
     Args:
         scenario: scenario, of which frame, battery, wind and seed are used.
-        flavour: autopilot to simulate.
         peers: addresses that it sends to from the start.
-        ready_s: time until it may be armed [s]; None for its flavour's.
-        faults: scripted faults.
+        ready_s: time until it may be armed; None for its flavour's.
         recorder: takes the true state at each tick, as rows of `record.TRUTH_COLUMNS`.
     """
 
@@ -135,7 +129,6 @@ class Autopilot(Endpoint):
         )
         self._telemetry = Telemetry(self.flight)
         self.script = Script(faults)
-        """Scripted faults."""
         self._recorder = recorder
         self._began_ns: int | None = None
         """Time at which the autopilot's own clock began [ns; the driver's clock]."""
@@ -144,7 +137,6 @@ class Autopilot(Endpoint):
             self._meet(address, pinned=True)
         self._reader = Codec(SYSTEM, COMPONENT)
         self._texts = 0
-        """Id of the newest text."""
         self._counts: Counter[str] = Counter()
         self._handlers: dict[str, Callable[[Message, Peer, int], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -161,12 +153,11 @@ class Autopilot(Endpoint):
     # Driver interface
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._fly(now_ns)
         messages = self._reader.decode(datagram.payload)
         peer = self._peers.get(datagram.peer)
         for message in messages:
-            if message.get_srcSystem() == SYSTEM:  # our own echo, or another system with our id
+            if message.get_srcSystem() == SYSTEM:  # an echo, or another system with the same id
                 self._counts["foreign"] += 1
                 continue
             peer = peer or self._meet(datagram.peer)
@@ -183,20 +174,17 @@ class Autopilot(Endpoint):
         self._speak()
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         self._fly(now_ns)
 
     def next_wake_ns(self) -> int:
-        """See `Endpoint`: the time of the next tick."""
         return 0 if self._began_ns is None else self._began_ns + self.flight.now_ns + TICK_NS
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """See `Endpoint`; the wind changes."""
+        """Only the wind changes."""
         vehicle = scenario.vehicle
         self.flight.quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         x, y, z = self.flight.position()
         names = ("heard", "foreign", "refused", "setpoints", "commands", "rejected", "sent")
         return {
@@ -212,7 +200,7 @@ class Autopilot(Endpoint):
     # Flight and telemetry
 
     def _fly(self, now_ns: int) -> None:
-        """Fly until now, tick by tick, and send the messages due at each tick."""
+        """Fly until `now_ns`, tick by tick, and send the messages due at each tick."""
         if self._began_ns is None:
             self._began_ns = now_ns
         behind_ns = now_ns - self._began_ns - self.flight.now_ns
@@ -229,14 +217,13 @@ class Autopilot(Endpoint):
                 self._list(peer)
 
     def _record(self, time_ns: int) -> None:
-        """Record the true state at a time."""
         if self._recorder is not None:
             x, y, z = self.flight.position()
             vx, vy, vz = self.flight.quadrotor.velocity().tolist()
             self._recorder.append_row(time_ns, x, vx, y, vy, z, vz)
 
     def _meet(self, address: Address, *, pinned: bool = False) -> Peer | None:
-        """Add a peer; None where there is no room for it."""
+        """Add a peer; None if PEERS_MAX are active."""
         now_ns = self.flight.now_ns
         if len(self._peers) == PEERS_MAX:
             others = [peer for peer in self._peers.values() if not peer.pinned]
@@ -249,7 +236,6 @@ class Autopilot(Endpoint):
         return peer
 
     def _send(self, peer: Peer, message: Message) -> None:
-        """Send a message to a peer, unless a fault silences the autopilot."""
         if not self.script.silent:
             self._counts["sent"] += 1
             self.send(peer.codec.encode(message), peer.address)
@@ -263,7 +249,6 @@ class Autopilot(Endpoint):
         return make is not None
 
     def _speak(self) -> None:
-        """Send all peers the flight's new texts, and log them."""
         for severity, text in self.flight.said:
             self.tell(AutopilotSaid(text=text, severity=int(severity)))
             self._texts = self._texts % 65535 + 1
@@ -274,7 +259,6 @@ class Autopilot(Endpoint):
         self.flight.said.clear()
 
     def _list(self, peer: Peer) -> None:
-        """Send the next parameters of a requested list."""
         if peer.listed is None:
             return
         names = list(self.flight.parameters)
@@ -316,8 +300,8 @@ class Autopilot(Endpoint):
         value = parameters.from_wire(message.param_value, kind, bytewise=self._flavour.bytewise)
         if value is not None:
             self.flight.set(name, round(value) if isinstance(before, int) else float(value))
-        for each in self._peers.values():
-            self._send(each, self._telemetry.parameter(name))
+        for receiver in self._peers.values():
+            self._send(receiver, self._telemetry.parameter(name))
 
     def _on_mode(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         self._acknowledge(
@@ -333,9 +317,9 @@ class Autopilot(Endpoint):
         if not mask & POSITION_IGNORED:
             position = turned((message.x, message.y, message.z))
         numbers = (*velocity, *(position or ()))
-        wanted = position is not None or not mask & VELOCITY_IGNORED
+        is_usable = position is not None or not mask & VELOCITY_IGNORED
         if (
-            wanted
+            is_usable
             and mask & ACCELERATION_IGNORED == ACCELERATION_IGNORED
             and message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
             and all(map(isfinite, numbers))
@@ -348,8 +332,8 @@ class Autopilot(Endpoint):
     def _on_command(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         long = message.get_type() == "COMMAND_LONG"
         seventh = message.param7 if long else message.z
-        given = (message.param1, message.param2, message.param3, seventh)
-        result = self._obey(message.command, given, peer)
+        parameters = (message.param1, message.param2, message.param3, seventh)
+        result = self._obey(message.command, parameters, peer)
         self._counts["commands" if result is Result.ACCEPTED else "rejected"] += 1
         self._acknowledge(peer, message, message.command, result)
 
@@ -383,9 +367,7 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Set the interval of a message to a peer [µs]; 0 restores the default, below 0 stops
-        it.
-        """
+        """Set the interval of a message to a peer; 0 restores the default, below 0 stops it."""
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
         if interval_us == 0.0:
@@ -416,5 +398,5 @@ def _is_ours(message: Message) -> bool:
 
 
 def _whole(value: float) -> int:
-    """Integer in a command's float parameter; -1 where it is none."""
+    """Integer in a command's float parameter; -1 if it is none."""
     return int(value) if isfinite(value) and value == int(value) else -1

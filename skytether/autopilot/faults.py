@@ -1,4 +1,4 @@
-"""Scripted faults: what fails, and when, counted from arming."""
+"""Scripted faults of the simulated autopilot, at times counted from arming."""
 
 import re
 from collections.abc import Sequence
@@ -15,28 +15,23 @@ FaultName = Literal[
 ]
 NAMES: tuple[str, ...] = get_args(FaultName)
 LASTING = ("silence", "estimate", "drift", "leap", "commander")
-"""Faults that may end."""
 DRIFT: Vector = (3.5, 0.0, 0.0)
-"""Velocity at which the vehicle moves unnoticed with the fault `drift` [m/s]."""
+"""True velocity of the fault `drift`, which the estimate does not show [m/s]."""
 COMMANDED: Vector = (3.0, 0.0, 0.0)
 """Velocity that a second commander sends with the fault `commander` [m/s]."""
 COMMANDED_NS = 20 * MILLISECOND_NS
-"""Time between two set-points of a second commander [ns]."""
+"""Interval of the second commander's set-points [ns]."""
 LEAP: Vector = (-12.0, 0.0, 0.0)
 """Displacement of the reported position with the fault `leap` [m]."""
 LOW_CHARGE = 0.05
-"""Charge that is left by the fault `battery`."""
+"""Remaining charge after the fault `battery`."""
 
 
 class ScriptedFault(NamedTuple):
-    """Scripted fault."""
-
     name: str
-    """Name, one of NAMES."""
     from_ns: int
-    """Time at which it begins, counted from arming."""
     until_ns: int | None
-    """Time at which it ends; None for never."""
+    """None for a fault that does not end."""
 
 
 def parse(text: str) -> ScriptedFault:
@@ -46,11 +41,11 @@ def parse(text: str) -> ScriptedFault:
         ConfigError: the text is no fault.
     """
     number = r"(\d+(?:\.\d+)?)"
-    found = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)
-    if found is None:
+    match = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)
+    if match is None:
         expected = "expected NAME@SECONDS, or NAME@SECONDS-SECONDS, after arming"
         raise ConfigError(f"--fault: got {text!r}, {expected}")
-    name, begin, end = found.groups()
+    name, begin, end = match.groups()
     if name not in NAMES:
         raise ConfigError(f"--fault: got {name!r}; {hint(name, NAMES)}")
     if end is not None and (name not in LASTING or float(end) <= float(begin)):
@@ -62,22 +57,13 @@ def parse(text: str) -> ScriptedFault:
 
 
 class Script:
-    """Scripted faults of a flight.
-
-    Args:
-        faults: the faults.
-    """
-
     def __init__(self, faults: Sequence[ScriptedFault]) -> None:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
         self._lasting: list[ScriptedFault] = []
         self._commands = False
-        """Whether somebody else commands the vehicle, over another line of the autopilot."""
         self.silent = False
-        """Whether the autopilot sends nothing."""
 
     def play(self, flight: PilotedVehicle) -> None:
-        """Apply the faults that are due."""
         if flight.armed_ns is None:
             return
         past_ns = flight.now_ns - flight.armed_ns

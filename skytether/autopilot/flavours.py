@@ -22,7 +22,7 @@ class FlightMode(Enum):
     PILOT = auto()
     """Flown by a pilot; with sticks centred, the vehicle stays where it is."""
     HOLD = auto()
-    """Brakes, and stays where it is."""
+    """Brakes, and holds the position."""
     GUIDED = auto()
     """Follows a companion computer: GUIDED, OFFBOARD."""
     TAKEOFF = auto()
@@ -30,44 +30,37 @@ class FlightMode(Enum):
     RETURN = auto()
     """Flies home, and lands."""
     LAND = auto()
-    """Lands where it is."""
+    """Lands at the present position."""
 
 
 @dataclass(frozen=True)
 class SimulatedFlavour:
-    """Flavour of the simulated autopilot."""
+    """Constants of one simulated autopilot."""
 
     title: str
-    """Display name."""
     version: tuple[int, int, int]
     """Version on which the behaviour was measured."""
     autopilot: int
-    """MAV_AUTOPILOT in the heartbeat."""
     bytewise: bool
-    """Whether a parameter's bits are sent, see `mavlink.parameters`."""
+    """Whether integer parameters are sent as bits, see `mavlink.parameters`."""
     gains: Gains
-    """Gains of the velocity loop."""
     frame: str
-    """Frame in the autopilot's own simulator, or the nearest one."""
+    """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
-    """Time from the start until it may be armed, in which position and filters settle [s]."""
+    """Time from the start until arming is allowed, in which position and filters settle."""
     words_for_stations: bool
-    """Whether its texts go to ground stations alone, as PX4's do."""
+    """Whether texts go only to ground stations, as PX4's do."""
     spool_s: float
-    """Time from the take-off command until it climbs [s]."""
+    """Time from the take-off command until the vehicle climbs."""
     wander_mps: float
-    """Standard deviation of the error of its velocity estimate, along each axis [m/s]. The true
-    velocity differs by this error from the one that the loops control."""
+    """Standard deviation, along each axis, of the error of the velocity that the loops use."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
     """Name and meaning of each mode, by the number in the heartbeat."""
     first: int
-    """Mode at the start."""
     streams: dict[int, float]
-    """Default rates of a link's messages [Hz], by message id."""
     parameters: Parameters
-    """Parameters at the start."""
 
     def number(self, mode: FlightMode) -> int:
         """Number of the first mode with this meaning."""
@@ -206,4 +199,3 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         },
     ),
 }
-"""Flavours by name."""

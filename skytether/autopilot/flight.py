@@ -1,8 +1,8 @@
-"""Flight of a simulated autopilot: arming, modes, the motion in each mode, and what ends it.
+"""Flight of a simulated autopilot: arming, modes, the motion in each mode, and failsafes.
 
 Both flavours share this module; their differences are in `ardupilot.py` and `px4.py`. Positions are
-x north, y east, altitude up, from where it was started. Times are those of its own clock [ns],
-which begins at 0.
+x north, y east, altitude up, from the start. Times are those of its own clock [ns], which begins at
+0.
 """
 
 from abc import ABC, abstractmethod
@@ -37,8 +37,6 @@ REST: Vector = (0.0, 0.0, 0.0)
 
 
 class Result(IntEnum):
-    """Result of a command: MAV_RESULT."""
-
     ACCEPTED = dialect.MAV_RESULT_ACCEPTED
     REJECTED = dialect.MAV_RESULT_TEMPORARILY_REJECTED
     DENIED = dialect.MAV_RESULT_DENIED
@@ -47,16 +45,12 @@ class Result(IntEnum):
 
 
 class Severity(IntEnum):
-    """Severity of a text: MAV_SEVERITY."""
-
     CRITICAL = dialect.MAV_SEVERITY_CRITICAL
     WARNING = dialect.MAV_SEVERITY_WARNING
     INFO = dialect.MAV_SEVERITY_INFO
 
 
 class Landed(Enum):
-    """Landed state: MAV_LANDED_STATE."""
-
     ON_GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
     IN_AIR = dialect.MAV_LANDED_STATE_IN_AIR
     TAKEOFF = dialect.MAV_LANDED_STATE_TAKEOFF
@@ -64,27 +58,20 @@ class Landed(Enum):
 
 
 class CompanionSetpoint(NamedTuple):
-    """Set-point of a companion computer."""
-
     velocity: Vector
     """Velocity, or with a position the feed-forward velocity [m/s]."""
     position: Vector | None
-    """Position [m]; None: only the velocity is set."""
+    """Position [m]; None if only the velocity is set."""
     came_ns: int
-    """Time of arrival."""
 
 
 class OwnSpeeds(NamedTuple):
-    """Limits and gains of the autopilot's own flight."""
+    """Limits and gains of the autopilot's own flight, in modes that follow no set-points."""
 
     speed: float
-    """Largest horizontal speed [m/s]."""
     up: float
-    """Largest speed upwards [m/s]."""
     down: float
-    """Largest speed downwards [m/s]."""
     land: float
-    """Speed of landing [m/s]."""
     p: float
     """Gain from horizontal distance to speed [1/s]."""
     p_up: float
@@ -99,10 +86,9 @@ class PilotedVehicle(ABC):
     """Vehicle with an autopilot.
 
     Args:
-        flavour: autopilot to simulate.
-        quadrotor: its body, standing on the ground at the origin.
-        ready_s: time from the start until it may be armed [s].
-        noise: random generator of what it estimates.
+        quadrotor: body of the vehicle, standing on the ground at the origin.
+        ready_s: time from the start until it may be armed.
+        noise: random generator of estimation errors.
     """
 
     low = 0.15
@@ -118,36 +104,28 @@ class PilotedVehicle(ABC):
         self.flavour, self.quadrotor = flavour, quadrotor
         self.parameters: Parameters = dict(flavour.parameters)
         self.number = flavour.first
-        """Number of the present mode."""
         self.armed = False
         self.armed_ns: int | None = None
-        """Time of the first arming."""
         self.flying = False
-        """Whether the vehicle has left the ground."""
         self.estimates = True
-        """Whether its position estimate is valid, once it is ready."""
+        """Whether the position estimate is valid, apart from the wait after the start."""
         self.drift: Vector = REST
         """True velocity minus the estimated one, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
         """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
         self.displaced: Vector = REST
-        """Displacement of the position that it reports [m]."""
         self.said: list[tuple[Severity, str]] = []
-        """Texts not sent yet."""
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat; None before any: then there is none to
-        lose."""
+        """Time of the ground station's newest heartbeat; None before any: no failsafe then."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
         """Altitude to climb to [m]; None while not climbing."""
         self._climb_ns = 0
-        """Time at which the climb begins."""
         self._held: Vector | None = None
         """Point that is held after coming to rest."""
         self._stood_ns = 0
-        """Time since which the vehicle has been at rest on the ground."""
         self._landing = False
         """Whether a return has become a landing."""
         self._told: set[str] = set()
@@ -156,22 +134,18 @@ class PilotedVehicle(ABC):
 
     @property
     def mode(self) -> FlightMode:
-        """Present mode."""
         return self.flavour.modes[self.number][1]
 
     @property
     def mode_name(self) -> str:
-        """The autopilot's name for the present mode."""
         return self.flavour.modes[self.number][0]
 
     @property
     def ready(self) -> bool:
-        """Whether the position is known."""
         return self.estimates and self.now_ns >= self._ready_ns
 
     @property
     def landed(self) -> Landed:
-        """Whether the vehicle is on the ground."""
         if not self.flying:
             return Landed.ON_GROUND
         if self._climb is not None:
@@ -180,7 +154,6 @@ class PilotedVehicle(ABC):
         return Landed.LANDING if landing else Landed.IN_AIR
 
     def say(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """Send a text to all peers."""
         self.said.append((severity, text))
 
     # Commands
@@ -211,7 +184,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def switch(self, number: int) -> Result:
-        """Enter the mode with this number, if it is possible now."""
         if number not in self.flavour.modes:
             return Result.DENIED
         name, kind = self.flavour.modes[number]
@@ -228,7 +200,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def enter(self, number: int) -> None:
-        """Enter the mode with this number unconditionally."""
         if number == self.number:
             return
         self.number = number
@@ -240,12 +211,11 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def set(self, name: str, value: float) -> None:
-        """Set a parameter."""
         self.parameters[name] = value
         self.quadrotor.gains = self.gains()
 
     def act(self, mode: FlightMode, why: str, severity: Severity = Severity.CRITICAL) -> None:
-        """Trigger a failsafe: announce the reason, and enter a mode unless in it already."""
+        """Trigger a failsafe: announce the reason, and enter a mode."""
         self.say(why, severity)
         self.enter(self.flavour.number(mode))
 
@@ -262,7 +232,6 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def want(self, velocity: Vector, position: Vector | None) -> None:
-        """Accept a set-point of a companion computer."""
         if not self.takes_setpoints():
             return
         if self.mode is FlightMode.GUIDED:
@@ -270,7 +239,7 @@ class PilotedVehicle(ABC):
         self._setpoint = CompanionSetpoint(velocity, position, self.now_ns)
 
     def forget(self) -> None:
-        """Forget the companion computer's earlier set-points."""
+        """Discard the companion computer's earlier set-points."""
         self._setpoint = None
 
     # Differences between flavours
@@ -278,15 +247,15 @@ class PilotedVehicle(ABC):
     refusal: Result
     """Result of a command that cannot be executed now."""
     arming_word: str
-    """Text announced at arming; empty for another sentence."""
+    """Word in the text announced at arming; empty for another sentence."""
 
     @abstractmethod
     def why_not_armed(self) -> str:
-        """Reason why it cannot be armed; empty where it can."""
+        """Reason why arming is refused; empty if it is allowed."""
 
     @abstractmethod
     def why_not_guided(self) -> str:
-        """Reason why it cannot be guided; empty where it can."""
+        """Reason why GUIDED is refused; empty if it is allowed."""
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
@@ -294,7 +263,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def takes_setpoints(self) -> bool:
-        """Whether it follows set-points in its present mode."""
+        """Whether set-points are followed in the present mode."""
 
     @abstractmethod
     def altitude_of(self, told: float) -> float | None:
@@ -305,20 +274,18 @@ class PilotedVehicle(ABC):
         """Enter the mode that climbs; returns whether this is possible."""
 
     @abstractmethod
-    def limits(self) -> OwnSpeeds:
-        """Limits and gains of its own flight, from its parameters."""
+    def limits(self) -> OwnSpeeds: ...
 
     @abstractmethod
-    def gains(self) -> Gains:
-        """Gains of its velocity loop, from its parameters."""
+    def gains(self) -> Gains: ...
 
     @abstractmethod
     def is_station(self, system: int, kind: int) -> bool:
-        """Whether heartbeats of this system and MAV_TYPE are those of its ground station."""
+        """Whether a system of this id and MAV_TYPE is the vehicle's ground station."""
 
     @abstractmethod
     def return_altitude(self, distance: float) -> float:
-        """Altitude at which it flies home from a distance [m]."""
+        """Altitude for the flight home from a distance [m]."""
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
@@ -330,12 +297,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def idle_s(self) -> float:
-        """Time on the ground after which it disarms [s]; shorter after a landing."""
+        """Time on the ground until the vehicle disarms [s]; shorter after a landing."""
 
     # Motion
 
     def tick(self) -> None:
-        """Simulate TICK_NS."""
         self.now_ns += TICK_NS
         if self.armed:
             if self.flying:
@@ -360,7 +326,6 @@ class PilotedVehicle(ABC):
         return new
 
     def _lift(self, velocity: Vector) -> None:
-        """Leave the ground, if the mode climbs."""
         if self.flying:
             return
         climbs = self._climb is not None and self.now_ns >= self._climb_ns
@@ -380,7 +345,6 @@ class PilotedVehicle(ABC):
             self.disarm()
 
     def _guide(self) -> Vector:
-        """Desired velocity now [m/s]."""
         if self._climb is not None:
             return self._climbing(self._climb)
         match self.mode:
@@ -404,7 +368,7 @@ class PilotedVehicle(ABC):
         return self._toward((*self._stay_xy(), altitude))
 
     def _stay_xy(self) -> tuple[float, float]:
-        """Horizontal point at which it climbs or lands."""
+        """Horizontal position held during a climb or a landing."""
         if self._held is None:
             self._held = self.quadrotor_wants()
         return self._held[:2]
@@ -424,7 +388,7 @@ class PilotedVehicle(ABC):
         return self._toward(setpoint.position, setpoint.velocity)
 
     def _staying(self) -> Vector:
-        """Brake, and hold the point where it comes to rest."""
+        """Velocity that brakes, then holds the position at which the vehicle came to rest."""
         if self._held is None:
             if hypot(*self.velocity()) > STILL_MPS:
                 return REST
@@ -452,7 +416,7 @@ class PilotedVehicle(ABC):
         return x, y, -(limits.land if z < 10.0 else limits.down)
 
     def _toward(self, point: Vector, velocity: Vector = REST) -> Vector:
-        """Velocity towards a point, slower near it, added to a feed-forward velocity."""
+        """Velocity towards a point, slower near the point, plus a feed-forward velocity."""
         limits = self.limits()
         x, y, z = (to - now for to, now in zip(point, self.quadrotor_wants(), strict=True))
         distance = hypot(x, y)
@@ -490,7 +454,7 @@ class PilotedVehicle(ABC):
             self._wander[:] = 0.0
 
     def quadrotor_wants(self) -> Vector:
-        """Desired position of its loops [m]: the true one, or that of the shaped velocity."""
+        """Position that the control loops track [m]: the true one, or that of the shaped motion."""
         x, y, z = self.quadrotor.wanted_position().tolist()
         return x, y, z
 

@@ -1,8 +1,8 @@
 """PX4 1.17, as measured: it leaves OFFBOARD when set-points stop, and flies home.
 
-A failsafe covers the mode that was asked for: when set-points come again, PX4 is back in OFFBOARD
-by itself. After disarming it is in the newest mode asked for that may be armed, such as OFFBOARD
-after a landing.
+A failsafe only covers the requested mode: when set-points come again, PX4 returns to OFFBOARD by
+itself. After disarming it is in the newest requested mode that may be armed, such as OFFBOARD after
+a landing.
 """
 
 from math import hypot, isfinite, radians, tan
@@ -24,7 +24,7 @@ from skytether.quadrotor.quadrotor import Quadrotor
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Smallest value of a gain, whatever its parameter says."""
+"""Lower bound of every gain, also if the parameter is smaller."""
 SILENCE_LAG_S = 0.2
 """Time from the end of COM_OF_LOSS_T until PX4 acts [s], as measured."""
 OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}
@@ -34,14 +34,12 @@ STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
 """Modes by the value of COM_LOW_BAT_ACT."""
 UNARMABLE = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN)
-"""Modes in which PX4 does not stay after disarming."""
+"""Modes that PX4 leaves after disarming."""
 FENCE_ACTIONS = {2: FlightMode.HOLD, 3: FlightMode.RETURN, 5: FlightMode.LAND}
 """Modes by the value of GF_ACTION."""
 
 
 class PX4(PilotedVehicle):
-    """Flight of PX4."""
-
     refusal = Result.REJECTED
     arming_word = ""
     lifts_off_by_setpoint = True
@@ -57,10 +55,8 @@ class PX4(PilotedVehicle):
         self._covered = False
         """Whether a failsafe covers OFFBOARD until set-points come again."""
         self._after_disarming = flavour.first
-        """Mode in which it is after disarming."""
 
     def switch(self, number: int) -> Result:
-        """See `PilotedVehicle`."""
         result = super().switch(number)
         if result is Result.ACCEPTED:
             self._covered = False
@@ -69,7 +65,6 @@ class PX4(PilotedVehicle):
         return result
 
     def disarm(self, *, force: bool = False) -> Result:
-        """See `PilotedVehicle`."""
         result = super().disarm(force=force)
         if result is Result.ACCEPTED:
             self._covered = False
@@ -77,14 +72,13 @@ class PX4(PilotedVehicle):
         return result
 
     def want(self, velocity: Vector, position: Vector | None) -> None:
-        """See `PilotedVehicle`."""
         super().want(velocity, position)
         if self._covered:
             self._covered = False
             self.enter(self.flavour.number(FlightMode.GUIDED))
 
     def why_not_armed(self) -> str:
-        """See `PilotedVehicle`; PX4 ends its texts with a tabulator."""
+        """Texts as PX4 sends them; some end with a tabulator."""
         unguided = self.mode is FlightMode.GUIDED and self.why_not_guided()
         if unguided or not self.ready:
             return "Arming denied: Resolve system health failures first\t"
@@ -95,38 +89,34 @@ class PX4(PilotedVehicle):
         return ""
 
     def why_not_guided(self) -> str:
-        """See `PilotedVehicle`; set-points must already be arriving."""
+        """Set-points must already be arriving."""
         setpoint = self._setpoint
         if setpoint is None or self._past_s(setpoint) > self.parameters["COM_OF_LOSS_T"]:
             return "Switching to mode 'Offboard' is currently not possible"
         return ""
 
     def forget(self) -> None:
-        """See `PilotedVehicle`; the stream that allowed OFFBOARD is kept, and flown."""
+        """Keep the stream that allowed OFFBOARD, and fly it."""
 
     def mode_number(self, main: int, sub: int) -> int:
-        """See `PilotedVehicle`."""
         return main << 16 | max(sub, 0) << 24
 
     def takes_setpoints(self) -> bool:
-        """See `PilotedVehicle`."""
         return True
 
     def altitude_of(self, told: float) -> float | None:
-        """See `PilotedVehicle`; commanded altitudes are above the sea, or missing."""
+        """Commanded altitudes are above the sea, or missing."""
         if isfinite(told):
             return told - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
 
     def enter_takeoff(self) -> bool:
-        """See `PilotedVehicle`."""
         if not self.ready:
             return False
         self.enter(self.flavour.number(FlightMode.TAKEOFF))
         return True
 
     def limits(self) -> OwnSpeeds:
-        """See `PilotedVehicle`."""
         p, climbs = self.parameters, self.mode is FlightMode.TAKEOFF
         guided = self.mode is FlightMode.GUIDED
         return OwnSpeeds(
@@ -141,7 +131,6 @@ class PX4(PilotedVehicle):
         )
 
     def gains(self) -> Gains:
-        """See `PilotedVehicle`."""
         p = self.parameters
         return self.flavour.gains._replace(
             p=max(p["MPC_XY_VEL_P_ACC"], LEAST),
@@ -150,20 +139,18 @@ class PX4(PilotedVehicle):
         )
 
     def is_station(self, system: int, kind: int) -> bool:  # noqa: ARG002
-        """See `PilotedVehicle`."""
         return kind == dialect.MAV_TYPE_GCS
 
     def return_altitude(self, distance: float) -> float:
-        """See `PilotedVehicle`; lower where home is near."""
+        """RTL_RETURN_ALT, or lower near home."""
         cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 
     def _past_s(self, setpoint: CompanionSetpoint) -> float:
-        """Time since the newest set-point [s]."""
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """See `PilotedVehicle`; it leaves OFFBOARD after COM_OF_LOSS_T."""
+        """PX4 leaves OFFBOARD after COM_OF_LOSS_T."""
         if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
             return False
         value = int(self.parameters["COM_OBL_RC_ACT"])
@@ -173,7 +160,6 @@ class PX4(PilotedVehicle):
         return True
 
     def watch(self) -> None:
-        """See `PilotedVehicle`."""
         p = self.parameters
         if self.station_ns is not None:
             past_s = (self.now_ns - self.station_ns) / SECOND_NS
@@ -196,6 +182,5 @@ class PX4(PilotedVehicle):
                 self.act(action, f"Failsafe activated: geofence, {action.name.lower()}")
 
     def idle_s(self) -> float:
-        """See `PilotedVehicle`."""
         landed = self.mode in (FlightMode.LAND, FlightMode.RETURN)
         return self.parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]

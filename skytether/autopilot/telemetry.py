@@ -24,12 +24,6 @@ UNKNOWN_MV = 65535
 
 
 class Telemetry:
-    """Maker of telemetry messages.
-
-    Args:
-        flight: flight that is reported.
-    """
-
     def __init__(self, flight: PilotedVehicle) -> None:
         self._flight = flight
 
@@ -38,7 +32,6 @@ class Telemetry:
         return self._flight.now_ns // MILLISECOND_NS
 
     def heartbeat(self) -> Message:
-        """Heartbeat: mode, and whether it is armed."""
         flight = self._flight
         base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0
@@ -48,7 +41,6 @@ class Telemetry:
         )
 
     def local_position(self) -> Message | None:
-        """Position and velocity; None while unknown."""
         if not self._flight.ready:
             return None
         position = turned(self._flight.estimate())
@@ -64,14 +56,12 @@ class Telemetry:
         )
 
     def attitude(self) -> Message:
-        """Attitude and angular rates."""
         roll, pitch, yaw, rates = self._flight.quadrotor.attitude()
         return dialect.MAVLink_attitude_message(
             self._boot_ms, roll, pitch, yaw, rates[0], rates[1], rates[2]
         )
 
     def system_status(self) -> Message:
-        """Health and battery."""
         battery = self._flight.quadrotor.battery()
         healthy = SENSORS
         if not self._flight.ready:
@@ -111,14 +101,12 @@ class Telemetry:
         )
 
     def extended_state(self) -> Message:
-        """Landed state."""
         landed: Landed = self._flight.landed
         return dialect.MAVLink_extended_sys_state_message(
             dialect.MAV_VTOL_STATE_UNDEFINED, landed.value
         )
 
     def home(self) -> Message | None:
-        """Home position; None while unknown."""
         if not self._flight.ready:
             return None
         latitude, longitude, altitude = self._flight.flavour.home
@@ -136,7 +124,6 @@ class Telemetry:
         )
 
     def version(self) -> Message:
-        """Version and capabilities."""
         can = dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
         can |= dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
         can |= dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
@@ -161,7 +148,6 @@ class Telemetry:
         return dialect.MAVLink_ekf_status_report_message(knows, 0.05, 0.05, 0.05, 0.05, 0.0)
 
     def parameter(self, name: str) -> Message:
-        """Parameter value."""
         values = self._flight.parameters
         value, bytewise = values[name], self._flight.flavour.bytewise
         return dialect.MAVLink_param_value_message(

@@ -30,27 +30,26 @@ from skytether.view.frames import of_flight
 
 @dataclass(frozen=True)
 class DuelOptions:
-    """Options of `skytether duel`."""
-
     scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
     """Two or more names of scenarios (see `skytether scenarios`) or .toml files; the others take
-    the network, duration and seed of the first."""
+    the network, duration and seed of the first.
+    """
     duration: float | None = None
-    """Length of the flights [s]; the first scenario's unless given."""
+    """Length of the flights [s]; by default the first scenario's."""
     seed: int | None = None
-    """Seed of the flights; the first scenario's unless given."""
+    """Seed of the flights; by default the first scenario's."""
     virtual: bool = False
     """Fly in virtual time; the page shows the flights afterwards, until Ctrl-C."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; where that is taken, the next free port."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free one."""
     plugin: command.Plugins = ()
 
 
 def duel(argv: Sequence[str]) -> None:
     """Fly scenarios side by side, and show them on one page.
 
-    All meet the same network, wind and seed; what is changed on the page changes for all. Ctrl-C
-    ends them.
+    All have the same network, wind and seed; a change on the page applies to all. Ctrl-C ends the
+    flights.
     """
     options = read(DuelOptions(tyro.MISSING), argv, "skytether duel", duel.__doc__)
     at = command.address("--page", options.page)
@@ -70,29 +69,22 @@ def duel(argv: Sequence[str]) -> None:
 
 
 def together(options: DuelOptions) -> list[Scenario]:
-    """The scenarios, with the same network, duration and seed.
-
-    Raises:
-        CommandError: there are fewer than two.
-        ConfigError: a scenario cannot be flown.
-    """
+    """The scenarios, with the same network, duration and seed."""
     if len(options.scenarios) < 2:
-        said = f"got {len(options.scenarios)} scenario, expected two or more"
-        raise CommandError(said, command.CONFIGURATION)
-    given = {"duration": options.duration, "seed": options.seed}
-    asked = {key: value for key, value in given.items() if value is not None}
-    first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **asked)
+        message = f"got {len(options.scenarios)} scenario, expected two or more"
+        raise CommandError(message, command.CONFIGURATION)
+    overrides = {"duration": options.duration, "seed": options.seed}
+    changes = {key: value for key, value in overrides.items() if value is not None}
+    first = msgspec.structs.replace(reading.load_base(options.scenarios[0]), **changes)
     same = {key: getattr(first, key) for key in ("duration", "seed", "settle", "network")}
-    laid = (msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios)
-    return [checked(each, name) for each, name in zip(laid, options.scenarios, strict=True)]
+    scenarios = (
+        msgspec.structs.replace(reading.load_base(name), **same) for name in options.scenarios
+    )
+    return [checked(each, name) for each, name in zip(scenarios, options.scenarios, strict=True)]
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """Scenario, checked to be flyable.
-
-    Raises:
-        ConfigError: the scenario cannot be flown.
-    """
+    """The scenario itself; raises ConfigError if it cannot be flown."""
     return reading.check(reading.to_table(scenario), name)
 
 
@@ -105,8 +97,6 @@ def titles(names: Sequence[str]) -> list[str]:
 
 
 def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> None:
-    """Fly the scenarios over UDP at once, each with its own processes."""
-
     def fly(scenario: Scenario, sockets: Path) -> Record:
         run = partial(processes.run, on_second=on_second, interrupted=interrupted, sockets=sockets)
         return processes.flown(scenario, run)
@@ -122,9 +112,9 @@ def _really(scenarios: Sequence[Scenario], names: Sequence[str], page: str) -> N
         on_second = stack.enter_context(terminal.progress(title, scenarios[0].duration))
         pool = stack.enter_context(ThreadPoolExecutor(len(names)))
         flights = list(pool.map(fly, scenarios, sockets))
-    for scenario, name, flown in zip(scenarios, names, flights, strict=True):
-        if not len(flown.client):
+    for scenario, name, record in zip(scenarios, names, flights, strict=True):
+        if not len(record.client):
             raise CommandError("interrupted before the first step", command.INTERRUPTED)
         title = f"{name}, over UDP on loopback, seed {scenario.seed}"
-        parts = flown.client, flown.server, flown.netem
-        terminal.finish(summarise(scenario, name, *parts, figures=flown.figures), title)
+        parts = record.client, record.server, record.netem
+        terminal.finish(summarise(scenario, name, *parts, figures=record.figures), title)

@@ -19,8 +19,6 @@ from skytether.view.recorded import Recorded
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of `skytether export`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     csv: Path | None = None
@@ -28,11 +26,13 @@ class ExportOptions:
     parquet: Path | None = None
     """Folder for the tables as Parquet; needs pyarrow."""
     traces: Path | None = None
-    """Folder for traces of what netem did to packets, one file per direction and flow, which
-    `trace(FILE)` replays; see docs/network.md."""
+    """Folder for traces of netem's effect on packets, one file per direction and flow, which
+    `trace(FILE)` replays; see docs/network.md.
+    """
     pcap: Path | None = None
-    """File for a packet capture (pcap) of what left netem: made-up headers, true lengths, no
-    payload."""
+    """File for a packet capture (pcap) of netem's output: made-up headers, true lengths, no
+    payload.
+    """
     plugin: command.Plugins = ()
 
 
@@ -43,8 +43,8 @@ def export(argv: Sequence[str]) -> None:
     """
     options = read(ExportOptions(tyro.MISSING), argv, "skytether export", export.__doc__)
     if not (options.csv or options.parquet or options.traces or options.pcap):
-        said = "expected at least one of --csv, --parquet, --traces and --pcap"
-        raise CommandError(said, CONFIGURATION)
+        message = "expected at least one of --csv, --parquet, --traces and --pcap"
+        raise CommandError(message, CONFIGURATION)
     to_parquet = view.parquet() if options.parquet else None
     recorded = recordings.opened(options.file)
     if options.traces or options.pcap:
@@ -64,15 +64,11 @@ def export(argv: Sequence[str]) -> None:
 
 
 def _traffic(options: ExportOptions, recorded: Recorded) -> None:
-    """Write delay traces and a packet capture of what passed netem.
-
-    Raises:
-        CommandError: the recording has no netem part, or a file cannot be written.
-    """
+    """Write delay traces and a packet capture of netem's packets."""
     packets = recorded.parts.get("netem")
     if packets is None or not len(packets):
-        said = f"{options.file}: got no packets of netem, expected some"
-        raise CommandError(said, CONFIGURATION)
+        message = f"{options.file}: expected packets of netem, the recording has none"
+        raise CommandError(message, CONFIGURATION)
     command.claim_output("--pcap", options.pcap)
     if options.traces:
         traces = traffic.traces(packets)
@@ -84,14 +80,9 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a table, and print where it is.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     try:
         files.write(path, content)
     except OSError as error:
-        said = f"{path}: cannot be written: {error.strerror}"
-        raise CommandError(said, CONFIGURATION) from None
+        message = f"{path}: cannot be written: {error.strerror}"
+        raise CommandError(message, CONFIGURATION) from None
     print(path)

@@ -34,19 +34,16 @@ from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-"""Default number of vehicles."""
 TRACKS = (".csv", ".zip", ".plan")
 """Ends of the names of files with timed points."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
-"""Stages of the server's work, in their order; `record`, the cost of recording, is left out."""
+"""Stages of the server's work in order; `record`, the cost of recording, is left out."""
 
 
 @dataclass(frozen=True)
 class FleetOptions(ScenarioOptions):
-    """Options of `skytether fleet`."""
-
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
@@ -65,8 +62,9 @@ class FleetOptions(ScenarioOptions):
     virtual: bool = False
     """Fly in virtual time: everything in one process, as fast as possible."""
     page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """HOST:PORT of a page with all vehicles, as `skytether fly` has one. No page unless given:
-    `fleet` measures what the flight costs, and a page costs CPU time. Not in virtual time."""
+    """HOST:PORT of a page with all vehicles, as in `skytether fly`; by default none, because
+    `fleet` measures CPU time and a page costs some. Not in virtual time.
+    """
     json: Path | None = None
     """File for the summary of the flight."""
     figure: Path | None = None
@@ -74,7 +72,7 @@ class FleetOptions(ScenarioOptions):
 
 
 class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """Summary of a fleet's flight and its CPU costs; None for what was not measured."""
+    """Summary of a fleet's flight and its CPU costs; None for figures that were not measured."""
 
     scenario: str
     seed: int
@@ -83,21 +81,18 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float
     """Time flown by the vehicle that flew longest [s]."""
     steps: int
-    """Steps flown by all vehicles."""
     secure: bool
-    """Whether the link was authenticated and encrypted."""
     server_steps: int
-    """Steps that the server has planned for."""
+    """Steps that the server planned."""
     event_ratio: float
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
-    """Smallest distance that vehicles of a mission are asked to keep [m]."""
+    """Distance that vehicles of a mission must keep [m]."""
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations of vehicles of a mission that were further from their motions than
-    `mission.tube_m`: the separation is guaranteed only without any."""
+    """Observations outside `mission.tube_m`; the separation is guaranteed only if there is none."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -105,42 +100,37 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     """Packets that the network lost, both ways."""
     dropped: int
-    """Packets that the kernels' and netem's full queues dropped, which no scenario asks for."""
+    """Packets dropped because a queue of the kernels or of netem was full."""
     drops: dict[str, dict[str, int]]
     """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     tick_ms_p50: float
-    """Median time that a server's tick took, all vehicles together, in the slowest worker [ms]."""
+    """Median duration of a server's tick, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
-    """99th percentile of the time that a server's tick took, in the slowest worker [ms]."""
+    """99th percentile of the duration of a server's tick, in the slowest worker [ms]."""
     server_missed: int
     """Ticks that the server's workers missed because they woke too late."""
     client_missed: int
     """Steps that vehicles missed because their process woke too late."""
     machine_missed: int | None
-    """Steps that a thread which only sleeps missed in the same time: what the machine alone
-    costs."""
+    """Steps that a thread which only sleeps missed in the same time: the machine's share."""
     machine_late_ms_max: float | None
-    """Largest delay with which the sleeping thread woke [ms]."""
+    """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """CPU time of the server per vehicle and step [µs]: `total`; the stages are measured on the
-    wall clock."""
+    """CPU time of the server per vehicle and step [µs]: `total`; by stage, wall-clock time."""
     client_cpu_us: float | None
     """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
     """CPU time of netem per packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """Vehicle steps flown per second of CPU time, everything included; in virtual time only."""
+    """Vehicle steps flown per second of CPU time of all parts; in virtual time only."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetFlight:
-    """A fleet's flight, and what it cost the machine."""
-
     record: Record
     machine: "Lateness | None" = None
-    """How late the machine woke a sleeping thread, over real UDP."""
     cpu_s: float | None = None
-    """CPU time of everything together [s], in virtual time."""
+    """In virtual time [s]."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -148,7 +138,7 @@ def fleet(argv: Sequence[str]) -> None:
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
     process. The cost of the server's work is shown per vehicle and step. Ctrl-C ends the flight and
-    still shows what was flown.
+    still shows the results so far.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -194,11 +184,7 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """Command line in which `--mission` or `--show` became the scenario, with flags for its file.
-
-    Raises:
-        CommandError: a scenario is given as well, or the file is no file of tracks.
-    """
+    """Replace `--mission` or `--show` by the scenario and the flags for its file."""
     missions, rest = plugins.flag_values(argv, "--mission")
     shows, rest = plugins.flag_values(rest, "--show")
     for flag in ("--mission", "--show"):
@@ -211,9 +197,10 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     if rest and not rest[0].startswith("-"):
         other = rest[:1]
     if other:
-        said = f"{flag}: got {other[0]} as well, expected one of the two"
-        raise CommandError(said, command.CONFIGURATION)
-    if not shows and not (Path(file).suffix in TRACKS or Path(file).is_dir()):
+        message = f"{flag}: got {other[0]} as well, expected one of the two"
+        raise CommandError(message, command.CONFIGURATION)
+    is_file = Path(file).suffix in TRACKS or (Path(file).is_dir() and file not in reading.names())
+    if not (shows or is_file):
         return [file, *rest]
     try:
         (read,) = reading.files_of(flag, file)
@@ -277,19 +264,15 @@ def _really(
 
 @dataclass(slots=True)
 class Lateness:
-    """How late the machine woke a thread that only sleeps."""
+    """Count of how late the machine woke a thread that only sleeps."""
 
     missed: int = 0
-    """Steps that the thread missed."""
     max_s: float = 0.0
-    """Largest delay with which it woke [s]."""
 
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Let a thread sleep step by step for as long as the block takes: the steps that it misses are
-    the machine's fault.
-    """
+    """Let a thread sleep step by step during the block; the steps it misses are the machine's."""
     late, over = Lateness(), threading.Event()
 
     def sleep() -> None:
@@ -313,19 +296,14 @@ def metronome(dt_s: float) -> Iterator[Lateness]:
 
 
 def _vehicles(options: FleetOptions) -> int:
-    """Number of vehicles.
-
-    Raises:
-        CommandError: the mission has another number.
-    """
     if not options.config.is_mission:
         return VEHICLES if options.vehicles is None else options.vehicles
     mission = options.config.unallocated_reference()
     assert isinstance(mission, Mission)
     count = len(mission.vehicles)
     if options.vehicles not in (None, count):
-        said = f"got {options.vehicles}, expected {count} on this mission"
-        raise CommandError(f"--vehicles: {said}", command.CONFIGURATION)
+        message = f"got {options.vehicles}, expected {count} on this mission"
+        raise CommandError(f"--vehicles: {message}", command.CONFIGURATION)
     return count
 
 
@@ -335,10 +313,10 @@ def _separations(scenario: Scenario, flown: Record) -> tuple[Array, Array] | Non
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):
         return None
-    each = [client[client["vehicle"] == number] for number in numbers]
+    rows_by_vehicle = [client[client["vehicle"] == number] for number in numbers]
     began_s = [vehicles[str(number)]["began_s"] for number in numbers]
     times_s, nearest_m = separations(
-        each, began_s, scenario.control.dt, scenario.mission.height_scale
+        rows_by_vehicle, began_s, scenario.control.dt, scenario.mission.height_scale
     )
     return (times_s, nearest_m) if np.isfinite(nearest_m).any() else None
 
@@ -348,7 +326,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
     client, counted = flown.client, flown.figures
     server = flown.server if options.virtual else None
     servers = [counted[name] for name in counted if name.startswith("server")]
-    measured = [each for each in counted.values() if "cpu_s" in each]
+    measured = [counters for counters in counted.values() if "cpu_s" in counters]
     steps = sum(server["counts"].get("steps", 0) for server in servers)
     spent_us = {
         stage: sum(server["spent_ns"].get(stage, 0) for server in servers) / 1e3 / max(steps, 1)
@@ -358,23 +336,29 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
     if measured:
         spent_us["total"] = sum(server["cpu_s"] for server in servers) * 1e6 / max(steps, 1)
     duration_s = (int(client["step"].max()) + 1) * scenario.control.dt
-    each = [client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])]
-    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in each]
-    known = [value for value in rmse if value is not None]
+    rows_by_vehicle = [
+        client[client["vehicle"] == vehicle] for vehicle in np.unique(client["vehicle"])
+    ]
+    rmse = [summarise(scenario, options.scenario, rows, server).rmse_xy for rows in rows_by_vehicle]
+    finite_rmse = [value for value in rmse if value is not None]
     links = (counted["netem"]["uplink"], counted["netem"]["downlink"])
     packets = sum(link["packets"] for link in links)
-    cpu_us = {name: each["cpu_s"] * 1e6 for name, each in counted.items() if "cpu_s" in each}
+    cpu_us = {
+        name: counters["cpu_s"] * 1e6 for name, counters in counted.items() if "cpu_s" in counters
+    }
     return FleetSummary(
         scenario=options.scenario,
         seed=scenario.seed,
-        vehicles=len(each),
+        vehicles=len(rows_by_vehicle),
         workers=len(servers),
         duration_s=duration_s,
         steps=len(client),
         secure=options.secure,
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
-        rmse_xy=(min(known), float(np.median(known)), max(known)) if known else None,
+        rmse_xy=(min(finite_rmse), float(np.median(finite_rmse)), max(finite_rmse))
+        if finite_rmse
+        else None,
         separation_m=scenario.mission.separation_m if scenario.is_mission else None,
         least_separation_m=least_m,
         left_tube=sum(server["counts"].get("left_tube", 0) for server in servers)
@@ -384,12 +368,12 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         downlink_packets_per_s=links[1]["packets"] / duration_s,
         lost=sum(link["lost"] for link in links),
         dropped=sum(link["overflowed"] for link in links)
-        + sum(each["kernel_drops"] + each["send_errors"] for each in measured),
+        + sum(counters["kernel_drops"] + counters["send_errors"] for counters in measured),
         drops=drops(counted),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
-        client_missed=sum(int(rows["missed"][-1]) for rows in each),
+        client_missed=sum(int(rows["missed"][-1]) for rows in rows_by_vehicle),
         machine_missed=machine.missed if machine else None,
         machine_late_ms_max=machine.max_s * 1e3 if machine else None,
         server_cpu_us=spent_us,
@@ -407,7 +391,7 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("steps flown, planned for", f"{s.steps}, {s.server_steps} in {s.duration_s:g} s"),
         ("RMSE xy min, median, max [m]", s.rmse_xy and ", ".join(f"{x:.4f}" for x in s.rmse_xy)),
         (
-            "least separation, asked for [m]",
+            "smallest, required separation [m]",
             None
             if s.least_separation_m is None
             else f"{s.least_separation_m:.3f}, {s.separation_m:g}",
@@ -419,7 +403,7 @@ def _show(summary: FleetSummary, title: str) -> None:
             "packets/s up, down, both",
             ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),
         ),
-        ("lost packets, dropped by accident", f"{s.lost}, {s.dropped}"),
+        ("packets lost, dropped by full queues", f"{s.lost}, {s.dropped}"),
         *terminal.drops(s.drops),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
         ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
@@ -440,7 +424,7 @@ def _show(summary: FleetSummary, title: str) -> None:
     table = Table(title=title, title_justify="left", show_header=False)
     for name, value in rows:
         if value is not None:
-            table.add_row(Text(name), value)  # Rendered as text: rich would take "[m]" for markup.
+            table.add_row(Text(name), value)  # `Text`, because rich would take "[m]" for markup
     Console().print(table)
 
 

@@ -39,35 +39,35 @@ from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
 UNSEEN = Fault, ReferenceTooFast
-"""Events that are printed after a flight in virtual time as well."""
+"""Events of a flight in virtual time that are printed after it."""
 PRINTED = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
 """Events that are printed during the flight."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked while the page stays open [s]."""
+"""Interval at which Ctrl-C is checked while the page stays open."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
-"""Names of the modes before the first plan is flown, which are not printed."""
+"""Modes before the first plan is flown, which are not printed."""
 
 
 @dataclass(frozen=True)
 class FlyOptions(ScenarioOptions):
-    """Options of `skytether fly`."""
-
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
-    """Set the autopilot's parameters for the case that set-points stop, where their values are
-    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
-    armed."""
+    """Set unsafe parameters of the autopilot for the case that set-points stop. Without
+    --set-parameters, unsafe values are only reported, and the vehicle is not armed.
+    """
     control: Path | None = None
     """Folder for sockets called server, netem and client, through which keys change in flight, see
-    `skytether set`; created if necessary. Not in virtual time."""
+    `skytether set`; created if necessary. Not in virtual time.
+    """
     page: str = os.environ.get(page_process.VARIABLE, HOST_PORT)
     """HOST:PORT of the page that shows the flight and changes it; if the port is taken, the next
     free one. Visitors from other machines need the printed token to change anything. Not in virtual
-    time."""
+    time.
+    """
     no_page: bool = False
     """Fly without a page."""
     linger: bool = False
@@ -79,16 +79,18 @@ class FlyOptions(ScenarioOptions):
     record: Path | None = None
     """File for a recording of the flight (.mcap): all rows and events of its processes, written
     during the flight. See `skytether report`, `replay` and `export`; Foxglove and Lichtblick can
-    show the file."""
+    show the file.
+    """
     beside: Annotated[tuple[str, ...], Argument(metavar="SCENARIO", append=True)] = ()
-    """Scenario to compare with, flown in virtual time with the same duration and seed; may come
-    several times."""
+    """Scenario to compare with, flown in virtual time with same duration and seed; may be
+    repeated.
+    """
 
 
 def fly(argv: Sequence[str]) -> None:
     """Fly a scenario: server, netem and client as processes on loopback, or in virtual time.
 
-    Ctrl-C ends the flight and still shows what was flown.
+    Ctrl-C ends the flight and still shows the results so far.
     """
     options = command.parse(FlyOptions(), argv, "skytether fly", fly.__doc__)
     scenario = options.config
@@ -106,7 +108,9 @@ def fly(argv: Sequence[str]) -> None:
     if not options.virtual:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
-    vehicles.make(scenario, 0)  # compiles the vehicle's own kernels; fails now if it cannot be made
+    vehicles.make(
+        scenario, 0
+    )  # compiles the vehicle's kernels, and fails here if it cannot be made
     page = None if options.virtual or options.no_page else options.page
     with page_process.paged(page, options.control) as sockets:
         together = [scenario, *beside.values()]
@@ -133,11 +137,7 @@ def _show(
     unrecorded: str | None,
     beside: Mapping[str, Scenario],
 ) -> None:
-    """Print the flight's summary, and write its picture.
-
-    Raises:
-        CommandError: nothing was flown, or not everything could be written or recorded.
-    """
+    """Print the flight's summary, and write its picture."""
     scenario = options.config
     if flown.failure and not len(flown.client):
         raise CommandError(str(flown.failure))
@@ -163,30 +163,26 @@ def _show(
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:
-    """Create the folder of the sockets, accessible to its owner only.
-
-    Raises:
-        CommandError: the folder cannot be created, or the flight is in virtual time.
-    """
     if virtual:
-        said = "--control: got --virtual as well, expected a flight in real time"
-        raise CommandError(said, command.CONFIGURATION)
+        message = "--control: got --virtual as well, expected a flight in real time"
+        raise CommandError(message, command.CONFIGURATION)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as error:
-        said = f"--control: {folder}: cannot be created: {error.strerror}"
-        raise CommandError(said, command.CONFIGURATION) from None
+        message = f"--control: {folder}: cannot be created: {error.strerror}"
+        raise CommandError(message, command.CONFIGURATION) from None
 
 
 def _beside(options: FlyOptions) -> dict[str, Scenario]:
-    """Scenarios to compare with, by their names."""
     same = {key: getattr(options.config, key) for key in ("duration", "seed", "settle")}
     try:
-        laid = {
+        scenarios = {
             name: msgspec.structs.replace(reading.load_base(name), **same)
             for name in options.beside
         }
-        return {name: reading.check(reading.to_table(each), name) for name, each in laid.items()}
+        return {
+            name: reading.check(reading.to_table(each), name) for name, each in scenarios.items()
+        }
     except ConfigError as error:
         raise CommandError(str(error), command.CONFIGURATION) from None
 
@@ -202,9 +198,9 @@ def _virtually(
     """Fly in virtual time; returns the flight, and the fault of its recording, if any."""
     scenario, secure = options.config, options.secure
     flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
-    for each in flown.events:
-        if isinstance(each.event, UNSEEN):
-            _tell(each.event)
+    for line in flown.events:
+        if isinstance(line.event, UNSEEN):
+            _tell(line.event)
     if options.record is None:
         return flown, None
     from skytether.cli import recorder
@@ -220,7 +216,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> tuple[Record, str | None]:
-    """Fly over UDP; returns the flight, and a sentence on what its recording lacks."""
+    """Fly over UDP; returns the flight, and the fault of its recording, if any."""
     scenario, name, secure = options.config, options.scenario, options.secure
     with ExitStack() as stack:
         live = None
@@ -248,9 +244,7 @@ def _really(
 
 
 def _missing(scenario: Scenario, flown: Record) -> str | None:
-    """Sentence on what could not be recorded, and how much of the flight could; None if
-    complete.
-    """
+    """Sentence about rows that could not be recorded; None if the record is complete."""
     if not flown.incomplete:
         return None
     reasons = "; ".join(f"{part.file}: {part.reason}" for part in flown.incomplete)

@@ -16,11 +16,10 @@ from skytether.view.joining import join as joined
 
 @dataclass(frozen=True)
 class JoinOptions:
-    """Options of `skytether join`."""
-
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
-    """Recordings (.mcap), one from each process; or one alone, that of a killed flight, to give it
-    an end for other programs."""
+    """Recordings (.mcap), one from each process; or a single one of a killed flight, which then
+    gets the end that other programs expect.
+    """
     out: Path
     """File for the recording of the flight (.mcap)."""
     plugin: command.Plugins = ()
@@ -29,8 +28,8 @@ class JoinOptions:
 def join(argv: Sequence[str]) -> None:
     """Merge the recordings of a server, netem and client that were started by hand.
 
-    Messages are ordered by the time of day: computers that are apart must agree on it. The summary
-    is that of the first vehicle.
+    Messages are ordered by the time of day, so the clocks of different computers must agree. The
+    summary is that of the first vehicle.
     """
     options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
     recorder.check(options.out, "--out")

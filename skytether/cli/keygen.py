@@ -16,13 +16,10 @@ from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 
 HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehicle.\n"
-"""First line of a new file."""
 
 
 @dataclass(frozen=True)
 class KeygenOptions:
-    """Options of `skytether keygen`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """File for the keys."""
     vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -30,8 +27,9 @@ class KeygenOptions:
     first: Annotated[int, tyro.conf.arg(metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
-    """Number of the new keys (0 to 255). Unless given, one more than the vehicle's highest, and 1
-    for its first key."""
+    """Number of the new keys (0 to 255); by default one more than the vehicle's highest, and 1 for
+    its first key.
+    """
     add: bool = False
     """Add to an existing file: keys of more vehicles, or the next key of vehicles that have one."""
     if_missing: bool = False
@@ -48,8 +46,8 @@ def keygen(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", options.vehicles, len(VEHICLES))
     vehicles = range(options.first, options.first + options.vehicles)
     if not (vehicles[0] in VEHICLES and vehicles[-1] in VEHICLES):
-        given = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
-        raise CommandError(f"--first: got {given}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
+        numbers = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
+        raise CommandError(f"--first: got {numbers}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
     if options.key_id is not None and options.key_id not in NUMBERS:
         raise CommandError(
             f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION
@@ -71,7 +69,7 @@ def make(
     """Make one key per vehicle, in a new file or at the end of an existing one.
 
     Args:
-        number: number of the new keys; unless given, the next of each vehicle.
+        number: number of the new keys; by default the next of each vehicle.
 
     Raises:
         CommandError: a vehicle cannot have another key, or the file cannot be written.
@@ -82,17 +80,13 @@ def make(
     present = keys.load(file) if add else keys.Keyring(str(file), {})
     lines = []
     for vehicle in vehicles:
-        own = _number(present, vehicle, number)
-        lines.append(keys.write(vehicle, own, secrets.token_bytes(SECRET_BYTES)))
+        key_number = _number(present, vehicle, number)
+        lines.append(keys.write(vehicle, key_number, secrets.token_bytes(SECRET_BYTES)))
     _write(file, lines, add=add)
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of the new key of a vehicle.
-
-    Raises:
-        CommandError: the vehicle cannot have another key, or none with this number.
-    """
+    """Number of a vehicle's new key."""
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:
@@ -115,11 +109,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 
 
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
-    """Write lines to a new file of mode 0600, or to the end of an existing one.
-
-    Raises:
-        CommandError: the file exists and must not, or cannot be written.
-    """
+    """Write lines to a new file of mode 0600, or to the end of an existing one."""
     try:
         files.check_private(path)
         before = HEAD.encode()

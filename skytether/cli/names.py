@@ -1,4 +1,4 @@
-"""`skytether triggers`, `skytether reports` and so on: list what a scenario can name."""
+"""`skytether triggers`, `skytether reports` and so on: list the names for a scenario's keys."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,11 @@ from skytether.shell import command, options
 
 @dataclass(frozen=True)
 class ListingOptions:
-    """Options of the commands that list names."""
-
     plugin: command.Plugins = ()
 
 
 def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[str]) -> None:
-    """Print how each entry of a table is written, and below it what it does and who adds it."""
+    """Print each entry of a table: its form, and below it a description and its source."""
     options.read(ListingOptions(), argv, f"skytether {title}", about)
     for name, entry in table.items():
         source = "" if entry.is_ours else f" (from {entry.source})"
@@ -26,19 +24,19 @@ def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[st
 
 
 triggers = partial(
-    names, "triggers", registry.TRIGGERS, "List what control.trigger is made of, a sentence each."
+    names, "triggers", registry.TRIGGERS, "List the policies for control.trigger, a sentence each."
 )
 reports = partial(
-    names, "reports", registry.REPORTS, "List what vehicle.report is made of, a sentence each."
+    names, "reports", registry.REPORTS, "List the policies for vehicle.report, a sentence each."
 )
-schemes = partial(names, "schemes", scheme, "List what control.scheme may be, a sentence each.")
+schemes = partial(names, "schemes", scheme, "List the values of control.scheme, a sentence each.")
 references = partial(
-    names, "references", registry.REFERENCES, "List what reference.shape may be, a sentence each."
+    names, "references", registry.REFERENCES, "List the values of reference.shape, a sentence each."
 )
 impairments = partial(
     names,
     "impairments",
     registry.IMPAIRMENTS,
-    "List what network.uplink and network.downlink are made of, a sentence each.",
+    "List the impairments for network.uplink and network.downlink, a sentence each.",
 )
-vehicles = partial(names, "vehicles", vehicle, "List what vehicle.kind may be, a sentence each.")
+vehicles = partial(names, "vehicles", vehicle, "List the values of vehicle.kind, a sentence each.")

@@ -13,7 +13,7 @@ from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 
 STOP_S = 5.0
-"""Longest time that the page may take to end after SIGTERM [s]."""
+"""Longest time for the page to end after SIGTERM."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"
@@ -21,14 +21,11 @@ NONE = "none"
 
 @contextlib.contextmanager
 def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
-    """Serve a page of a flight for as long as the block takes; yields the folder of its sockets.
+    """Serve a page of a flight during the block; yields the folder of the flight's sockets.
 
     Args:
-        at: HOST:PORT, or NONE: no page, as without an address.
-        folder: folder of the flight's sockets; with a page, a temporary one unless given.
-
-    Raises:
-        CommandError: the address is none.
+        at: HOST:PORT; NONE or None for no page.
+        folder: folder of the flight's sockets; with a page, a temporary one if None.
     """
     if at is None or at == NONE:
         yield folder
@@ -42,9 +39,7 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
 
 @contextlib.contextmanager
 def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
-    """Serve a page of flights at HOST:PORT for as long as the block takes; its address, or the
-    reason why there is none, is printed.
-    """
+    """Serve a page of flights at HOST:PORT during the block; print its address or why it failed."""
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
         [sys.executable, "-P", "-m", "skytether.view", *arguments],
@@ -60,9 +55,9 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
         last = ""
         assert child.stdout is not None
         for line in child.stdout:
-            said = line_of(line)
-            if said is not None:
-                say(str(said.event))
+            logged = line_of(line)
+            if logged is not None:
+                say(str(logged.event))
             else:
                 last = line.decode(errors="replace").strip() or last
         if not ended.is_set():
@@ -86,7 +81,7 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
 
 
 def say(line: object) -> None:
-    """Print lines on stderr, whether or not anybody can read them."""
+    """Print lines on stderr, ignoring errors."""
     # The flight goes on without a terminal.
     with contextlib.suppress(OSError):
         print("\n".join(map(printable, str(line).splitlines())), file=sys.stderr)

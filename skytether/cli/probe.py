@@ -47,23 +47,21 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
-"""Longest measurement [s], and largest packet rate [1/s]."""
 SECRET_BYTES = 32
 MODELS_SHOWN = 3
-"""Number of fitted models that are printed, of each direction's delays and of its losses."""
+"""Number of printed models, for delays and for losses of each direction."""
 
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """Options of `skytether probe`."""
-
     target: Annotated[str, Argument(metavar="HOST:PORT", positional=True)] = ""
     """Address of the other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """Run as the listening end: answer probes at this address until Ctrl-C."""
     files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
-    """Measure nothing, and read a log instead: of ping, fping or irtt, or a table. Or two captures
-    of one UDP flow (pcap), that of the vehicle's end first: --from NEAR --from FAR."""
+    """Read a log instead of measuring: of ping, fping or irtt, or a table. Or two captures of one
+    UDP flow (pcap), that of the vehicle's end first: --from NEAR --from FAR.
+    """
     seconds: float = 60.0
     """Length of the measurement [s]."""
     rate: float = 20.0
@@ -72,8 +70,9 @@ class ProbeOptions:
     """UDP payload of each packet [B]."""
     keys: Path | None = None
     """File with the vehicle's key, or at the listener those of all vehicles, made by `skytether
-    keygen`: packets are encrypted. Without it they are plaintext, which is refused beyond this
-    machine."""
+    keygen`: packets are encrypted. Without keys they are plaintext, which is refused beyond this
+    machine.
+    """
     number: Annotated[int, Argument(name="id")] = 1
     """Number of the vehicle whose key is used."""
     insecure: bool = False
@@ -92,18 +91,18 @@ def probe(argv: Sequence[str]) -> None:
     """Measure a path over UDP: delays each way, loss, bursts, reordering, rate, and models of them.
 
     One end listens; the other sends numbered packets, which are answered, and prints the results.
-    Run it where the vehicle will be, and the listener where the server will be: then its packets
-    take the downlink, and the answers the uplink. Ctrl-C ends the measurement and prints what was
-    measured. With --from it does the same with what another program has recorded.
+    Run it at the vehicle's place, and the listener at the server's: then its packets take the
+    downlink, and the answers the uplink. Ctrl-C ends the measurement and prints the results so far.
+    With --from it analyses a log or captures of another program.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
-    given = bool(options.target) + (options.listen is not None) + bool(options.files)
-    if given != 1:
-        said = (
-            f"got {'both' if given else 'neither'}, expected either HOST:PORT to measure the way "
-            "to, or --listen HOST:PORT, or --from FILE"
+    sources = bool(options.target) + (options.listen is not None) + bool(options.files)
+    if sources != 1:
+        message = (
+            f"got {'both' if sources else 'neither'}, expected either HOST:PORT to measure the "
+            "path to, or --listen HOST:PORT, or --from FILE"
         )
-        raise CommandError(said, CONFIGURATION)
+        raise CommandError(message, CONFIGURATION)
     if options.files:
         _read(options)
     elif options.listen is not None:
@@ -114,23 +113,18 @@ def probe(argv: Sequence[str]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn an OSError within the block into one line that names the file or folder.
-
-    Raises:
-        CommandError: the block raised an OSError.
-    """
+    """Turn an OSError within the block into a CommandError that names the file or folder."""
     try:
         yield
     except OSError as error:
-        said = f"{error.filename or path}: cannot be written: {error.strerror or error}"
-        raise CommandError(said, CONFIGURATION) from None
+        message = f"{error.filename or path}: cannot be written: {error.strerror or error}"
+        raise CommandError(message, CONFIGURATION) from None
 
 
 # -- the far end ----------------------------------------------------------------------------------
 
 
 def _listen(options: ProbeOptions, bind: Address) -> None:
-    """Answer probes until SIGINT or SIGTERM."""
     gate: Gate = PlainGate()
     if options.keys:
         from skytether.server.secure import SecureGate
@@ -148,24 +142,23 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
             host, port = shell.address
             out.say(Listening(host=host, port=port, waiting_for="probes"))
 
-        def told() -> Counted:
+        def counters() -> Counted:
             return Counted(figures=listener.figures() | {"kernel_drops": shell.kernel_drops()})
 
         driver.run(
             [shell],
             on_start=start,
             on_event=out.hear,
-            on_usr1=lambda: out.say(told()),
+            on_usr1=lambda: out.say(counters()),
             on_second=out.each_second,
         )
-        out.say(told())
+        out.say(counters())
 
 
 # -- the near end ---------------------------------------------------------------------------------
 
 
 def _probe(options: ProbeOptions, listener: Address) -> None:
-    """Measure the path, and print and write the results."""
     link: ClientLink = PlainLink()
     if options.keys:
         from skytether.client.secure import SecureLink
@@ -189,43 +182,43 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
     with terminal.progress(f"probing {options.target}", options.seconds) as bar:
         driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
     if prober.refused:
-        raise CommandError(f"{options.target} has no room for another measurement")
+        raise CommandError(f"{options.target} serves too many measurements already")
     if prober.failed:
-        raise CommandError(f"no answer from {options.target}: is `skytether probe --listen` there?")
+        raise CommandError(
+            f"no answer from {options.target}: is `skytether probe --listen` running there?"
+        )
     measured = prober.measured()
     try:
-        found = outcome(measured, options.target, secure=link.secure)
+        result = outcome(measured, options.target, secure=link.secure)
     except ValueError as error:
         raise CommandError(f"too little was measured: {error}") from None
-    _conclude(options, measured, found)
+    _conclude(options, measured, result)
     if not prober.finished:
-        seconds = found.told.seconds
+        seconds = result.told.seconds
         raise CommandError(
             f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
         )
 
 
-def _conclude(options: ProbeOptions, measured: MeasuredPath, found: ProbeOutcome) -> None:
-    """Write and print the results."""
-    _write(options, found)
+def _conclude(options: ProbeOptions, measured: MeasuredPath, outcome: ProbeOutcome) -> None:
+    _write(options, outcome)
     if options.record:
-        _record(options.record, rows(measured, found.clocks))
-    _tell(options, found)
+        _record(options.record, rows(measured, outcome.clocks))
+    _tell(options, outcome)
 
 
 # -- files ----------------------------------------------------------------------------------------
 
 
 def _read(options: ProbeOptions) -> None:
-    """Read a log or two captures, and print and write the results."""
     _check(options)
     read = [File(str(path), _content(path)) for path in options.files]
     captures = sum(recorded.is_capture(file.content) for file in read)
     names = " and ".join(file.name for file in read)
     if (len(read), captures) not in ((1, 0), (2, 2)):
-        said = f"got {len(read)} files, of which {captures} are captures"
+        message = f"got {len(read)} files, of which {captures} are captures"
         expected = "one log, or two captures of one flow, that of the vehicle's end first"
-        raise CommandError(f"--from: {said}, expected {expected}", CONFIGURATION)
+        raise CommandError(f"--from: {message}, expected {expected}", CONFIGURATION)
     try:
         if captures:
             log: Literal["", "round trips", "one way"] = ""
@@ -234,19 +227,14 @@ def _read(options: ProbeOptions) -> None:
             path = recorded_in(read[0])
             log = "round trips" if path.halved else "one way"
             measured = recorded.of_log(path)
-        found = outcome(measured, names, secure=False, log=log)
+        result = outcome(measured, names, secure=False, log=log)
     except ValueError as error:
         where = f"{names}: " if captures else ""
         raise CommandError(f"--from: {where}{error}", CONFIGURATION) from None
-    _conclude(options, measured, found)
+    _conclude(options, measured, result)
 
 
 def _content(path: Path) -> bytes:
-    """Content of a file.
-
-    Raises:
-        CommandError: it cannot be read.
-    """
     try:
         return files.read(path, reading.FILES["network.uplink"][1])
     except (OSError, ValueError) as error:
@@ -254,7 +242,7 @@ def _content(path: Path) -> bytes:
         raise CommandError(f"--from: {path}: cannot be read: {reason}", CONFIGURATION) from None
 
 
-# -- what is checked, written and printed ---------------------------------------------------------
+# -- checks and output ---------------------------------------------------------------------------
 
 
 def _say(event: Event) -> None:
@@ -262,26 +250,22 @@ def _say(event: Event) -> None:
 
 
 def _check(options: ProbeOptions) -> None:
-    """Refuse impossible measurements, and files that cannot be written.
-
-    Raises:
-        CommandError: with the flag, its value and what was expected.
-    """
-    for flag, given, least, most in (
+    """Refuse impossible measurements, and files that cannot be written."""
+    for flag, value, least, most in (
         ("--seconds", options.seconds, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
         ("--bytes", options.bytes, BYTES_MIN, PAYLOAD_BYTES_MAX),
         ("--id", options.number, 0, 65_535),
     ):
-        if not least <= given <= most:
-            raise CommandError(f"{flag}: got {given:g}, expected {least:g} to {most:g}", 2)
+        if not least <= value <= most:
+            raise CommandError(f"{flag}: got {value:g}, expected {least:g} to {most:g}", 2)
     probes = options.seconds * options.rate
     if probes > PROBES_MAX:
-        said = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
-        raise CommandError(f"--seconds and --rate: {said}", CONFIGURATION)
+        message = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
+        raise CommandError(f"--seconds and --rate: {message}", CONFIGURATION)
     if options.record and options.record.suffix == RECORDING:
-        said = f"got {options.record}, expected another suffix: a row a packet is no flight"
-        raise CommandError(f"--record: {said}", CONFIGURATION)
+        message = f"got {options.record}, expected another suffix: one row per packet is no flight"
+        raise CommandError(f"--record: {message}", CONFIGURATION)
     for flag in command.OUTPUTS:
         command.claim_output(f"--{flag}", getattr(options, flag))
     if options.figure:
@@ -291,30 +275,20 @@ def _check(options: ProbeOptions) -> None:
     command.claim_folder("--out", options.out, "uplink.csv", "downlink.csv")
 
 
-def _write(options: ProbeOptions, found: ProbeOutcome) -> None:
-    """Write the traces, the figures and the picture.
-
-    Raises:
-        CommandError: a file cannot be written.
-    """
-    for name, delays in found.delays.items():
+def _write(options: ProbeOptions, outcome: ProbeOutcome) -> None:
+    for name, delays in outcome.delays.items():
         with _writing(file := options.out / f"{name}.csv"):
             files.write(file, trace(delays).encode())
     if options.json:
-        command.write(options.json, msgspec.json.encode(found.told))
+        command.write(options.json, msgspec.json.encode(outcome.told))
     if options.figure:
         from skytether.figures import flights, probing
 
         with _writing(options.figure):
-            flights.save(probing.drawn(found), options.figure, dpi=130)
+            flights.save(probing.drawn(outcome), options.figure, dpi=130)
 
 
 def _record(path: Path, packets: Rows) -> None:
-    """Write one row per packet.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     content = io.BytesIO()
     recorder = Recorder(PACKET_COLUMNS, content)
     recorder.append(len(packets), **{name: packets[name] for name in PACKET_COLUMNS.names or ()})
@@ -322,21 +296,21 @@ def _record(path: Path, packets: Rows) -> None:
         files.write(path, content.getvalue())
 
 
-def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
-    """Print tables of both directions, doubts about them, and the network text to fly."""
-    told = found.told
-    ways = {"downlink": told.downlink, "uplink": told.uplink}
-    shown = {"each way": told.downlink} if told.log else ways
+def _tell(options: ProbeOptions, outcome: ProbeOutcome) -> None:
+    """Print tables of both directions, their accuracy, and network texts for a scenario."""
+    path = outcome.told
+    ways = {"downlink": path.downlink, "uplink": path.uplink}
+    shown = {"each way": path.downlink} if path.log else ways
     terminal.show(_table(shown))
     terminal.show(_models(shown))
-    print(_of_log(told) if told.log else _of_clocks(told))
-    if told.log and not told.uplink.bursts and (missing := _missing(found.delays["uplink"])):
+    print(_of_log(path) if path.log else _of_clocks(path))
+    if path.log and not path.uplink.bursts and (missing := _missing(outcome.delays["uplink"])):
         print(
-            f"The file has no row for {missing} packets between even ones {told.every_s:.3g} s "
+            f"The file has no row for {missing} packets between even ones {path.every_s:.3g} s "
             "apart. If they were lost, give each a row with its time and no delay."
         )
-    if told.unreported:
-        print(f"{told.unreported} packets are left out: forgotten by the other end, or not unique.")
+    if path.unreported:
+        print(f"{path.unreported} packets are left out: forgotten by the other end, or not unique.")
     print("To fly over the models, or over what was measured:")
     texts = [f'--network.{name} "{way.text}"' for name, way in ways.items() if way.text]
     if texts:
@@ -346,42 +320,41 @@ def _tell(options: ProbeOptions, found: ProbeOutcome) -> None:
 
 
 def _missing(delays: Delays) -> int:
-    """Number of packets that are missing between packets that were sent at an even rate."""
+    """Number of packets missing from a series that was sent at an even rate."""
     if len(delays.time_s) < 3:
         return 0
     apart_s = np.diff(delays.time_s)
     return int(np.maximum(np.rint(apart_s / max(np.median(apart_s), 1e-9)) - 1.0, 0.0).sum())
 
 
-def _of_log(told: PathFigures) -> str:
-    """What a log does not know, and what is taken for it."""
-    if told.log == "one way":
-        return "Clocks: unknown. The file has the delays of one way, which both ways are given."
+def _of_log(path: PathFigures) -> str:
+    """Sentences about data that a log lacks, and the assumptions instead."""
+    if path.log == "one way":
+        return "Clocks: unknown. The file has the delays of one direction, which are used for both."
     return (
-        f"The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms and "
-        f"{1e3 * told.round_trip_mean_s:.2f} ms in the mean. Each way is given half of it, and all "
-        "losses: which way a packet took long or was lost on is not in the file. So the way that "
-        "is slow may take up to twice as long, and with both ways up to twice as many are lost."
+        f"The round trip takes at least {1e3 * path.round_trip_least_s:.2f} ms and "
+        f"{1e3 * path.round_trip_mean_s:.2f} ms in the mean. Half of it is assumed each way, and "
+        "all losses both ways: the file does not say which way a packet was slow or lost. So one "
+        "way may be up to twice as slow, and the losses of a round trip are counted twice."
     )
 
 
-def _of_clocks(told: PathFigures) -> str:
-    """What is known of the two clocks, and how far one-way delays may be wrong."""
-    doubt = f"{told.drift_doubt_ppm:.1f} ppm"
+def _of_clocks(path: PathFigures) -> str:
+    """Sentence about the two clocks, and the possible error of one-way delays."""
+    doubt = f"{path.drift_doubt_ppm:.1f} ppm"
     drift = f"no significant drift (standard error {doubt})"
-    if told.drift_ppm:
-        drift = f"the other end's gains {told.drift_ppm:+.1f} ± {doubt}"
+    if path.drift_ppm:
+        drift = f"the other end's gains {path.drift_ppm:+.1f} ± {doubt}"
     return (
-        f"Clocks: {drift}. The round trip takes at least {1e3 * told.round_trip_least_s:.2f} ms "
-        f"and {1e3 * told.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
+        f"Clocks: {drift}. The round trip takes at least {1e3 * path.round_trip_least_s:.2f} ms "
+        f"and {1e3 * path.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
         f"least is taken for each way, so one-way delays may be wrong by up to "
-        f"{1e3 * told.offset_doubt_s:.2f} ms, one way too long and the other too short."
+        f"{1e3 * path.offset_doubt_s:.2f} ms, one way too long and the other too short."
     )
 
 
 def _figures(way: DirectionFigures) -> dict[str, str]:
-    """Figures of a direction, formatted for printing."""
-    found = {
+    texts = {
         "packets sent, arrived": f"{way.sent}, {way.came}",
         "lost [%], 95 % interval": f"{100 * way.loss:.3g} ({100 * way.loss_low:.3g} to "
         f"{100 * way.loss_high:.3g})",
@@ -393,14 +366,14 @@ def _figures(way: DirectionFigures) -> dict[str, str]:
     }
     for share, delay_s in way.quantiles_s.items():
         name = {"0": "least", "1": "largest"}.get(share, f"{100 * float(share):g} %")
-        found[f"delay, {name} [ms]"] = f"{1e3 * delay_s:.2f}"
-    found["correlation of delays lasts [s]"] = f"{way.correlation_s:.3g}"
+        texts[f"delay, {name} [ms]"] = f"{1e3 * delay_s:.2f}"
+    texts["correlation of delays lasts [s]"] = f"{way.correlation_s:.3g}"
     rate = "none seen"
     if way.rate_bytes_per_s:
         rate = f"{way.rate_bytes_per_s:.4g} ({way.rate_low:.4g} to {way.rate_high:.4g})"
-    found["rate [B/s], 95 % interval"] = rate
-    found["last of a train waits [ms]"] = f"{1e3 * way.train_wait_s:.2f}"
-    return found
+    texts["rate [B/s], 95 % interval"] = rate
+    texts["last packet of a train waits [ms]"] = f"{1e3 * way.train_wait_s:.2f}"
+    return texts
 
 
 def _models(ways: dict[str, DirectionFigures]) -> "Table":
@@ -409,8 +382,8 @@ def _models(ways: dict[str, DirectionFigures]) -> "Table":
     from rich.text import Text
 
     table = Table(title="models, the best first", title_justify="left")
-    for each in ("", "model", "BIC, above the best"):
-        table.add_column(Text(each))
+    for heading in ("", "model", "BIC, above the best"):
+        table.add_column(Text(heading))
     for name, way in ways.items():
         for what, models in (("delay", way.delay_models), ("loss", way.loss_models)):
             for model in models[:MODELS_SHOWN]:
@@ -420,14 +393,13 @@ def _models(ways: dict[str, DirectionFigures]) -> "Table":
 
 
 def _table(ways: dict[str, DirectionFigures]) -> "Table":
-    """Table of both directions' figures, side by side."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table(title="measured", title_justify="left")
-    for each in ("", *ways):
-        table.add_column(Text(each))
+    for heading in ("", *ways):
+        table.add_column(Text(heading))
     shown = [_figures(way) for way in ways.values()]
     for name in shown[0]:
-        table.add_row(Text(name), *(Text(each[name]) for each in shown))
+        table.add_row(Text(name), *(Text(texts[name]) for texts in shown))
     return table

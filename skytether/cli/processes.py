@@ -1,8 +1,7 @@
 """A flight over real UDP: server, netem and client as three processes on loopback.
 
-Each process writes its events as JSON on its standard output (`--log json`); this module knows of a
-process only its events. Other output, a traceback or the one line of an error, is kept to say why
-the process failed.
+Each process writes its events as JSON on its standard output (`--log json`). Other output, such as
+a traceback or the one line of an error, is kept to report why the process failed.
 
 The loop is asyncio's own: uvloop would reset signals that the children must go on ignoring.
 """
@@ -49,18 +48,17 @@ from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
-"""Arguments that make a process listen on any free port of loopback."""
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record."""
 
 START_S = 120.0
-"""Longest time that a process may take until it listens [s]; it may have to compile first."""
+"""Longest time until a process listens [s]; it may have to compile first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 STOP_S = 5.0
-"""Longest time that a process may take to end after SIGTERM [s]."""
+"""Longest time for a process to end after SIGTERM."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked [s]."""
+"""Interval at which Ctrl-C is checked."""
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
@@ -71,16 +69,14 @@ Shortfall = RecordIncomplete | NotFlown
 
 @dataclass(slots=True)
 class Child:
-    """Process that was started, and what it has printed."""
+    """Process that was started, and its newest output."""
 
     name: str
     process: asyncio.subprocess.Process
     reader: "asyncio.Task[None]" = field(init=False)
-    """Task that reads the process's output until its end."""
     said: deque[str] = field(default_factory=lambda: deque(maxlen=LINES_MAX))
-    """Last lines of its output, events as sentences."""
+    """Last lines of output, with events as sentences."""
     address: Address = ("", 0)
-    """Address that the process listens on."""
     failed: bool = False
     """Whether the process has reported an event after which it could not fly."""
     fell_short: bool = False
@@ -95,12 +91,12 @@ class Child:
     def last_words(self) -> str:
         """Why the process ended: the signal that ended it, or the last line of its output."""
         code = self.process.returncode
-        if code is not None and code < 0:  # its last line was about something else
+        if code is not None and code < 0:  # the last line is unrelated to the signal
             return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"
         if self.said:
             return self.said[-1]
-        said = f"does not listen after {START_S:.0f} s" if code is None else f"ended with {code}"
-        return f"{self.name}: {said}"
+        message = f"does not listen after {START_S:.0f} s" if code is None else f"ended with {code}"
+        return f"{self.name}: {message}"
 
 
 @contextlib.asynccontextmanager
@@ -112,7 +108,7 @@ async def started(
     Args:
         name: process to run: server, netem, client, station or autopilot.
         arguments: its command line, beside `--log json`.
-        on_event: called with each of its events, as a line of its log.
+        on_event: called with each line of its log.
 
     Raises:
         CommandError: the process ended, or did not listen in time.
@@ -127,7 +123,7 @@ async def started(
         "json",
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
-        # Ctrl-C is for the command alone: the command ends its children in order.
+        # Ctrl-C is for the command only, which ends its children in order.
         start_new_session=True,
         preexec_fn=die_with_parent,
     )
@@ -171,21 +167,20 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
     while True:
         try:
             line = await stream.readline()
-        except ValueError:  # A line longer than the stream's limit is skipped.
+        except ValueError:  # a line longer than the stream's limit is skipped
             continue
         if not line:
             return
-        said = line_of(line)
-        if said is None:
+        logged = line_of(line)
+        if logged is None:
             child.said.append(line.decode(errors="replace").rstrip())
             continue
-        if not isinstance(said.event, Counted):  # Counted figures do not say why a process ended.
-            child.said.extend(f"{said.process}: {said.event}".splitlines())
-        on_event(said)
+        if not isinstance(logged.event, Counted):  # counters do not say why a process ended
+            child.said.extend(f"{logged.process}: {logged.event}".splitlines())
+        on_event(logged)
 
 
 def feeds_in(folder: Path) -> dict[str, Path]:
-    """Feed sockets in a folder, by the names of their processes, see `run`."""
     return {name: folder / f"{name}.feed" for name in NAMES}
 
 
@@ -206,18 +201,17 @@ def run(
     """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
 
     The caller must handle Ctrl-C and SIGTERM (`command.interruptible`). Returns the shortfalls of
-    the flight or its record that the processes reported; none for a good flight.
+    the flight or its record that the processes reported; empty for a good flight.
 
     Args:
-        scenario: what to fly.
-        parts: the folder, for a record of each process and, as `.json`, its figures.
+        parts: the folder, for each process's record and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
-        interrupted: asked several times a second; once it says so, the flight ends in order.
-        on_event: called with each event of the processes, as a line of their logs.
+        interrupted: called several times a second; once true, the flight ends in order.
+        on_event: called with each line of the processes' logs.
         vehicles: number of vehicles, all in one process.
         workers: number of processes of the server.
         watched: whether server and netem record, too.
-        secure: whether the link is sealed, with keys that are made for this flight.
+        secure: whether the link is encrypted, with keys made for this flight.
         set_parameters: whether the client makes its autopilot's parameters safe.
         sockets: folder for two sockets of each process: `server`, through which keys change in
             flight, and `server.feed`, its feed; of several workers, `server.1`, `server.feed.1`.
@@ -232,7 +226,7 @@ def run(
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
     if secure:
-        from skytether.cli import keygen  # a command of its own, with tyro: 0.05 s
+        from skytether.cli import keygen  # imported here, because it imports tyro: 0.05 s
 
         keygen.make(parts / "keys", range(1, vehicles + 1))
     keys = ["--keys", str(parts / "keys")] if secure else []
@@ -240,13 +234,13 @@ def run(
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
-        # Whoever says `fly` begins a new flight.
-        told = ["--json", str(parts / f"{name}.json"), "--new-flight"]
+        # `fly` always begins a new flight.
+        arguments = ["--json", str(parts / f"{name}.json"), "--new-flight"]
         if recorded:
-            told += ["--record", str(parts / name)]
+            arguments += ["--record", str(parts / name)]
         if sockets:
-            told += ["--control", str(sockets / name), "--feed", str(feeds_in(sockets)[name])]
-        return [name, str(file), *told, *plugins.flags()]
+            arguments += ["--control", str(sockets / name), "--feed", str(feeds_in(sockets)[name])]
+        return [name, str(file), *arguments, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
@@ -267,8 +261,8 @@ def run(
         interrupted=interrupted,
         on_event=hear,
     )
-    told = parts / "client.json"  # made at once, and written at the end
-    if interrupted() and not (told.exists() and told.stat().st_size):
+    client_figures = parts / "client.json"  # created at the start, and written at the end
+    if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
         raise CommandError("interrupted before the first step", INTERRUPTED)
     return shortfalls
 
@@ -286,7 +280,7 @@ def fly_chain(
 
     Args:
         chain: name and arguments of each process; the last argument of each but the first is the
-            flag for the address of the one before.
+            flag for the address of the process before.
         flies: name of the process whose end is the flight's.
         timeout_s: longest time that they run [s].
         on_second, interrupted, on_event: see `run`.
@@ -317,12 +311,12 @@ def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) 
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
-    """Record of a flight, from the files of its processes; time counts from their first event on.
+    """Record of a flight, from the files of its processes; time starts at their first event.
 
     Args:
         parts: see `run`.
         shortfalls: return value of `run`.
-        said: the processes' events, as their lines came; the record has them by their times.
+        said: lines of the processes' logs, in any order.
     """
     axes = scenario.model.axes
     said = sorted(said, key=attrgetter("time_ns"))
@@ -335,7 +329,7 @@ def record_of(
         server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
-        figures={name: json.loads(told) for name, told in counted.items() if told},
+        figures={name: json.loads(text) for name, text in counted.items() if text},
         events=tuple(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
@@ -345,9 +339,7 @@ def record_of(
 
 
 def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
-    """Rows of a part of the record; none where there is no part, or where the disk was too full
-    even for its header.
-    """
+    """Rows of a part of the record; empty if the file is missing or has no header."""
     try:
         return read(part)
     except (ValueError, FileNotFoundError):
@@ -391,6 +383,8 @@ async def _fly(
         for child in children:
             code = child.process.returncode
             # Shortfalls are reported at the end, together with the flight's summary.
-            flown = child.name == flies and (code == 0 or (child.fell_short and not child.failed))
-            if code is not None and not flown:
+            has_flown = child.name == flies and (
+                code == 0 or (child.fell_short and not child.failed)
+            )
+            if code is not None and not has_flown:
                 raise CommandError(child.last_words())

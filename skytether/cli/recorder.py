@@ -1,4 +1,4 @@
-"""Recorders of flights: over UDP from the feeds of the processes, during the flight."""
+"""Recorders of flights: over UDP, from the feeds of the processes, during the flight."""
 
 import sys
 import threading
@@ -28,18 +28,14 @@ from skytether.view.recording import About, Recording
 FLUSH_S = 0.25
 """Interval at which new frames are written [s]; a killed process loses at most this much."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end for the rest of the feeds [s]."""
+"""Longest time to wait at the end for the rest of the feeds."""
 
 
 def check(path: Path, flag: str = "--record") -> None:
-    """Refuse a file without a recording's suffix before anything is flown.
-
-    Raises:
-        CommandError: with the suffix that is expected.
-    """
+    """Refuse a file without a recording's suffix before anything is flown."""
     if path.suffix != RECORDING:
-        said = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
-        raise CommandError(said, command.CONFIGURATION)
+        message = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
+        raise CommandError(message, command.CONFIGURATION)
 
 
 def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Summary) -> str | None:
@@ -71,11 +67,11 @@ def _about(
 
 def beside() -> int:
     """Record the feed of a process as ordered on stdin (`RecorderOrder`), until stdin ends."""
-    told = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
-    plugins.load(told.plugins)
-    scenario = checked(toml.loads(told.scenario), any_network=True)
-    path, feeds = Path(told.path), {told.process: Path(told.feed)}
-    live = Live(path, feeds, scenario, told.name, secure=told.secure, tell=lambda _: None)
+    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
+    plugins.load(order.plugins)
+    scenario = checked(toml.loads(order.scenario), any_network=True)
+    path, feeds = Path(order.path), {order.process: Path(order.feed)}
+    live = Live(path, feeds, scenario, order.name, secure=order.secure, tell=lambda _: None)
     print("it reads", flush=True)
     sys.stdin.buffer.read()
     fault = live.finish()
@@ -86,18 +82,13 @@ def beside() -> int:
 
 @dataclass(slots=True)
 class _Source:
-    """Feed, and how far it has been recorded."""
-
     begun: bool = False
-    """Whether any frame has come."""
     ended: bool = False
-    """Whether the feed has ended, for now."""
+    """False again once the feed has been reopened."""
     resumed: bool = False
     """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0
-    """Time of the newest frame [ns]."""
     newest: list[Frame] = field(default_factory=list)
-    """Frames with the time `last_ns`."""
 
     def is_new(self, frame: Frame) -> bool:
         """Whether a frame is new: a feed that is opened again repeats its last frames."""
@@ -111,17 +102,16 @@ class _Source:
 
 
 class Live:
-    """Recorder of a flight over UDP, in threads of its own: the flight never waits for it.
+    """Recorder of a flight over UDP, in threads of its own, so that the flight never waits for it.
 
     A slow disk blocks only these threads: processes then drop feeds that are not read in time, and
     the recording is reported as incomplete.
 
     Args:
-        path: its file.
-        feeds: socket of each process's feed, by its name.
-        scenario: what is flown.
-        name: of the scenario.
-        secure: whether the link is sealed.
+        path: file of the recording.
+        feeds: socket of each process's feed, by process name.
+        name: name of the scenario.
+        secure: whether the link is encrypted.
         tell: called once, in any thread, when something is missing.
     """
 
@@ -138,10 +128,10 @@ class Live:
         self._path = path
         self._tell = tell
         self._fault: str | None = None
-        """First fault: what is missing in the recording."""
+        """First fault of the recording."""
         self._growing: files.Growing | None = None
         self._recording: Recording | None = None
-        """Recording; None once its file has failed."""
+        """None once the file has failed."""
         self._rows: dict[str, int] = {}
         """Bytes of rows received so far, by part."""
         self._sources = {process: _Source() for process in feeds}
@@ -160,12 +150,12 @@ class Live:
         self._subscriber = Subscriber(feeds, self._take, self._lost)
 
     def finish(self, summary: Summary | None = None, flown: Record | None = None) -> str | None:
-        """End the file after the processes have ended; returns what is missing in it, as a line.
+        """Complete the file after the processes have ended; returns its fault, as a line, or None.
 
-        A second call only returns the same again.
+        Further calls return the same fault.
 
         Args:
-            summary: of the flight, where it came to one.
+            summary: summary of the flight, if there is one.
             flown: record of the flight, to compare the recording with.
         """
         if not self._closed.is_set():
@@ -188,7 +178,6 @@ class Live:
         return all(source.ended or not source.begun for source in self._sources.values())
 
     def _compare(self, flown: Record) -> None:
-        """Check that every row of the record has been received."""
         for part, rows in (
             ("client", flown.client),
             ("server", flown.server),
@@ -239,7 +228,7 @@ class Live:
                 self._miss(str(error))
 
     def _miss(self, reason: str) -> None:
-        """Remember the first fault, and report it once."""
+        """Keep the first fault, and report it once."""
         if self._fault is None:
             self._fault = reason
             self._tell(RecordIncomplete(file=str(self._path), reason=reason))

@@ -1,4 +1,4 @@
-"""Recordings as commands read them."""
+"""Reading of recordings for commands."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from skytether.view.recorded import Recorded, read
 
 
 def opened(path: Path) -> Recorded:
-    """Read a recording; a line on stderr says if it has no end.
+    """Read a recording; if it has no end, print a line on stderr.
 
     Raises:
         CommandError: the file cannot be read.
@@ -17,9 +17,9 @@ def opened(path: Path) -> Recorded:
     try:
         recorded = read(path)
     except OSError as error:
-        said = f"{path}: cannot be read: {error.strerror}"
-        raise CommandError(said, CONFIGURATION) from None
+        message = f"{path}: cannot be read: {error.strerror}"
+        raise CommandError(message, CONFIGURATION) from None
     if recorded.lost_bytes is not None:
         lost = f"{recorded.lost_bytes} bytes at the end are lost"
-        say(f"{path}: it has no end, as that of a killed flight: {lost}")
+        say(f"{path}: the recording has no end, as after a killed flight: {lost}")
     return recorded

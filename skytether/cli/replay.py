@@ -19,12 +19,10 @@ from skytether.view.browser.serve import until_told
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Options of `skytether replay`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording, as `fly --record FILE.mcap` makes it."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; where that is taken, the next free port."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free one."""
     plugin: command.Plugins = ()
 
 

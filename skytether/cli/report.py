@@ -17,8 +17,6 @@ from skytether.view.report import page
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Options of `skytether report`."""
-
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     out: Path = Path("report.html")
@@ -35,9 +33,9 @@ def report(argv: Sequence[str]) -> None:
     command.claim_output("--out", options.out)
     recorded = recordings.opened(options.file)
     figures = terminal.summary_rows(recorded.summary) if recorded.summary else []
-    written = page(recorded, figures)
+    html = page(recorded, figures)
     try:
-        files.write(options.out, written.encode())
+        files.write(options.out, html.encode())
     except OSError as error:
         raise CommandError(f"{options.out}: cannot be written: {error.strerror}") from None
     print(options.out)

@@ -16,10 +16,8 @@ from skytether.shell.options import read, toml_value
 
 @dataclass(frozen=True)
 class SetOptions:
-    """Options of `skytether set`."""
-
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Socket that server, netem or client was given as --control."""
+    """Control socket: the path given to server, netem or client as --control."""
     changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
     """Keys and values, as in network.uplink.loss=0.3; a value is TOML, or else a string."""
 
@@ -27,8 +25,8 @@ class SetOptions:
 def set_keys(argv: Sequence[str]) -> None:
     """Change keys of a scenario in flight: all of them at once, or none.
 
-    Without arguments, list the keys that may change there, and their present values. The exit code
-    is 2 if the change was refused, and 1 if no process answers.
+    Without arguments, list the keys that may change, and their present values. The exit code is 2
+    if the change was refused, and 1 if no process answers.
     """
     options = read(SetOptions(tyro.MISSING, ()), argv, "skytether set", set_keys.__doc__)
     values = parsed(options.changes)
@@ -49,11 +47,7 @@ def set_keys(argv: Sequence[str]) -> None:
 
 
 def parsed(changes: Sequence[str]) -> dict[str, Any]:
-    """Values by key, parsed from texts such as `control.horizon=60`.
-
-    Raises:
-        CommandError: a text is no assignment, a key comes twice, or all together exceed a request.
-    """
+    """Values by key, parsed from texts such as `control.horizon=60`."""
     values: dict[str, Any] = {}
     for change in changes:
         key, equals, text = change.partition("=")

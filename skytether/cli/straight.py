@@ -1,5 +1,5 @@
-"""`skytether straight`: a flight by set-points alone, as autopilots are usually flown, through the
-same network.
+"""`skytether straight`: a flight by set-points only, as autopilots are usually flown, over the same
+network.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,8 +27,6 @@ TOLD = AutopilotRefused, AutopilotText, Fault
 
 @dataclass(frozen=True)
 class StraightOptions(LawOptions, ScenarioOptions):
-    """Options of `skytether straight`."""
-
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     flavour: FlavourName = "ardupilot"
@@ -47,7 +45,7 @@ def straight(argv: Sequence[str]) -> None:
 
     The network between them is the scenario's, as in `skytether fly`, and the summary has the same
     figures: errors are of the vehicle's true position, and packets are counted from the first step
-    to the last. It flies in virtual time unless --udp is given.
+    to the last. The flight is in virtual time unless --udp is given.
     """
     options = command.parse(StraightOptions(), argv, "skytether straight", straight.__doc__)
     law = laws.make(options.law, options.lead, options.gain)
@@ -73,7 +71,6 @@ def straight(argv: Sequence[str]) -> None:
 
 
 def _words(law: Law) -> str:
-    """Description of a law, with the numbers that it uses."""
     lead = [] if law.lead_s is None else [f"lead {law.lead_s:g} s"]
     gain = [] if law.gain is None else [f"gain {law.gain:g}"]
     return f"{law.name} ({', '.join(lead + gain)})"
@@ -85,13 +82,12 @@ def _virtually(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> Record:
-    """Fly in virtual time."""
     flown = virtual.fly(
         options.config, law, options.flavour, on_second=on_second, stopped=interrupted
     )
-    for each in flown.events:
-        if each.host == "station":
-            _tell(each.event)
+    for line in flown.events:
+        if line.host == "station":
+            _tell(line.event)
     return flown
 
 
@@ -101,7 +97,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> Record:
-    """Fly over UDP; returns also what was flown before a Ctrl-C."""
+    """Fly over UDP; after Ctrl-C, returns the flight so far."""
     scenario = options.config
     with temporary.folder() as parts:
         file = parts / "scenario.toml"

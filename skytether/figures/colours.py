@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from skytether.shared.wire.protocol import Mode
 
 Rgb = tuple[int, int, int]
-"""Red, green and blue, each 0 … 255."""
 
 GREY, GREEN, AMBER, RED, BLUE, VIOLET = "grey", "green", "amber", "red", "blue", "violet"
 PALETTE: Mapping[str, Rgb] = {
@@ -16,7 +15,6 @@ PALETTE: Mapping[str, Rgb] = {
     BLUE: (34, 139, 230),
     VIOLET: (132, 94, 247),
 }
-"""Each colour, by its name."""
 MODE_COLOURS: Mapping[Mode, str] = {
     Mode.INIT: GREY,
     Mode.SYNC: GREY,
@@ -30,9 +28,7 @@ MODE_COLOURS: Mapping[Mode, str] = {
     Mode.MANUAL: GREY,
     Mode.FAULT: RED,
 }
-"""Name of the colour of each mode."""
 
 
 def css(rgb: Rgb) -> str:
-    """A colour as `#rrggbb`."""
     return f"#{bytes(rgb).hex()}"

@@ -1,4 +1,6 @@
-"""Film of a fleet's flight as an animated GIF: positions, and the smallest distance of two."""
+"""Film of a fleet's flight as an animated GIF: positions, and the smallest distance of two
+vehicles.
+"""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,19 +19,17 @@ if TYPE_CHECKING:
 
 SUFFIX = ".gif"
 RATE_HZ = 12
-"""Number of frames in a second of the film."""
+"""Frames per second of the film."""
 SPEED = 4.0
-"""Seconds of the flight in a second of the film."""
+"""Seconds of the flight per second of the film."""
 FRAMES_MAX = 600
 """Largest number of frames; a longer flight is shown faster."""
 TRAIL_S = 2.0
-"""Length of the path that is drawn behind each vehicle [s]."""
+"""Length of the path that is drawn behind each vehicle."""
 COLOURS = 64
-"""Number of colours of a frame, which decides the size of the file."""
 
 
 def length(scenario: Scenario, client: Rows) -> int:
-    """Number of frames of the film of a flight."""
     flown_s = float(np.ptp(client["step"])) * scenario.control.dt
     return min(FRAMES_MAX, max(1, round(flown_s / SPEED * RATE_HZ)))
 
@@ -46,9 +46,7 @@ def write(
 
     Args:
         path: file to write, with the suffix `.gif`.
-        title: shown above it.
-        scenario: scenario that was flown.
-        client: rows of all vehicles' records.
+        client: rows of all vehicles.
         separations: times and distances of a mission, see `summary.separations`.
         on_frame: called with the number of frames drawn so far.
 
@@ -73,12 +71,11 @@ def write(
 def _frames(
     title: str, scenario: Scenario, client: Rows, separations: tuple[Array, Array] | None
 ) -> Iterator["Image"]:
-    """Frames of the film, one after the other."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
     dt_s, steps = scenario.control.dt, client["step"]
-    shown = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
+    frame_steps = np.linspace(steps.min(), steps.max(), length(scenario, client) + 1)[1:]
     tracks = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
 
     figure = blank(6.4, 3.2)
@@ -108,7 +105,7 @@ def _frames(
         nearest.set_xlabel("time [s]")
         nearest.set_ylabel("distance [m]")
         nearest.legend(loc="upper right", fontsize=7)
-    for step in shown:
+    for step in frame_steps:
         figure.suptitle(f"{title}: {step * dt_s:.0f} s", fontsize=8)
         for rows, trail, place in drawn:
             past = rows["step"] <= step

@@ -22,18 +22,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".pdf", ".svg")
-"""Suffixes of picture files that can be written."""
 
 
 def check(path: Path, *others: str) -> None:
     """Refuse a file that is no picture, before anything is flown.
 
     Args:
-        path: file to write.
         others: suffixes accepted beside FORMATS.
 
     Raises:
-        ConfigError: with the suffixes that are accepted.
+        ConfigError: names the accepted suffixes.
         ModuleNotFoundError: matplotlib is not installed.
     """
     accepted = (*FORMATS, *others)
@@ -89,7 +87,6 @@ def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
 
 
 def draw_path(plane: "Axes", scenario: Scenario, flight: Record) -> None:
-    """Draw a flight's path over its reference."""
     position = flight.client["state"][..., 0]
     draw_reference(plane, scenario, flight.client, flight.server)
     plane.plot(position[:, 0], position[:, 1], "k-", linewidth=1.0, label="UAV")
@@ -126,7 +123,7 @@ def draw_reference(
 
     Args:
         client: rows of the vehicle.
-        server: rows of the server; only they have the positions of a live point.
+        server: rows of the server, which have the positions of a target that moves in flight.
     """
     if scenario.reference.shape in ("circle", "figure-eight", "square"):
         time_s = client["step"] * scenario.control.dt
@@ -149,8 +146,8 @@ def fleet(
 
     Args:
         path: file to write, in one of FORMATS.
-        client: rows of all vehicles' records.
-        server: rows of the server; only they have the positions of a live point.
+        client: rows of all vehicles.
+        server: rows of the server, which have the positions of a target that moves in flight.
         separations: times and distances of a mission, see `summary.separations`.
     """
     figure = blank(10.4, 4.8)
@@ -184,10 +181,9 @@ def fleet(
 
 
 def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_m: Array) -> None:
-    """Draw the smallest distance of two vehicles, and the required one."""
     axes.plot(times_s - times_s[:1], nearest_m, "k-", linewidth=0.8, label="nearest two vehicles")
     asked_m = scenario.mission.separation_m
-    axes.axhline(asked_m, color="tab:red", linestyle="--", label=f"asked for: {asked_m:g} m")
+    axes.axhline(asked_m, color="tab:red", linestyle="--", label=f"required: {asked_m:g} m")
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("distance [m]")
@@ -197,7 +193,6 @@ def _draw_separations(axes: "Axes", scenario: Scenario, times_s: Array, nearest_
 def _draw_errors(
     spread: "Axes", scenario: Scenario, flights: Sequence[Rows], server: Rows | None
 ) -> None:
-    """Draw the spread of the tracking error over the vehicles."""
     settled = [rows[rows["step"] * scenario.control.dt >= scenario.settled_s] for rows in flights]
     errors = [
         np.sqrt((position_error(scenario, rows, server)[:, :2] ** 2).sum(axis=1).mean())

@@ -19,43 +19,34 @@ class Table:
     """Table of a report: its numbers as CSV, and as shown."""
 
     name: str
-    """Name of the table's file."""
     title: str
-    """Heading above the table."""
     says: str
     """Explanation of the numbers: a few sentences."""
     csv: str
     """Numbers as CSV, with all digits."""
     heading: Sequence[str]
-    """Headings of the shown columns."""
     rows: Sequence[Sequence[str]]
-    """Shown cells, row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Figure of a page."""
-
     name: str
-    """Name of the figure in the page, and of its file."""
     title: str
-    """Heading above it."""
     says: str
     """Caption: one or two sentences."""
     png: bytes
-    """Drawing as PNG."""
 
 
 def blank(width: float, height: float) -> "Figure":
     """Empty figure of a size [inch]."""
-    from matplotlib.figure import Figure  # takes half a second to import
+    from matplotlib.figure import Figure  # imported here, because it takes half a second
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 @contextmanager
 def lettered(width: float, height: float, size: float) -> "Iterator[Figure]":
-    """Empty figure of a page, of a size [inch], while letters have a size [points]."""
+    """Empty figure of a size [inch]; inside the block, text has the size `size` [points]."""
     import matplotlib as mpl
 
     letters: Any = {"font.size": size, "axes.titlesize": size, "legend.fontsize": 8}
@@ -65,21 +56,20 @@ def lettered(width: float, height: float, size: float) -> "Iterator[Figure]":
 
 
 def as_png(figure: "Figure", dpi: int) -> bytes:
-    """Figure as the content of a PNG file."""
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=dpi)
     return png.getvalue()
 
 
 def as_text(value: Any, spec: str) -> str:
-    """Number as shown in a table, with a dash for an unknown one."""
+    """Number as shown in a table, with a dash for None."""
     return "–" if value is None else format(value, spec)
 
 
 Row = Mapping[str, Any]
 """Numbers of a row, by the name of their column."""
 Cell = tuple[str, str] | Callable[[Row], str]
-"""How a cell is shown: name and format of a number, or a function of the row."""
+"""Content of a cell: name and format of a number, or a function of the row."""
 
 
 def table_of(
@@ -90,7 +80,7 @@ def table_of(
     Args:
         name, title, says: see `Table`.
         rows: all numbers; they go into the CSV.
-        shown: what is shown in each column, by its heading.
+        shown: content of each column's cells, by heading.
     """
 
     def text(row: Row, cell: Cell) -> str:
@@ -104,10 +94,13 @@ def rendered(template: str, **values: Any) -> str:
     """Page made from a template.
 
     Args:
-        template: its package and file; it may extend another one.
-        values: values for the template.
+        template: path of the template in the package `skytether`.
     """
-    from jinja2 import Environment, FunctionLoader, StrictUndefined  # takes a tenth of a second
+    from jinja2 import (
+        Environment,
+        FunctionLoader,
+        StrictUndefined,
+    )  # imported here, because it takes a tenth of a second
 
     def source(name: str) -> str:
         return resources.files("skytether").joinpath(name).read_text(encoding="utf-8")

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOTS_MAX = 20_000
-"""Largest number of packets that are drawn one by one."""
 
 
 def drawn(outcome: ProbeOutcome) -> "Figure":
@@ -26,7 +25,7 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
     figure = blank(10.0, 5.6)
     grid = figure.subplots(2, 2, width_ratios=(5, 3))
     for (name, delays), (over_time, shares) in zip(outcome.delays.items(), grid, strict=True):
-        told = getattr(outcome.told, name)
+        figures = getattr(outcome.told, name)
         every = max(1, len(delays.time_s) // DOTS_MAX)
         time_s, delay_ms = delays.time_s[::every], 1e3 * delays.delay_s[::every]
         came = np.isfinite(delay_ms)
@@ -37,7 +36,7 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
         for end in ends.tolist():
             over_time.axvspan(*delays.time_s[end : end + 2], color="0.9", linewidth=0)
         over_time.set_title(
-            f"{name}: {told.sent} packets, {told.loss:.2%} lost (red)"
+            f"{name}: {figures.sent} packets, {figures.loss:.2%} lost (red)"
             f"{f'; grey: {TRAIN} at once, to measure the rate' if len(ends) else ''}",
             fontsize=10,
             loc="left",
@@ -46,22 +45,24 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
         sorted_ms = np.sort(1e3 * delays.delay_s[delays.came])
         at = (np.arange(len(sorted_ms)) + 0.5) / len(sorted_ms)
         shares.step(sorted_ms, at, color="tab:blue", label="measured", where="post")
-        if told.delay_models:
-            _, model = path(told.delay_models[0].text).impairments[0]
+        if figures.delay_models:
+            _, model = path(figures.delay_models[0].text).impairments[0]
             assert isinstance(model, Delay)
             passes_s = (
-                (outcome.told.bytes + HEADER_BYTES) / told.rate_bytes_per_s
-                if told.rate_bytes_per_s
+                (outcome.told.bytes + HEADER_BYTES) / figures.rate_bytes_per_s
+                if figures.rate_bytes_per_s
                 else 0.0
             )
             grid_of = np.linspace(0.001, 0.999, 500)
-            model_ms = [1e3 * (model.quantile_ns(each) / SECOND_NS + passes_s) for each in grid_of]
-            label = told.delay_models[0].text.partition("(")[0]
+            model_ms = [
+                1e3 * (model.quantile_ns(share) / SECOND_NS + passes_s) for share in grid_of
+            ]
+            label = figures.delay_models[0].text.partition("(")[0]
             shares.plot(model_ms, grid_of, "--", color="tab:orange", label=label)
         shares.set_title("share of packets", fontsize=10, loc="left")
         shares.legend(loc="lower right", fontsize=8)
-        for each in (over_time, shares):
-            each.grid(alpha=0.3)
+        for axes in (over_time, shares):
+            axes.grid(alpha=0.3)
     grid[1, 0].set_xlabel("time [s]")
     grid[1, 1].set_xlabel("delay [ms]")
     return figure

@@ -14,7 +14,7 @@ FORMULA = ("=", "+", "-", "@")
 def _plain(value: Any) -> Any:
     """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
 
-    A text that a spreadsheet would take as a formula gets an apostrophe in front. Control
+    A text that a spreadsheet would take for a formula gets an apostrophe in front. Control
     characters are escaped by `printable`, so that they cannot affect a terminal.
     """
     if isinstance(value, bool):
@@ -39,7 +39,6 @@ def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Table as CSV text."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(list(map(_plain, header)))

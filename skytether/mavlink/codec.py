@@ -9,20 +9,17 @@ from typing import Any
 from skytether.mavlink.dialect import dialect
 
 Message = Any
-"""Message of pymavlink, which is untyped: its fields are its attributes."""
+"""pymavlink's message, which is untyped: its fields are its attributes."""
 
 FRAME_BYTES_MAX = 280
 """Longest frame [B]: 10 of header, 255 of payload, 2 of checksum and 13 of signature."""
 SIGNED = 0x01
-"""Flag of a frame that has a signature."""
 
 
 class Codec:
     """Encoder and decoder of frames, for one end of a link.
 
     Args:
-        system: number of this system.
-        component: number of this component.
         stream: whether frames may come in pieces, as over a serial line or TCP; a datagram has
             whole frames.
     """
@@ -32,7 +29,7 @@ class Codec:
         self._stream = stream
         self._rest = bytearray()
         self.garbage_bytes = 0
-        """Number of bytes so far that belong to no frame."""
+        """Bytes so far that belong to no frame."""
 
     def encode(self, message: Message) -> bytes:
         """Frame of a message, with the next sequence number."""
@@ -60,7 +57,6 @@ class Codec:
         return messages
 
     def _one(self, frame: bytearray) -> Message | None:
-        """Message of a frame; None where the frame is invalid."""
         if not frame:
             return None
         number = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
@@ -74,15 +70,15 @@ class Codec:
 
 
 def _length(data: bytearray, at: int) -> int:
-    """Length of the frame that begins here; 0 where none begins.
+    """Length of the frame that begins at `at`; 0 if none does.
 
     A truncated header counts as the longest frame.
     """
-    left = len(data) - at
+    remaining = len(data) - at
     if data[at] == 0xFD:
-        if left < 3:
+        if remaining < 3:
             return FRAME_BYTES_MAX
         return 12 + data[at + 1] + (13 if data[at + 2] & SIGNED else 0)
     if data[at] == 0xFE:
-        return FRAME_BYTES_MAX if left < 2 else 8 + data[at + 1]
+        return FRAME_BYTES_MAX if remaining < 2 else 8 + data[at + 1]
     return 0

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 
 def turned(vector: Sequence[float]) -> tuple[float, float, float]:
-    """Vector converted between (north, east, down) and (x north, y east, up), either way; shape
-    (3,).
-    """
+    """(north, east, down) to (x north, y east, up), or back; shape (3,)."""
     x, y, z = vector
     return x, y, -z

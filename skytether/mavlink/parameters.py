@@ -25,7 +25,6 @@ INTEGERS = frozenset(
 
 
 def type_of(value: float) -> int:
-    """Parameter type for this value, of 32 bits."""
     return INTEGER if isinstance(value, int) else FLOAT
 
 
@@ -34,7 +33,7 @@ def to_wire(value: float, *, bytewise: bool) -> float:
 
     Args:
         value: an int for a parameter of type INTEGER.
-        bytewise: whether its bits are sent, as PX4 does.
+        bytewise: whether the integer's bits are sent, as PX4 does.
     """
     if bytewise and isinstance(value, int):
         bits: float = struct.unpack("<f", struct.pack("<i", value))[0]
@@ -43,7 +42,7 @@ def to_wire(value: float, *, bytewise: bool) -> float:
 
 
 def from_wire(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Value of a parameter from the wire, an int for integer types; None where it is no number."""
+    """Value of a parameter from the wire, an int for integer types; None if it is invalid."""
     if kind not in INTEGERS:
         return value if kind == FLOAT and math.isfinite(value) else None
     if bytewise:

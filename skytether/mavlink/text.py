@@ -10,7 +10,6 @@ CHUNK_BYTES = 50
 UNFINISHED_MAX = 8
 """Most unfinished texts that are kept; a new one replaces the oldest."""
 CHUNKS_MAX = 8
-"""Most chunks of a text."""
 
 
 def chunks(severity: int, text: str, number: int) -> list[Message]:
@@ -18,28 +17,26 @@ def chunks(severity: int, text: str, number: int) -> list[Message]:
 
     Args:
         severity: MAV_SEVERITY.
-        text: the text.
         number: id of the text from 1 to 65535, which its chunks share.
     """
-    said = text.encode()
-    parts = [said[at : at + CHUNK_BYTES] for at in range(0, len(said), CHUNK_BYTES)]
-    if len(said) % CHUNK_BYTES == 0:
+    encoded = text.encode()
+    parts = [encoded[at : at + CHUNK_BYTES] for at in range(0, len(encoded), CHUNK_BYTES)]
+    if len(encoded) % CHUNK_BYTES == 0:
         parts.append(b"")  # a chunk that is not full marks the end
-    own = number if len(parts) > 1 else 0
+    text_id = number if len(parts) > 1 else 0
     return [
-        dialect.MAVLink_statustext_message(severity, part, own, k) for k, part in enumerate(parts)
+        dialect.MAVLink_statustext_message(severity, part, text_id, k)
+        for k, part in enumerate(parts)
     ]
 
 
 class Texts:
-    """Reassembly of texts from chunks."""
-
     def __init__(self) -> None:
         self._begun: OrderedDict[tuple[int, int, int], list[str]] = OrderedDict()
         """Chunks so far of each text, by system, component and text id."""
 
     def take(self, message: Message) -> str | None:
-        """Text completed by a message; None where more chunks follow, or its beginning is lost."""
+        """Text completed by a message; None if more chunks follow, or its beginning is lost."""
         if message.id == 0:
             return str(message.text)
         key = message.get_srcSystem(), message.get_srcComponent(), message.id

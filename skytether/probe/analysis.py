@@ -1,22 +1,20 @@
 """Analysis of packets that went both ways, as functions of arrays.
 
-Clocks: an apparent delay is the true one and the offset of the clocks, t_receiver - t_sender = d +
-o(t), one way, and d - o(t) the other. With o(t) = o + s t, a line below all points of a direction,
-along the least delays, has the slope s, or -s. Following Moon, Skelly and Towsley (1999), of all
-lines below the points the one with the highest mean is taken; both directions share one slope. A
-point's height above the line is its delay beyond the least one. Of the two least delays only the
-sum is known, in which the offset cancels: half of it is assumed for each direction.
+Clocks: an apparent delay is the true delay plus the offset of the clocks one way, t_receiver -
+t_sender = d + o(t), and d - o(t) the other way. With o(t) = o + s t, a line through the smallest
+delays of a direction has the slope s, or -s. Following Moon, Skelly and Towsley (1999), the line is
+the one with the highest mean among all lines below the points; both directions share one slope. The
+height of a point above the line is its delay beyond the least delay. Of the two least delays only
+the sum can be measured, in which the offset cancels: half of it is assumed for each direction.
 
-Loss: the confidence interval is Wilson's, for the number of packets that are effectively
-independent.
+Loss: the confidence interval is Wilson's, for the effective number of independent packets.
 
-Rate: packets of a train that are sent at once leave a bottleneck one behind the other, each after
-size / rate (packet dispersion). So the i-th of a train has the delay of a packet that was sent
-alone, and i size / rate more. The time size / rate is estimated in two ways, and the estimate with
-the smaller error is taken. One is the slope of a line through delay over place in the train, common
-to all trains: it is insensitive to slowly varying delays. The other is the maximum-likelihood time,
-given the measured distribution of the delays of packets sent alone: it is the better one for delays
-that vary fast.
+Rate: packets of a train that are sent at once leave a bottleneck one behind the other, size / rate
+apart (packet dispersion). So the i-th packet of a train has the delay of a packet sent alone, plus
+i size / rate. The time size / rate is estimated in two ways, and the estimate with the smaller
+error is used. One is the common slope of lines through delay over place in the train: slowly
+varying delays hardly affect it. The other is the maximum-likelihood time, given the measured
+distribution of the delays of packets sent alone: it is the better one for delays that vary fast.
 """
 
 from collections.abc import Callable
@@ -31,17 +29,16 @@ from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array, Flags
 
 DRIFT_MAX = 500e-6
-"""Largest believable drift between two clocks: the fastest rate at which clocks are slewed."""
+"""Largest plausible drift between two clocks: the fastest rate at which clocks are slewed."""
 WINDOWS = 12
 """Number of parts of a measurement whose least delays give the drift's uncertainty."""
 CERTAIN = 5.0
-"""Number of standard errors above which a drift is taken as real, estimated from so few parts."""
+"""Number of standard errors above which a drift is significant; large, because of few WINDOWS."""
 Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
 ALIKE_S = 50e-6
 """Standard deviation up to which values count as all equal [s]."""
 LAGS = 20
-"""Number of lags of the autocorrelation."""
 TOGETHER_NS = 2 * MILLISECOND_NS
 """Longest time within which the packets of a train are sent [ns]."""
 SPREAD_MIN_S = 1e-3
@@ -53,7 +50,6 @@ GROUPS_MIN, GROUPS_MAX = 4, 10
 ALONE_MIN, KERNELS = 100, 500
 """Smallest number of packets for a distribution, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
-"""Probabilities of the reported quantiles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,30 +57,26 @@ class Clocks:
     """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, assuming that half of the least round trip is the delay of each
-    way [s]."""
+    """Offset at the first probe, if both directions have half of the least round-trip time."""
     drift: float
-    """Rate by which the listener's clock runs faster; 0 where no drift is certain."""
+    """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
     drift_doubt: float
-    """Standard error of the drift."""
     least_sum_s: float
-    """Sum of the two least delays [s]."""
+    """Sum of the two least delays."""
     doubt_s: float
-    """Largest error of the offset, and so of all one-way delays: half of the least delays, less
-    known fixed times [s]."""
+    """Largest error of all one-way delays: half of the least delays, less known fixed times."""
 
 
 @dataclass(frozen=True, slots=True)
 class BottleneckRate:
-    """Rate of a path's bottleneck; None if its packet trains give no finite rate."""
+    """Rate of a path's bottleneck, in one direction."""
 
     bytes_per_s: float
-    """Rate, headers of IP and UDP included [B/s]."""
+    """Rate, headers of IP and UDP included."""
     low: float
     high: float
     """Bounds of the 95 % interval [B/s]."""
     trains: int
-    """Number of trains used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +84,14 @@ class Delays:
     """Packets of one direction that were sent alone, in order of sending."""
 
     time_s: Array
-    """Time of sending on the prober's clock, from the first probe [s]; shape (n,)."""
+    """Time of sending on the prober's clock, from the first probe; shape (n,)."""
     delay_s: Array
-    """One-way delay [s]; NaN of a lost packet; shape (n,)."""
+    """One-way delay; NaN for a lost packet; shape (n,)."""
     rate: BottleneckRate | None
-    """Rate of the direction; None where trains show no finite one."""
+    """None if trains give no finite rate."""
 
     @property
     def came(self) -> Flags:
-        """Whether each packet arrived; shape (n,)."""
         return np.isfinite(self.delay_s)
 
 
@@ -111,7 +102,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     """Clocks, and delays of the downlink and of the uplink.
 
     Raises:
-        ValueError: too few packets arrived in a direction.
+        ValueError: fewer than two packets arrived in a direction.
     """
     down, up = measured.downlink, measured.uplink
     alone = down.came & (down.train < 0), up.came & (up.train < 0)
@@ -141,7 +132,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
 
 
 def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
-    """Clocks, and delays of both ways, of a log: its two ways are one, on one clock.
+    """Clocks, and delays of a log, which has one series of delays on one clock for both directions.
 
     Raises:
         ValueError: fewer than two packets arrived.
@@ -150,9 +141,9 @@ def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     if way.came.sum() < 2:
         raise ValueError("fewer than two packets arrived")
     time_s, delay_s = _points(way.sent_ns, way.came_ns)
-    found = _alone(way, time_s, delay_s, None)
+    result = _alone(way, time_s, delay_s, None)
     least_s = float(delay_s[way.came].min())
-    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), found, found
+    return Clocks(0.0, 0.0, 0.0, 2.0 * least_s, least_s), result, result
 
 
 def _points(sent_ns: Longs, came_ns: Longs) -> tuple[Array, Array]:
@@ -165,7 +156,7 @@ def _alone(way: Way, time_s: Array, delay_s: Array, found: BottleneckRate | None
 
 
 def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[float, float]:
-    """Slope of both lines, and its standard error; 0 where it is not certain."""
+    """Slope of both lines, and its standard error; the slope is 0 if it is not significant."""
     if x_down[-1] - x_down[0] <= 0.0:
         return 0.0, DRIFT_MAX
     down, up = lower_hull(x_down, y_down), lower_hull(x_up, y_up)
@@ -184,8 +175,8 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
 def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> float:
     """Standard error of the slope, from least delays in parts of the measurement.
 
-    Half the difference of both directions' least delays in a part is the offset there; the scatter
-    of these offsets over time gives the uncertainty of a line through them.
+    Half the difference of both directions' least delays in a part is the offset in that part; the
+    scatter of these offsets over time gives the uncertainty of a line through them.
     """
     edges = np.linspace(0.0, max(x_down[-1], x_up.max()), WINDOWS + 1)
     offsets, times = [], []
@@ -198,9 +189,9 @@ def _drift_doubt(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> floa
     if len(times) < 4:
         return DRIFT_MAX
     slopes = np.polyfit(times, offsets, 1)
-    left = np.asarray(offsets) - np.polyval(slopes, times)
+    residuals = np.asarray(offsets) - np.polyval(slopes, times)
     spread = float(np.std(times)) * sqrt(len(times))
-    return sqrt(float(left @ left) / (len(times) - 2)) / spread
+    return sqrt(float(residuals @ residuals) / (len(times) - 2)) / spread
 
 
 def lower_hull(x: Array, y: Array) -> tuple[Array, Array]:
@@ -244,15 +235,15 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
     Pairs with a gap between them, such as those around a train, are left out.
 
     Args:
-        time_s: times of sending, in the order of sending [s]; shape (n,).
+        time_s: times of sending, in the order of sending; shape (n,).
         values: NaN for unknown values; shape (n,).
 
     Returns:
-        Two arrays of shape (lags,), with fewer entries where there are few packets.
+        two arrays of shape (lags,), with fewer entries if there are few packets.
     """
     centred = values - np.nanmean(values)
     variance = float(np.nanmean(centred**2))
-    apart, found = [], []
+    apart, correlations = [], []
     typical = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     for lag in range(1, min(lags, len(values) // 4) + 1):
         between = time_s[lag:] - time_s[:-lag]
@@ -261,13 +252,12 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
         if pairs.sum() < 10 or variance <= ALIKE_S**2:
             break
         apart.append(float(between[pairs].mean()))
-        found.append(float(product[pairs].mean()) / variance)
-    return np.array(apart), np.array(found)
+        correlations.append(float(product[pairs].mean()) / variance)
+    return np.array(apart), np.array(correlations)
 
 
 def effective(count: int, correlations: Array) -> float:
-    """Effective sample size: number of independent values that determine a mean as well as these
-    correlated ones.
+    """Effective sample size: number of independent values that determine a mean equally well.
 
     The sum over lags ends where the correlation no longer differs significantly from 0.
     """
@@ -324,8 +314,8 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     """Rate of the bottleneck of a path; None if the packet trains give no finite rate.
 
     Args:
-        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored
-            [s]; shape (n,).
+        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored;
+            shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -338,10 +328,10 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     if not trains:
         return None
     alone = np.sort(delay_s[way.came & (way.train < 0)])
-    found = [_slope(trains)]
+    estimates = [_slope(trains)]
     if len(trains) >= GROUPS_MIN and len(alone) >= ALONE_MIN:
-        found.append(_likeliest(trains, alone, *found[0]))
-    time_s, error = min(found, key=lambda each: each[1])
+        estimates.append(_likeliest(trains, alone, *estimates[0]))
+    time_s, error = min(estimates, key=lambda each: each[1])
     spread_s = time_s * max(float(places[-1]) for places, _ in trains)
     if spread_s < SPREAD_MIN_S or time_s < 4.0 * error:
         return None
@@ -355,20 +345,17 @@ Trains = list[tuple[Array, Array]]
 
 
 def _slope(trains: Trains) -> tuple[float, float]:
-    """Common slope of lines through all trains, each with its own intercept, and its standard
-    error.
-    """
+    """Common slope of lines through all trains, each with its own intercept; standard error."""
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx
-    left = sum(float((y - slope * x) @ (y - slope * x)) for x, y in centred)
+    residual = sum(float((y - slope * x) @ (y - slope * x)) for x, y in centred)
     free = max(sum(len(x) - 1 for x, _ in centred) - 1, 1)
-    return slope, sqrt(left / free / sxx)
+    return slope, sqrt(residual / free / sxx)
 
 
 def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:
-    """Most likely transmission time of a packet [s], and its jackknife standard error over groups
-    of trains.
+    """Most likely transmission time of a packet [s], and its jackknife standard error over trains.
 
     Args:
         alone: sorted delays of packets that were sent alone [s].
@@ -408,7 +395,7 @@ def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tupl
     ]
     spread = np.array(without) - np.mean(without)
     error = sqrt((groups - 1) / groups * float(spread @ spread))
-    # A time that is hardly likelier than zero is not certain, however small the scatter is.
+    # A time that is hardly more likely than zero is uncertain, however small its scatter.
     gain = likelihood(time_s, trains) - likelihood(0.0, trains)
     error = max(error, time_s / sqrt(2.0 * max(gain, 1e-9)))
     # factor by which Student's t is wider than the normal distribution

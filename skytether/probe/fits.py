@@ -2,8 +2,9 @@
 
 Each is fitted by maximum likelihood. They are compared by BIC, k ln n - 2 ln L with k parameters,
 where n is the effective sample size, see `analysis.effective`. Likelihoods are densities, with a
-time resolution of RESOLUTION_S: the paper's lattice of slots has a normal error of at least that,
-and delays keep that distance from a law's lower bound. Delays that hardly vary are called constant.
+time resolution of RESOLUTION_S: the normal error of the paper's lattice of slots is at least that,
+and delays keep that distance from a distribution's lower bound. Delays that hardly vary are called
+constant.
 """
 
 from collections.abc import Callable
@@ -17,37 +18,32 @@ from skytether.probe.analysis import highest
 from skytether.shared.law.model import Array, Flags
 
 RESOLUTION_S = 50e-6
-"""Time resolution of the likelihoods [s]."""
 CONSTANT_S = 0.5e-3
 """Largest standard deviation of delays that are called constant [s]."""
 LEASTS = 60
-"""Number of candidates for the lower bound of a delay distribution that has one."""
+"""Number of candidates for a delay distribution's lower bound."""
 SLOTS = 4000
-"""Number of slot lengths that are tried for the paper's law."""
+"""Number of slot lengths that are tried for the paper's distribution."""
 PAIRS_MIN = 20
 """Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Shortest time after which a channel is redrawn, in mean times between packets, and longest
-[s]."""
+"""Bounds of a channel's redraw time: in mean times between packets, and in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedImpairment:
-    """Fitted model."""
+    """Impairment with fitted arguments."""
 
     name: str
-    """Name of the impairment."""
     numbers: tuple[float, ...]
-    """Arguments of the impairment."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
     def text(self, correlation_s: float = 0.0) -> str:
-        """The impairment as a scenario writes it."""
-        shown = [f"{number:.5g}" for number in self.numbers]
+        arguments = [f"{number:.5g}" for number in self.numbers]
         if correlation_s and self.name != "constant":
-            shown.append(f"correlation_s={correlation_s:.3g}")
-        return f"{self.name}({', '.join(shown)})"
+            arguments.append(f"correlation_s={correlation_s:.3g}")
+        return f"{self.name}({', '.join(arguments)})"
 
 
 # -- delays -------------------------------------------------------------------------------------
@@ -57,7 +53,7 @@ def fit_delays(delay_s: Array, independent: float) -> list[FittedImpairment]:
     """Models of delays, the best first.
 
     Args:
-        delay_s: delays of the received packets [s]; shape (n,).
+        delay_s: delays of the received packets; shape (n,).
         independent: effective sample size.
     """
     if len(delay_s) < PAIRS_MIN:
@@ -77,7 +73,7 @@ def fit_delays(delay_s: Array, independent: float) -> list[FittedImpairment]:
 
 
 Found = tuple[str, tuple[float, ...], int, float]
-"""Name of a law, its arguments, number of parameters, and logarithm of its likelihood."""
+"""Name of a distribution, its arguments, number of parameters, and log-likelihood."""
 
 
 def _normal_likelihood(left: Array, sd: float) -> float:
@@ -96,7 +92,7 @@ def _normal(delay_s: Array) -> Found:
 
 
 def _with_least(delay_s: Array, name: str) -> Found:
-    """Gamma or lognormal law beyond a least delay, with the best least delay found by trial."""
+    """Gamma or lognormal distribution beyond the best least delay, which is found by trial."""
     first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
     law = _gamma if name == "gamma" else _lognormal
     below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)
@@ -109,9 +105,7 @@ def _with_least(delay_s: Array, name: str) -> Found:
 
 
 def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best lognormal law beyond a least
-    delay.
-    """
+    """Log-likelihood, mean and standard deviation of the best lognormal law over `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     logs = np.log(over)
     mu, sigma = float(np.mean(logs)), max(float(np.std(logs)), 1e-6)
@@ -121,7 +115,7 @@ def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best gamma law beyond a least delay."""
+    """Log-likelihood, mean and standard deviation of the best gamma distribution over `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     count, mean, mean_log = len(over), float(np.mean(over)), float(np.mean(np.log(over)))
 
@@ -135,17 +129,15 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Least delay plus a Poisson number of slots, with a normal error; None without visible
-    slots.
-    """
+    """Least delay plus a Poisson number of slots, with a normal error; None without slots."""
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
         return None
     shift = delay_s - first
-    some = shift[:: max(1, len(shift) // 2000)]
+    sample = shift[:: max(1, len(shift) // 2000)]
 
     def concentration(slot_s: float) -> float:
-        return abs(complex(np.mean(np.exp(2j * pi * some / slot_s))))
+        return abs(complex(np.mean(np.exp(2j * pi * sample / slot_s))))
 
     # Slots at equal distances of 1/slot: a peak is as wide as 1/span.
     inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
@@ -161,15 +153,13 @@ def _paper(delay_s: Array) -> Found | None:
     phase = float(np.angle(np.mean(np.exp(2j * pi * shift / slot)))) * slot / (2.0 * pi)
     places = np.rint((shift - phase) / slot)
     slot, begin = (float(each) for each in np.polyfit(places, delay_s, 1))
-    left = delay_s - begin - slot * places
-    error = max(float(np.std(left)), RESOLUTION_S)
+    residuals = delay_s - begin - slot * places
+    error = max(float(np.std(residuals)), RESOLUTION_S)
     places -= places.min()
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Log-likelihood of the Poisson law if so many slots below the smallest delay never
-        occurred.
-        """
+        """Log-likelihood of the Poisson law if `before` slots below the least delay are empty."""
         counts, times = np.unique(places + before, return_counts=True)
         mean = float(np.mean(places)) + before
         logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]
@@ -180,28 +170,28 @@ def _paper(delay_s: Array) -> Found | None:
         return None
     before = max(befores[:200], key=likelihood)
     numbers = max(begin - before * slot, 0.0), slot, float(np.mean(places)) + before
-    return "paper", numbers, 4, likelihood(before) + _normal_likelihood(left, error)
+    return "paper", numbers, 4, likelihood(before) + _normal_likelihood(residuals, error)
 
 
 # -- losses -------------------------------------------------------------------------------------
 
 
 def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
-    """Models of losses, the best first; none where nothing was lost, or everything.
+    """Models of losses, the best first; empty if nothing was lost, or everything.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
     loses every packet while it is bad. Its state is not redrawn between two packets with
     probability exp(-Δt / cell), and a bad period lasts cell / (1 - share) on average.
 
     Args:
-        time_s: times of sending, in the order of sending [s]; shape (n,).
+        time_s: times of sending, in the order of sending; shape (n,).
         lost: whether each was lost; shape (n,).
     """
-    count, gone = len(lost), int(np.sum(lost))
-    if count < PAIRS_MIN or gone in (0, count):
+    count, lost_count = len(lost), int(np.sum(lost))
+    if count < PAIRS_MIN or lost_count in (0, count):
         return []
-    share = gone / count
-    bernoulli = gone * log(share) + (count - gone) * log(1.0 - share)
+    share = lost_count / count
+    bernoulli = lost_count * log(share) + (count - lost_count) * log(1.0 - share)
     fits = [FittedImpairment("loss", (share,), log(count) - 2.0 * bernoulli)]
     between = np.maximum(np.diff(time_s), 0.0)
     before, after = lost[:-1].astype(bool), lost[1:].astype(bool)
@@ -223,7 +213,7 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
 
 
 def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
-    """Log-likelihood as a function of the share, with the best cell length."""
+    """Log-likelihood as a function of the share; `cell` is the logarithm of the cell length."""
     return likelihood(share, exp(cell))
 
 

@@ -1,4 +1,4 @@
-"""Far end of a measurement: it answers each probe with one packet, no longer than the probe.
+"""Far end of a measurement: answers each probe with one packet, no longer than the probe.
 
 An answer has the listener's time, and lists the arrivals that the prober has not acknowledged, the
 oldest first, so that a lost answer loses no arrival. The probes of a train are answered together
@@ -6,8 +6,8 @@ once all have arrived, so that the answers form a train as well.
 
 A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
 kept from the first PROBE on, which only a sender that receives packets at that address can send.
-Without keys a session is answered at that address alone: otherwise whoever knows the session could
-direct answers at a third party. With keys a sender may change its address.
+Without keys a session is answered at that address only: otherwise anybody who has seen the session
+id could direct answers at a third party. With keys a sender may change its address.
 """
 
 import hashlib
@@ -36,8 +36,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; a further one replaces one that had no probe for IDLE_NS, or one of
-the host with the most."""
+"""Most measurements at once; see `Listener._gives_way` for a further one."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
@@ -45,7 +44,6 @@ HISTORY_MAX = 65_536
 HOLD_NS = 200 * MILLISECOND_NS
 """Time to wait for the rest of a train after each of its packets [ns]."""
 _ARRIVALS_MAX = PAYLOAD_BYTES_MAX // 12
-"""Most arrivals that fit an answer."""
 
 
 @dataclass(slots=True)
@@ -53,11 +51,9 @@ class HeldPacket:
     """Packet of a train whose answer waits for the rest of the train."""
 
     number: int
-    """Number of the packet's arrival."""
     call: GateCall
     peer: Address
     size: int
-    """Size of the datagram [B]."""
 
 
 @dataclass(slots=True)
@@ -65,24 +61,22 @@ class ProbeSession:
     """Measurement by one prober."""
 
     heard_ns: int
-    """Time of the newest probe [ns]."""
+    """Time of the newest probe."""
     host: str
-    """Host of the prober."""
     logged: int = 0
-    """Number of arrivals so far."""
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
     train: list[HeldPacket] = field(default_factory=list)
     """Packets of a train that wait for the rest."""
     train_ns: int = 0
-    """Time of the newest packet in `train` [ns]."""
+    """Time of the newest packet in `train`."""
 
 
 class Listener(Endpoint):
     """Listener that answers probes.
 
     Args:
-        gate: opens incoming packets, and seals answers.
+        gate: opens incoming packets, and encrypts answers.
         secret: random bytes, from which session ids are derived.
     """
 
@@ -95,7 +89,6 @@ class Listener(Endpoint):
         self._answered = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
             if call is not None:
@@ -107,9 +100,11 @@ class Listener(Endpoint):
     def _hear(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         message = decode(call.payload)
         if isinstance(message, ProbeHello):
-            room = self._gives_way(datagram.peer, now_ns) is not None
-            room = room or len(self._sessions) < SESSIONS_MAX
-            welcome = ProbeWelcome(message.nonce, self._cookie(message.nonce, datagram.peer), room)
+            has_room = self._gives_way(datagram.peer, now_ns) is not None
+            has_room = has_room or len(self._sessions) < SESSIONS_MAX
+            welcome = ProbeWelcome(
+                message.nonce, self._cookie(message.nonce, datagram.peer), has_room
+            )
             packet = call.line.seal(encode(welcome))
             if len(packet) > len(datagram.payload):
                 raise ProtocolError(Drop.LENGTH)
@@ -125,8 +120,8 @@ class Listener(Endpoint):
         """Measurement of a session, begun if it is new.
 
         Raises:
-            ProtocolError: the session id is not this listener's for the sender, or there is no
-                room.
+            ProtocolError: the session id is not this listener's for the sender, or SESSIONS_MAX are
+                open.
         """
         session = self._sessions.get(name)
         if session is None or not self._gate.secure:
@@ -135,10 +130,10 @@ class Listener(Endpoint):
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
         if session is None:
             if len(self._sessions) >= SESSIONS_MAX:
-                gone = self._gives_way(peer, now_ns)
-                if gone is None:
+                replaced = self._gives_way(peer, now_ns)
+                if replaced is None:
                     raise ProtocolError(Drop.FULL)
-                del self._sessions[gone]
+                del self._sessions[replaced]
             session = self._sessions[name] = ProbeSession(now_ns, host_of(peer))
         session.heard_ns = now_ns
         self._sessions.move_to_end(name)
@@ -181,7 +176,6 @@ class Listener(Endpoint):
             self._answer(session, probe.session, waits, now_ns)
 
     def _release(self, session: ProbeSession, name: bytes, now_ns: int) -> None:
-        """Answer all packets of a train."""
         for each in session.train:
             self._answer(session, name, each, now_ns)
         session.train.clear()
@@ -198,20 +192,18 @@ class Listener(Endpoint):
             self._answered += 1
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`; an incomplete train is answered after a time limit."""
+        """Answer incomplete trains after a time limit."""
         for name, session in self._sessions.items():
             if session.train and now_ns >= session.train_ns + HOLD_NS:
                 self._release(session, name, now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which an incomplete train is answered."""
         return min(
             (each.train_ns + HOLD_NS for each in self._sessions.values() if each.train),
             default=None,
         )
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "sessions": len(self._sessions),
             "answered": self._answered,
@@ -219,7 +211,6 @@ class Listener(Endpoint):
         }
 
     def _cookie(self, nonce: bytes, peer: Address) -> bytes:
-        """Cookie for a prober's nonce and address."""
         host, port = peer
-        told = nonce + f"{host} {port}".encode()
-        return hashlib.blake2s(told, key=self._secret, digest_size=COOKIE_BYTES).digest()
+        content = nonce + f"{host} {port}".encode()
+        return hashlib.blake2s(content, key=self._secret, digest_size=COOKIE_BYTES).digest()

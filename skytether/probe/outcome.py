@@ -16,18 +16,13 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest reported correlation time, in times between two packets; shorter ones are left out of
-the text."""
+"""Shortest correlation time in the text, in times between two packets."""
 ORDERED_SHARE = 0.01
-"""Share of reordered packets predicted for independent delays; above it, a path without reordering
-is called ordered."""
+"""Predicted share of reordered packets above which a path without any is called ordered."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
-    """Fitted model, for the output."""
-
     text: str
-    """The impairment as a scenario writes it."""
     bic: float
     """Bayesian information criterion: the smaller, the better."""
 
@@ -38,41 +33,36 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     came: int
     copies: int
-    """Duplicate arrivals, those of trains included."""
+    """Duplicate arrivals, including packets of trains."""
     loss: float
-    """Share of the packets that were lost."""
     loss_low: float
     loss_high: float
     """Bounds of the 95 % interval of the loss."""
     bursts: int
-    """Number of runs of lost packets."""
     burst_packets: float
     """Mean length of a run [packets]."""
     reordered: float
     """Share of packets that arrived after one sent later."""
     mean_s: float
-    """Mean one-way delay [s]."""
     sd_s: float
-    """Standard deviation of the delay [s]."""
     quantiles_s: dict[str, float]
-    """Quantiles of the delay [s], by probability."""
+    """Quantiles of the delay, by probability."""
     correlation: list[tuple[float, float]]
-    """Time between two packets [s], and correlation of their delays."""
+    """Time between two packets [s] and the correlation of their delays, by lag."""
     correlation_s: float
-    """Time in which the correlation falls to 1/e [s]; 0 without significant correlation."""
+    """Time in which the correlation falls to 1/e; 0 without significant correlation."""
     rate_bytes_per_s: float | None
-    """Rate of the narrowest part, with headers [B/s]; None where trains show none."""
+    """Rate of the bottleneck, with headers; None if trains give none."""
     rate_low: float | None
     rate_high: float | None
     """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
     """Number of trains of which enough packets arrived."""
     train_wait_s: float
-    """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
+    """Time for which the last packet of a train waits in the bottleneck's queue."""
     delay_models: list[ModelFigures]
     """Models of the delay, without the transmission time at the rate, the best first."""
     loss_models: list[ModelFigures]
-    """Models of the losses, the best first."""
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
 
@@ -84,41 +74,34 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """What a log was of, whose delays both ways have; of round trips they have half."""
+    """Content of a log, "" for a measurement; round-trip times are halved for each direction."""
     seconds: float
-    """Length of the measurement [s]."""
     bytes: int
-    """UDP payload of a packet [B]; 0 where a log does not have it."""
+    """UDP payload of a packet [B]; 0 if a log does not have it."""
     every_s: float
-    """Time between two packets [s]."""
     offset_s: float
-    """Offset of the listener's clock at the first probe [s]."""
+    """Offset of the listener's clock at the first probe."""
     offset_doubt_s: float
-    """Largest error of that offset, and of all one-way delays, with opposite signs [s]."""
+    """Largest error of that offset, and of all one-way delays, with opposite signs."""
     drift_ppm: float
-    """Drift of the listener's clock [10⁻⁶]; 0 where none is certain."""
+    """Drift of the listener's clock; 0 if none is significant."""
     drift_doubt_ppm: float
-    """Standard error of the drift [10⁻⁶]."""
     round_trip_mean_s: float
-    """Mean round trip [s], which depends on no clock."""
+    """Mean round-trip time, which depends on no clock offset."""
     round_trip_least_s: float
-    """Sum of both least delays [s]."""
+    """Sum of both least delays."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them, or of packets in
-    captures that are left out."""
+    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
     uplink: DirectionFigures
-    """Direction from the listener to the prober."""
+    """From the listener to the prober."""
     downlink: DirectionFigures
-    """Direction from the prober to the listener."""
+    """From the prober to the listener."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeOutcome:
-    """Result of a measurement."""
-
     clocks: Clocks
     delays: Mapping[str, Delays]
-    """Packets of the uplink and of the downlink."""
     told: PathFigures
 
 
@@ -134,7 +117,7 @@ def outcome(
     Args:
         listener: HOST:PORT of the other end, or the names of files.
         secure: whether packets were encrypted.
-        log: what it is from, where it is from a log.
+        log: content of the log; empty for a measurement.
 
     Raises:
         ValueError: too few packets arrived.
@@ -142,7 +125,7 @@ def outcome(
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
     clocks, down, up = (analysis.delays_of_log if log else analysis.delays)(measured)
     delays = {"uplink": up, "downlink": down}
-    told = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
+    directions = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
     near = measured.downlink.sent_ns
     path = PathFigures(
         listener=listener,
@@ -155,10 +138,10 @@ def outcome(
         offset_doubt_s=clocks.doubt_s,
         drift_ppm=clocks.drift * 1e6,
         drift_doubt_ppm=clocks.drift_doubt * 1e6,
-        round_trip_mean_s=told["uplink"].mean_s + told["downlink"].mean_s,
+        round_trip_mean_s=directions["uplink"].mean_s + directions["downlink"].mean_s,
         round_trip_least_s=clocks.least_sum_s,
         unreported=measured.unreported,
-        **told,
+        **directions,
     )
     return ProbeOutcome(clocks, delays, path)
 
@@ -228,7 +211,7 @@ def trace(delays: Delays) -> str:
     begin = float(delays.time_s[0])
     for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # a trace holds one packet for each instant: the first
+        if at > last:  # a trace has at most one packet per time: the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"

@@ -1,4 +1,4 @@
-"""Near end of a measurement: it sends probes on a time grid, and records what became of each.
+"""Near end of a measurement: sends probes on a time grid, and records the fate of each.
 
     HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
     the last answers have had time to come
@@ -48,12 +48,10 @@ TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 HELLO_BYTES = 64
 """Size of a HELLO without keys: its WELCOME is shorter [B]."""
 PATIENCE_NS = 10 * SECOND_NS
-"""Longest wait for a first answer [ns]."""
+"""Longest wait for a first answer."""
 POLL_NS = 100 * MILLISECOND_NS
-"""Time between two polls [ns]."""
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Shortest and longest wait for the last answers [ns]; between them, twice the longest round
-trip."""
+"""Bounds of the wait for the last answers [ns]: twice the longest round-trip time in between."""
 
 Longs = NDArray[np.int64]
 
@@ -66,43 +64,36 @@ class Way:
     """
 
     sent_ns: Longs
-    """Time of sending, on the sender's clock [ns]; shape (n,)."""
+    """Time of sending, on the sender's clock; shape (n,)."""
     came_ns: Longs
-    """Time of arrival, on the receiver's clock [ns]; 0 for a lost packet; shape (n,)."""
+    """Time of arrival, on the receiver's clock; 0 for a lost packet; shape (n,)."""
     came: Flags
-    """Whether each packet arrived; shape (n,)."""
     train: Longs
     """Number of each packet's train, -1 for a packet sent alone; shape (n,)."""
     copies: int
-    """Number of duplicate arrivals."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """Packets of both directions."""
-
     downlink: Way
-    """Packets from the prober to the listener, as from a vehicle to the server."""
+    """From the prober to the listener, as from a vehicle to the server."""
     uplink: Way
-    """Packets from the listener to the prober."""
+    """From the listener to the prober."""
     size: int
-    """UDP payload of each packet [B]."""
     period_ns: int
-    """Time between two probes [ns]."""
     unreported: int
-    """Number of arrivals that the listener dropped before it could report them, or of packets in
-    captures that are left out."""
+    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
 
 
 class Prober(Endpoint):
-    """Prober that sends probes, and keeps their times of sending, arrival and answer.
+    """Sender of probes; keeps their times of sending, arrival and answer.
 
     Args:
-        link: seals outgoing packets, and opens incoming ones.
+        link: encrypts outgoing packets, and opens incoming ones.
         listener: address of the other end.
         nonce: NONCE_BYTES, different for each measurement.
         probes: number of places on the grid, at most PROBES_MAX.
-        period_ns: time between two places [ns].
+        period_ns: time between two places.
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
     """
 
@@ -128,21 +119,16 @@ class Prober(Endpoint):
         self._due_ns: int | None = 0
         """Time of the next wake; 0 before the first."""
         self._hello_ns = 0
-        """Time of the newest HELLO."""
         self._began_ns: int | None = None
-        """Time of the first HELLO."""
         self._zero_ns = 0
-        """Time of the first probe."""
         self._slot = 0
         """Place on the grid of the next probe."""
         self._over_ns: int | None = None
         """Time at which the last probe was sent; None before."""
         self._longest_ns = 0
-        """Longest round trip so far."""
         self.refused = False
-        """Whether the listener has refused for lack of room."""
+        """Whether the listener has refused, because it serves SESSIONS_MAX."""
         self.failed = False
-        """Whether the listener has not answered in time."""
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
         self._logged_number, self._logged_ns = array("q"), array("q")
@@ -159,10 +145,9 @@ class Prober(Endpoint):
         self._trains = 0
         self._dropped: Counter[Drop] = Counter()
 
-    # -- what comes ----------------------------------------------------------------------------
+    # -- incoming ------------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         try:
             if datagram.peer != self._listener:
                 raise ProtocolError(Drop.ELSEWHERE)
@@ -192,7 +177,6 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        """Keep the arrivals in an answer."""
         # Without keys, an attacker may claim anything: more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
@@ -200,7 +184,7 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.FIELD)
         self._total = max(self._total, answer.logged)
         known = self._logged
-        # the listener's memory was full: the arrivals between were dropped
+        # the listener's memory was full: the arrivals in between were dropped
         if answer.first > known:
             for _ in range(answer.first - known):
                 self._logged_number.append(-1)
@@ -218,10 +202,9 @@ class Prober(Endpoint):
                 probe = self._logged_number[answer.number]
                 self._longest_ns = max(self._longest_ns, now_ns - self._sent_ns[probe])
 
-    # -- what is sent --------------------------------------------------------------------------
+    # -- outgoing -----------------------------------------------------------------------------
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if self._done:
             return
         if self._began_ns is None:
@@ -289,23 +272,20 @@ class Prober(Endpoint):
         self.send(self._link.seal(encode(probe, size)), self._listener)
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         return None if self._done else self._due_ns
 
     @property
     def finished(self) -> bool:
-        """See `Endpoint`."""
         return self._done
 
-    # -- what was measured ---------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------
 
     @property
     def probed_s(self) -> float:
-        """Length of the measurement so far [s]."""
+        """Length of the measurement so far."""
         return self._slot * self._period_ns / SECOND_NS
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "sent": len(self._sent_ns),
             "arrived": self._logged,
@@ -341,7 +321,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers; a lost one was sent when its probe arrived."""
+        """Answers to probes; a lost answer was sent when its probe arrived."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

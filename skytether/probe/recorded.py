@@ -1,12 +1,13 @@
-"""Measurements from files: a log of round trips, or two captures of one UDP flow.
+"""Measurements from files: a log of round-trip times, or two captures of one UDP flow.
 
-A log (`scenario.air.recorded`) knows one clock and one path, which is taken for both ways.
+A log (`scenario.air.recorded`) has one clock and one series of delays, which is used for both
+directions.
 
-Two captures, one at each end, are matched by the payloads of the flow that they share most packets
-of. A payload that was sent twice is left out, because it cannot be told which of the two came. The
-clocks may differ. Of the flow's two directions, the downlink is the one for which the far time less
-the near time is larger: the difference between the two directions is a round trip. A packet is
-lost that only its sender saw, between the first and the last that both saw.
+Two captures, one at each end, are matched by payload, for the flow with most packets in both. A
+payload that was sent twice is left out, because its arrivals are ambiguous. The clocks may differ.
+Of the flow's two directions, the downlink is the one with the larger far time minus near time; the
+difference between the two directions is a round-trip time. A packet is lost if it is in the
+sender's capture only, between the first and the last packets that are in both.
 """
 
 import struct
@@ -22,21 +23,20 @@ from skytether.shared.scenario.air.recorded import CAPTURES, CAPTURES_NEW, Recor
 RECORDS_MAX = 4 * PROBES_MAX
 """Largest number of records in a capture, those of other protocols included."""
 PAYLOAD_BYTES_MIN = 8
-"""Smallest captured payload by which packets are told apart [B]."""
+"""Smallest payload by which packets are matched [B]."""
 TIME_MAX_NS = 2**62
 """Latest time of a packet, which is in 2116 [ns since 1970]."""
 SIZES_MAX = 8
-"""Number of sizes of packets, the most frequent ones, into which longer ones are cut."""
+"""Number of packet sizes, the most frequent ones, into which longer packets are split."""
 UDP = 17
 
 
 def is_capture(content: bytes) -> bool:
-    """Whether a file is a pcap or pcapng file."""
     return content[:4] in {*CAPTURES, CAPTURES_NEW}
 
 
 def of_log(path: RecordedPath) -> MeasuredPath:
-    """Measurement of a recorded path: both ways alike, on one clock."""
+    """Measurement from a log: both ways alike, on one clock."""
     sent_ns = np.rint(path.time_s * SECOND_NS).astype(np.int64)
     delay_ns = np.rint(path.delay_s * SECOND_NS).astype(np.int64)
     came = ~path.lost
@@ -58,20 +58,20 @@ Packets = list[tuple[int, bytes]]
 
 
 def of_captures(near: bytes, far: bytes) -> MeasuredPath:
-    """Measurement of the UDP flow that two captures share.
+    """Measurement of the UDP flow that is in two captures.
 
     Args:
         near: capture at the vehicle's end.
         far: capture at the server's end.
 
     Raises:
-        ValueError: one cannot be read, or they share too little.
+        ValueError: one cannot be read, or they have too few packets in common.
     """
-    here, there = _directions(near), _directions(far)
-    where = {payload: ends for ends, packets in there.items() for _, payload in packets}
+    near_flows, far_flows = _directions(near), _directions(far)
+    where = {payload: ends for ends, packets in far_flows.items() for _, payload in packets}
     shared = Counter(
         (ends, where[payload])
-        for ends, packets in here.items()
+        for ends, packets in near_flows.items()
         for _, payload in packets
         if payload in where
     )
@@ -79,7 +79,7 @@ def of_captures(near: bytes, far: bytes) -> MeasuredPath:
         raise ValueError("no UDP packet is in both captures with its payload")
     ends, far_ends = shared.most_common(1)[0][0]
     flow = [
-        _as_sent(here.get(one, []), there.get(other, []))
+        _as_sent(near_flows.get(one, []), far_flows.get(other, []))
         for one, other in ((ends, far_ends), (ends[::-1], far_ends[::-1]))
     ]
     ahead_ns = [_ahead_ns(*direction) for direction in flow]
@@ -95,28 +95,28 @@ def of_captures(near: bytes, far: bytes) -> MeasuredPath:
 def _as_sent(near: Packets, far: Packets) -> tuple[Packets, Packets]:
     """Packets of a direction in both captures, as they were on the wire.
 
-    Where a kernel cuts packets late (UDP segmentation offload), a capture has several as one.
+    If a kernel splits packets late (UDP segmentation offload), a capture has several as one.
     """
 
-    def cut(packets: Packets, others: Packets) -> Packets:
-        known = {payload for _, payload in others}
-        sizes = [size for size, _ in Counter(map(len, known)).most_common(SIZES_MAX)]
+    def split(packets: Packets, others: Packets) -> Packets:
+        whole = {payload for _, payload in others}
+        sizes = [size for size, _ in Counter(map(len, whole)).most_common(SIZES_MAX)]
         found: Packets = []
         for time_ns, payload in packets:
             pieces = [payload]
-            for size in sizes if payload not in known else []:
+            for size in sizes if payload not in whole else []:
                 parts = [payload[at : at + size] for at in range(0, len(payload), size)]
-                if not known.isdisjoint(parts):
+                if not whole.isdisjoint(parts):
                     pieces = parts
                     break
             found += [(time_ns, piece) for piece in pieces]
         return found
 
-    return cut(near, far), cut(far, near)
+    return split(near, far), split(far, near)
 
 
 def _ahead_ns(near: Packets, far: Packets) -> float:
-    """Far time less near time of the packets of a direction: the median [ns].
+    """Far time minus near time of the packets of a direction: the median.
 
     Raises:
         ValueError: fewer than two packets are in both captures.
@@ -125,8 +125,8 @@ def _ahead_ns(near: Packets, far: Packets) -> float:
     ahead = [times[payload] - time_ns for time_ns, payload in near if payload in times]
     if len(ahead) < 2:
         raise ValueError(
-            "the captures share packets of one direction alone, which cannot tell delays from "
-            "clocks that differ: expected a flow that goes both ways"
+            "the captures share packets of one direction only, which does not separate delays from "
+            "clock offsets: expected a flow that goes both ways"
         )
     return float(np.median(ahead))
 
@@ -135,56 +135,55 @@ def _way(sent: Packets, came: Packets) -> tuple[Way, int]:
     """Packets of a direction, and the number of those that were left out.
 
     Raises:
-        ValueError: too few have a payload of their own, or there are too many.
+        ValueError: too few have a unique payload, or there are too many.
     """
     counts = Counter(payload for _, payload in sent)
     arrivals = defaultdict[bytes, list[int]](list)
     for time_ns, payload in came:
         arrivals[payload].append(time_ns)
-    own = [(time_ns, payload) for time_ns, payload in sent if counts[payload] == 1]
-    both = [place for place, (_, payload) in enumerate(own) if payload in arrivals]
-    if len(both) < 2 or 2 * len(own) < len(sent):
+    unique = [(time_ns, payload) for time_ns, payload in sent if counts[payload] == 1]
+    both = [place for place, (_, payload) in enumerate(unique) if payload in arrivals]
+    if len(both) < 2 or 2 * len(unique) < len(sent):
         raise ValueError(
-            f"of {len(sent)} packets of a direction {len(own)} have a payload of their own: "
+            f"of {len(sent)} packets of a direction {len(unique)} have a unique payload: "
             "expected most; a capture on one interface has each packet once"
         )
-    own = own[both[0] : both[-1] + 1]
-    if len(own) > PROBES_MAX:
-        raise ValueError(f"got {len(own)} packets of a direction, expected at most {PROBES_MAX}")
-    heard = [arrivals.get(payload, []) for _, payload in own]
+    unique = unique[both[0] : both[-1] + 1]
+    if len(unique) > PROBES_MAX:
+        raise ValueError(f"got {len(unique)} packets of a direction, expected at most {PROBES_MAX}")
+    heard = [arrivals.get(payload, []) for _, payload in unique]
     way = Way(
-        np.array([time_ns for time_ns, _ in own], np.int64),
+        np.array([time_ns for time_ns, _ in unique], np.int64),
         np.array([times_ns[0] if times_ns else 0 for times_ns in heard], np.int64),
         np.array([bool(times_ns) for times_ns in heard]),
-        np.full(len(own), -1, np.int64),
+        np.full(len(unique), -1, np.int64),
         sum(max(len(times_ns) - 1, 0) for times_ns in heard),
     )
     return way, len(sent) - sum(counts[payload] == 1 for _, payload in sent)
 
 
 def _directions(content: bytes) -> Mapping[Ends, Packets]:
-    """UDP packets of a capture, by sender and receiver."""
-    found = defaultdict[Ends, Packets](list)
+    flows = defaultdict[Ends, Packets](list)
     for number, (time_ns, link, frame) in enumerate(_records(content)):
         if number >= RECORDS_MAX:
             raise ValueError(f"got a capture of more packets than {RECORDS_MAX}")
         packet = _udp(link, frame)
         if packet is not None:
             ends, payload = packet
-            found[ends].append((time_ns, payload))
-    for packets in found.values():
+            flows[ends].append((time_ns, payload))
+    for packets in flows.values():
         packets.sort(key=lambda packet: packet[0])
-    return found
+    return flows
 
 
 # -- pcap and pcapng ------------------------------------------------------------------------------
 
 Record = tuple[int, int, bytes]
-"""Time [ns], type of the link, and frame."""
+"""Time [ns], link type, and frame."""
 
 
 def _records(content: bytes) -> Iterator[Record]:
-    """Records of a capture; one that is cut at its end ends there."""
+    """Records of a capture; a truncated file ends at its last whole record."""
     return _pcapng(content) if content[:4] == CAPTURES_NEW else _pcap(content)
 
 
@@ -215,22 +214,22 @@ def _pcapng(content: bytes) -> Iterator[Record]:
         block = content[at + 8 : at + size - 4]
         if size < 12 or at + size > len(content):
             return
-        if kind == 1 and len(block) >= 8:  # an interface
+        if kind == 1 and len(block) >= 8:  # interface description
             (link,) = struct.unpack_from(order + "H", block)
             interfaces.append((link, _ticks_per_s(order, block[8:])))
-        elif kind == 6 and len(block) >= 20:  # a packet
-            interface, high, low, kept, _ = struct.unpack_from(order + "IIIII", block)
+        elif kind == 6 and len(block) >= 20:  # enhanced packet
+            interface, high, low, length, _ = struct.unpack_from(order + "IIIII", block)
             if interface < len(interfaces):
                 link, per_s = interfaces[interface]
                 time_ns = ((high << 32) | low) * SECOND_NS // per_s
                 if time_ns > TIME_MAX_NS:
                     raise ValueError(f"got a packet at {time_ns / SECOND_NS:.3g} s since 1970")
-                yield time_ns, link, block[20 : 20 + kept]
+                yield time_ns, link, block[20 : 20 + length]
         at += size
 
 
 def _ticks_per_s(order: str, options: bytes) -> int:
-    """Unit of an interface's times, as its option if_tsresol has it [1/s]."""
+    """Time resolution of an interface, from its option if_tsresol [1/s]."""
     at = 0
     while at + 4 < len(options):
         code, size = struct.unpack_from(order + "HH", options, at)
@@ -247,7 +246,7 @@ _VLANS = (b"\x81\x00", b"\x88\xa8")
 
 
 def _udp(link: int, frame: bytes) -> tuple[Ends, bytes] | None:
-    """Ends and payload of a UDP packet in a frame; None of anything else, and of fragments."""
+    """Ends and payload of a UDP packet in a frame; None for anything else, and for fragments."""
     at = _LINKS.get(link)
     if at is None:
         return None

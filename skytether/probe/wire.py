@@ -3,15 +3,15 @@
     [version, type, ...]
 
 | type | message | sent by  | fields                                              |
-|------|---------|----------|-----------------------------------------------------|
-| 1    | HELLO   | prober   | nonce, padding                                      |
-| 2    | WELCOME | listener | nonce, cookie, room                                 |
-| 3    | PROBE   | prober   | session, number, train, held, padding               |
-| 4    | ANSWER  | listener | session, number, sent_ns, first, logged, arrivals,  |
-|      |         |          | padding                                             |
+|------|---------|----------|-----------------------------------------------------| | 1    | HELLO
+| prober   | nonce, padding                                      | | 2    | WELCOME | listener |
+nonce, cookie, room                                 | | 3    | PROBE   | prober   | session, number,
+train, held, padding               | | 4    | ANSWER  | listener | session, number, sent_ns, first,
+logged, arrivals,  | |      |         |          | padding
+|
 
 HELLO and WELCOME have the types that a handshake of `shared.wire.handshake` may carry. The session
-is nonce and cookie together. A PROBE is as long as is asked for, and its ANSWER no longer.
+is nonce and cookie together. A PROBE is padded to the requested size, and its ANSWER is no longer.
 """
 
 from struct import Struct
@@ -23,18 +23,16 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
-"""Protocol version; endpoints of a flight reject it, so that none takes a probe for its own."""
+"""Protocol version; endpoints of a flight reject it, so that none accepts a probe."""
 NONCE_BYTES = COOKIE_BYTES = 8
 SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
 MESSAGE_BYTES_MIN = 96
-"""Smallest size of a PROBE [B]: its ANSWER then has room for two arrivals."""
+"""Smallest size of a PROBE [B]: its ANSWER then has space for two arrivals."""
 TRAIN_MAX = 64
-"""Most packets of a train."""
 NO_NUMBER = 2**32 - 1
 """Number in a PROBE that only asks for arrivals, and in its ANSWER."""
 
 _ARRIVAL = Struct("<IQ")
-"""Arrival: number of the PROBE, and the listener's time [ns]."""
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
 
 
@@ -48,10 +46,9 @@ class ProbeWelcome(NamedTuple):
     """WELCOME: the listener grants or refuses a session."""
 
     nonce: bytes
-    """Nonce of the HELLO that is answered."""
     cookie: bytes
     room: bool
-    """Whether the listener has room for another session."""
+    """Whether the listener grants the session."""
 
 
 class Probe(NamedTuple):
@@ -63,7 +60,7 @@ class Probe(NamedTuple):
     train: int
     """Number of packets of its train; 0 for a packet sent alone."""
     held: int
-    """Number of arrivals that the prober has received reports of."""
+    """Number of arrivals of which the prober has received reports."""
 
 
 class ProbeAnswer(NamedTuple):
@@ -73,7 +70,7 @@ class ProbeAnswer(NamedTuple):
     number: int
     """Number of the arrival that is answered, from 0; or NO_NUMBER."""
     sent_ns: int
-    """Time of sending, on the listener's clock [ns]."""
+    """Time of sending, on the listener's clock."""
     first: int
     """Number of the first reported arrival."""
     logged: int
@@ -95,15 +92,15 @@ def encode(message: Message, size: int = 0) -> bytes:
     """
     fields: tuple[Any, ...] = message
     if isinstance(message, ProbeAnswer):
-        room = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
-        told = message.arrivals[: max(0, room // _ARRIVAL.size)]
-        fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in told)
+        free_bytes = size - len(_packed(ProbeAnswer, (*message[:-1], b""), b"")) - 1
+        arrivals = message.arrivals[: max(0, free_bytes // _ARRIVAL.size)]
+        fields = *message[:-1], b"".join(_ARRIVAL.pack(*each) for each in arrivals)
     if isinstance(message, ProbeWelcome):
         return msgpack.packb((VERSION, 2, *message))
     bare = _packed(type(message), fields, b"")
-    room = size - len(bare)
+    free_bytes = size - len(bare)
     # The msgpack header of more than 255 padding bytes is one byte longer.
-    return _packed(type(message), fields, _PADDING[: max(0, room - (room > 255))])
+    return _packed(type(message), fields, _PADDING[: max(0, free_bytes - (free_bytes > 255))])
 
 
 def _packed(kind: type[Message], fields: tuple[Any, ...], padding: bytes) -> bytes:
@@ -163,7 +160,7 @@ def _check(session: bytes, numbers: tuple[int, ...]) -> None:
     """Refuse a session id of wrong length, and numbers out of range.
 
     Raises:
-        ProtocolError: with the field.
+        ProtocolError: names the field.
     """
     wrong = any(isinstance(each, bool) or not 0 <= each <= NO_NUMBER for each in numbers)
     if wrong or len(session) != SESSION_BYTES:

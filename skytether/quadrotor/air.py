@@ -1,10 +1,10 @@
-"""The air around a quadrotor: steady wind, and turbulence by Dryden's model, compiled.
+"""Air around a quadrotor: steady wind, and turbulence by Dryden's model, compiled.
 
     u: σ √(2T) / (1 + T s)      v, w: σ √T (1 + √3 T s) / (1 + T s)²      T = L / V
 
 Filters of white noise give the velocity of the air along the wind (u), across (v) and upwards (w).
-V is the speed with which the air carries its eddies past: the wind's, 6 m above ground. Lengths L
-and strengths σ at low height are those of MIL-F-8785C:
+V is the speed at which the air carries its eddies past the vehicle: that of the wind 6 m above
+ground. Lengths L and strengths σ at low height are those of MIL-F-8785C:
 
     σ_w = 0.1 V      σ_u = σ_v = σ_w / c^0.4      L_w = h      L_u = L_v = h / c^1.2
     c = 0.177 + 0.000823 h                        h: height [ft], 10 to 1000
@@ -18,30 +18,25 @@ from skytether.quadrotor.body import STEP_S
 from skytether.shared.base.kernel import F1, part
 
 FOOT_M = 0.3048
-"""A foot [m]."""
 ROOT_3 = 1.7320508075688772
-"""√3."""
 
 
 class Air(NamedTuple):
-    """Wind, and the state of its gust filters."""
-
     steady: F1
     """Velocity of the steady wind [m/s; north, east, down]; shape (3,)."""
     turbulence: F1
-    """Wind speed 6 m above ground that the gusts correspond to [m/s]; 0 for no gusts; shape
-    (1,)."""
+    """Wind speed 6 m above ground that determines the gusts [m/s]; 0 for no gusts; shape (1,)."""
     gust: F1
     """States of the gust filters: one for u, two for v, two for w [m/s]; shape (5,)."""
 
 
 @part
 def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
-    """Velocity of the air over the next step.
+    """Compute the velocity of the air over the next step.
 
     Args:
         drawn: standard normal numbers; shape (3,).
-        height: altitude, above ground at 0 [m].
+        height: altitude above ground [m].
         out: velocity [m/s; north, east, down]; shape (3,).
     """
     for axis in range(3):

@@ -14,12 +14,12 @@ from skytether.quadrotor.frames import GRAVITY, Frame
 from skytether.shared.base.kernel import F1, making_kernel, making_part
 
 STATES = 17
-"""Number of states: position (0 to 2), velocity (3 to 5), quaternion (6 to 9, w first), rates
-(10 to 12) and rotors' speeds (13 to 16)."""
+"""Number of states: position (0 to 2), velocity (3 to 5), quaternion (6 to 9, w first), rates (10
+to 12) and rotor speeds (13 to 16).
+"""
 STEP_NS = 2_000_000
-"""Length of a step of the body and of its loops [ns]."""
+"""Step of the body and of its loops [ns]."""
 STEP_S = 0.002
-"""Length of a step [s]."""
 
 
 class Signs(NamedTuple):
@@ -61,10 +61,8 @@ def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
     """Time derivative of the states, by the module's equations; shape (STATES,).
 
     Args:
-        x: states.
         command: commanded rotor speeds ω* [rad/s]; shape (4,).
         wind: velocity of the air [m/s; north, east, down]; shape (3,).
-        out: derivative.
     """
     q, rates = x[6:10], x[10:13]
     air, force, pushed = np.empty(3), np.zeros(3), np.empty(3)
@@ -107,7 +105,7 @@ def derivative(frame: Frame, x: F1, command: F1, wind: F1, out: F1) -> None:
 
 @making_part
 def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
-    """Advance the states by one step with a fourth-order Runge-Kutta method."""
+    """Advance the states by one step of the fourth-order Runge-Kutta method."""
     slopes, between = np.empty((4, STATES)), np.empty(STATES)
     derivative(frame, x, command, wind, slopes[0])
     for stage in range(1, 4):

@@ -10,12 +10,9 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """Quadrotor in X configuration; rotors 1 front right, 2 back left, 3 front left, 4 back
-    right.
-    """
+    """Quadrotor in X configuration: rotors front right, back left, front left, back right."""
 
     mass_kg: float
-    """Mass [kg]."""
     roll_inertia: float
     """Moment of inertia about the forward axis [kg m²]."""
     pitch_inertia: float
@@ -37,13 +34,10 @@ class Frame(NamedTuple):
     body_drag: float
     """Drag c of the body over its airspeed squared [N s²/m²]."""
     rotor_lag_s: float
-    """Time constant of a rotor's speed [s]."""
     rotor_max: float
     """Largest speed of a rotor with a full battery [rad/s]."""
     cells: int
-    """Number of cells of the battery, in series."""
     capacity_ah: float
-    """Capacity of the battery [A h]."""
     resistance_ohm: float
     """Internal resistance of the battery [Ω]."""
     hover_a: float
@@ -53,8 +47,7 @@ class Frame(NamedTuple):
     rate_gain: float
     """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Gain on measured angular acceleration, subtracted from the command: it shortens the rotors'
-    lag."""
+    """Gain on measured angular acceleration, subtracted to reduce the rotors' lag."""
 
     @property
     def hover(self) -> float:
@@ -63,7 +56,7 @@ class Frame(NamedTuple):
 
 
 GRAVITY = 9.81
-"""Acceleration of gravity [m/s²]."""
+"""Gravitational acceleration [m/s²]."""
 
 CRAZYFLIE = Frame(
     mass_kg=0.03,
@@ -116,9 +109,11 @@ KG15 = Frame(
     rate_damping=1.0,
 )
 """3DR Iris, 1.5 kg: body, rotors and drag as in PX4's model for Gazebo (`models/iris/iris.sdf`).
+
 Means are used where that model has two values: rotors 0.22 m (front) and 0.20 m (back) to the side,
 lags of 0.0125 s upwards and 0.025 s downwards. Battery: the Iris' 5.1 Ah in three cells, for 16 to
-22 minutes; the resistance is assumed, typical of a battery of that size."""
+22 minutes; the resistance is assumed, typical of a battery of that size.
+"""
 
 SIH = Frame(
     mass_kg=1.0,
@@ -143,8 +138,9 @@ SIH = Frame(
     rate_damping=3.0,
 )
 """PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors of 1000 rad/s as in rotorpy.
-Its drag of 1 N for each m/s is applied here as rotor drag in hover. It has no battery: that of the
-1.5 kg frame is used."""
+
+Its drag of 1 N for each m/s is applied here as rotor drag in hover. It has no battery; that of the
+1.5 kg frame is used.
+"""
 
 FRAMES = {"crazyflie": CRAZYFLIE, "1.5kg": KG15, "sih": SIH}
-"""Frames by name."""

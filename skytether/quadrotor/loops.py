@@ -1,11 +1,11 @@
 """Control loops of a quadrotor, compiled: from a velocity command to rotor speeds.
 
-    velocity      v* follows the target within limits of jerk and acceleration, where there are any;
+    velocity      v* follows the target within limits of jerk and acceleration, if there are any;
                   e = v* - v + K ∫(v* - v) dt      a = a* + P e + I ∫e dt + D (a* - v̇)
-    attitude      thrust along a - g; the error of the attitude asks for rates
-    rates         the error of the rates asks for torques
-    rotors        forces of the rotors that make thrust and torques, none below 0 or above what the
-                  battery gives
+    attitude      thrust along a - g; attitude error → commanded rates
+    rates         rate error → commanded torques
+    rotors        rotor forces with that thrust and those torques, from 0 to the largest that the
+                  battery's voltage allows
 
 The limits follow ArduPilot's input shaping: the acceleration tracks p (v - v*), or its square root
 for large errors, with p = jerk / acceleration.
@@ -33,7 +33,7 @@ class Gains(NamedTuple):
     acceleration_up: float
     """Largest vertical acceleration of the shaped velocity [m/s²]."""
     catch_up: float
-    """Gain K from the distance by which the shaped motion is ahead to velocity [1/s]."""
+    """Gain K from the position error of the shaped motion to velocity [1/s]."""
     p: float
     """Gain from horizontal velocity error to acceleration [1/s]."""
     i: float
@@ -47,7 +47,6 @@ class Gains(NamedTuple):
     integral_max: float
     """Largest acceleration from an integral [m/s²]."""
     tilt_max: float
-    """Largest tilt [rad]."""
 
 
 ARDUPILOT = Gains(
@@ -104,13 +103,14 @@ CRAZYFLIE = Gains(
 Crazyflie. Its integrals do not reach their limits; 5 m/s² is assumed here."""
 
 AHEAD_MAX_M = 2.0
-"""Largest distance that K acts on [m]."""
+"""Largest position error that K acts on [m]."""
 CELL_V = (0.0, 3.3, 3.6, 3.68, 3.75, 3.82, 3.95, 4.2)
 CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Voltage of a cell of lithium polymer at rest [V], over its charge; typical, of no cell in
-particular. The first entry extends the curve below charge 0."""
+"""Open-circuit voltage of a lithium polymer cell over its charge [V]; typical, not measured. The
+first entry extends the curve below charge 0.
+"""
 CELL_FULL_V = 4.2
-"""Voltage of a full cell [V]."""
+"""Voltage of a full cell at rest."""
 
 
 class Quad(NamedTuple):
@@ -119,8 +119,9 @@ class Quad(NamedTuple):
     x: F1
     """States of the body, see `body.STATES`; shape (17,)."""
     wanted: F1
-    """Shaped velocity v* (0 to 2), its acceleration a* (3 to 5), and the distance by which it is
-    ahead of the quadrotor (6 to 8) [north, east, down]; shape (9,)."""
+    """Shaped velocity v* (0 to 2), its acceleration a* (3 to 5), and the position error of the
+    shaped motion, ∫(v* - v) dt (6 to 8) [north, east, down]; shape (9,).
+    """
     integral: F1
     """Integral terms of the acceleration command [m/s²]; shape (3,)."""
     acceleration: F1
@@ -133,7 +134,6 @@ class Quad(NamedTuple):
 
 @inline
 def clipped(value: float, most: float) -> float:
-    """Value clipped to -most … most."""
     return min(max(value, -most), most)
 
 
@@ -232,8 +232,8 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     errors = np.array([-roll, -pitch, -yaw])
     inertia = np.array([frame.roll_inertia, frame.pitch_inertia, frame.yaw_inertia])
     for i in range(3):
-        asked = frame.attitude_gain * errors[i] * (0.4 if i == 2 else 1.0)
-        turning = frame.rate_gain * (asked - rates[i]) - frame.rate_damping * quad.turning[i]
+        rate = frame.attitude_gain * errors[i] * (0.4 if i == 2 else 1.0)
+        turning = frame.rate_gain * (rate - rates[i]) - frame.rate_damping * quad.turning[i]
         torque[i] = inertia[i] * turning
     return frame.mass_kg * max(thrust, 0.0)
 
@@ -242,8 +242,8 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
 def mix(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
     """Rotor speeds that produce a thrust and torques, within the rotors' limits.
 
-    If a rotor would saturate, all rotors push less: torques have priority over thrust, and roll and
-    pitch over yaw.
+    If a rotor would saturate, the thrust of all rotors is lowered: torques have priority over
+    thrust, and roll and pitch over yaw.
     """
     most = frame.thrust * rotor_max * rotor_max
     yaw = clipped(0.25 * torque[2] * frame.thrust / frame.torque, 0.15 * most)
@@ -301,7 +301,6 @@ def fly(
     """Fly some steps with a velocity command.
 
     Args:
-        air: wind, and state of the gusts.
         drawn: random numbers of the gusts, one row per step; shape (steps, 3).
         target: commanded velocity [m/s; north, east, down]; shape (3,).
         ground: height of the ground, positive downwards [m].

@@ -20,12 +20,10 @@ UP = np.array([1.0, 1.0, -1.0])
 
 
 class Attitude(NamedTuple):
-    """Attitude and rates of the body."""
-
     roll: float
-    """Roll, to the right [rad]."""
+    """To the right [rad]."""
     pitch: float
-    """Pitch, nose up [rad]."""
+    """Nose up [rad]."""
     yaw: float
     """Heading, from north to east [rad]."""
     rates: tuple[float, float, float]
@@ -33,26 +31,22 @@ class Attitude(NamedTuple):
 
 
 class Battery(NamedTuple):
-    """State of the battery."""
-
     charge: float
-    """Remaining charge, from 1 to 0."""
+    """From 1 to 0."""
     voltage: float
-    """Voltage [V]."""
+    """Unit: V."""
     current: float
-    """Current [A]."""
+    """Unit: A."""
 
 
 class Quadrotor:
     """Quadrotor and the air around it.
 
     Args:
-        frame: physical parameters.
-        gains: gains of its autopilot's velocity loop.
-        rng: random generator of its gusts, for this vehicle alone.
+        rng: random generator of its gusts, for this vehicle only.
         position: initial position, at rest [m]; shape (3,).
-        ground_m: altitude of the ground [m]; None for no ground.
-        charge: charge of its battery, from 0 to 1; endless if it never discharges.
+        ground_m: altitude of the ground; None for no ground.
+        charge: charge of its battery, from 0 to 1; infinite for a battery that never discharges.
         hovers: whether it begins in hover, with rotors turning.
     """
 
@@ -71,10 +65,8 @@ class Quadrotor:
             frame, charge = frame._replace(capacity_ah=np.inf), 1.0
         self.frame, self._rng = frame, rng
         self.gains = gains
-        """Gains of its autopilot's velocity loop."""
         self._ground = np.inf if ground_m is None else -ground_m
         self.on = hovers
-        """Whether the rotors turn."""
         x = np.zeros(STATES)
         x[:3], x[6] = UP * position, 1.0
         x[13:] = frame.hover if hovers else 0.0
@@ -91,7 +83,7 @@ class Quadrotor:
 
         Args:
             steady_mps: velocity of steady wind along the first axes [m/s; x, y, z].
-            turbulence_mps: wind speed 6 m above ground that the gusts correspond to [m/s].
+            turbulence_mps: wind speed 6 m above ground that determines the gusts [m/s].
         """
         steady = np.zeros(3)
         steady[: len(steady_mps)] = steady_mps
@@ -103,7 +95,6 @@ class Quadrotor:
 
         Args:
             velocity: commanded velocity [m/s]; shape (3,).
-            duration_ns: time [ns].
         """
         steps, self._rest_ns = divmod(self._rest_ns + duration_ns, STEP_NS)
         if not steps:
@@ -114,11 +105,11 @@ class Quadrotor:
         fly(self.frame, self.gains, self._quad, self._air, drawn, target, self._ground, self.on)
 
     def position(self) -> Array:
-        """Position [m]; shape (3,)."""
+        """Shape (3,) [m]."""
         return UP * self._quad.x[:3]
 
     def velocity(self) -> Array:
-        """Velocity [m/s]; shape (3,)."""
+        """Shape (3,) [m/s]."""
         return UP * self._quad.x[3:6]
 
     def wanted_position(self) -> Array:
@@ -131,7 +122,6 @@ class Quadrotor:
         return wanted
 
     def attitude(self) -> Attitude:
-        """Attitude and rates."""
         w, x, y, z = self._quad.x[6:10].tolist()
         p, q, r = self._quad.x[10:13].tolist()
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -140,14 +130,11 @@ class Quadrotor:
         return Attitude(float(roll), float(pitch), float(yaw), (p, q, r))
 
     def battery(self) -> Battery:
-        """State of the battery."""
         charge, voltage, current = self._quad.battery.tolist()
         return Battery(max(charge, 0.0), voltage, current)
 
     def discharge(self, charge: float) -> None:
-        """Set the battery's charge to a lower value."""
         self._quad.battery[0] = min(self._quad.battery[0], charge)
 
     def stands(self) -> bool:
-        """Whether the quadrotor stands on the ground."""
         return bool(self._quad.x[2] >= self._ground)

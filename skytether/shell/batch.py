@@ -1,13 +1,12 @@
 """Batches of datagrams: one system call receives or sends many of them, on Linux.
 
-`recvmmsg` and `sendmmsg` take an array of message headers, which this module lays out once in
-memory that stays where it is. With each datagram `recvmmsg` can hand over the time at which the
-kernel received it: a datagram that is read late then does not count as delayed. A third way,
-UDP segmentation offload, sends datagrams of one size to one peer as a single long one, which the
-kernel cuts up as late as it can.
+`recvmmsg` and `sendmmsg` take an array of message headers, which is allocated once. `recvmmsg` also
+returns the kernel's arrival time of each datagram, so that one that is read late does not count as
+delayed. UDP segmentation offload sends datagrams of one size to one peer as one long datagram,
+which the kernel splits late.
 
-None of these calls says which datagram failed, or why. If one sends or receives fewer than asked,
-the caller tries the first remaining datagram by the socket's plain call, which raises its error.
+None of these calls says which datagram failed, or why. If a call sends or receives fewer than
+asked, the caller tries the next datagram by the socket's plain call, which raises its error.
 """
 
 import contextlib
@@ -26,27 +25,26 @@ from typing import Any
 from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
-"""Most datagrams in one call."""
 NEAR_NS, READINGS = 5_000, 4
-"""Largest time from one reading of a clock to the next for the two to count as simultaneous [ns],
-and number of attempts."""
+"""Longest time between two readings that count as simultaneous [ns], and number of attempts."""
 SIZE_MAX = 2048
-"""Largest payload that `DatagramBatch.send` takes [B]: packets of a flight have at most 1200."""
+"""Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
-"""Most datagrams that are sent as one; older kernels take no more."""
+"""Most datagrams sent as one; older kernels refuse more."""
 SEGMENTED_BYTES_MAX = 65_000
-"""Largest payload of all datagrams that are sent as one [B]; IP allows a little more."""
+"""Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
-"""Largest payload of a datagram that is sent with another one as one [B]."""
+"""Largest payload of a datagram that is sent together with another as one [B]."""
 
 _STRIDE = 65_536 + 4096 + 64
-"""Distance of two datagrams that are received [B]: room for the longest, and an odd number of cache
-lines, so that their first bytes do not all compete for the same lines."""
+"""Distance of two receive buffers [B]: the longest datagram, and an odd number of cache lines, so
+that the datagrams' first bytes do not all map to the same cache set.
+"""
 _STARTS = range(0, _STRIDE * BATCH_MAX, _STRIDE)
 _SOL_UDP, _UDP_SEGMENT = 17, 103
 _HEADER = struct.Struct("@QI4xQQQQi4xI4x")
 """Layout of `struct mmsghdr`: address of the name and its size, address and number of the buffers,
-address and size of control data, flags, size of what was received or sent."""
+address and size of control data, flags, size of the payload received or sent."""
 _BUFFER = struct.Struct("@QQ")
 """Layout of `struct iovec`: address of a buffer and its size."""
 _MSG_DONTWAIT = 0x40
@@ -56,17 +54,18 @@ _STAMP = struct.Struct("@Qiiqq")
 _IPV4, _IPV6 = struct.Struct("=HH4s8x"), struct.Struct("=HHI16sI")
 """Layouts of `struct sockaddr_in` and `sockaddr_in6`; ports are in network order."""
 _WHOLE = memoryview(array("Q", [_STAMP.size] * BATCH_MAX))
-"""Room for control data, for each datagram [B]."""
+"""Size of the space for control data, for each datagram [B]."""
 
 RawAddress = bytes
 """Address of a peer in the kernel's own form, `struct sockaddr_in` or `sockaddr_in6`."""
 
 
 def pack_address(address: tuple[str, int] | tuple[str, int, int, int]) -> RawAddress:
-    """Numeric address in the kernel's own form.
+    """Address in the kernel's form.
 
     Args:
-        address: of two values for IPv4, or for IPv6 without a scope, and else of four.
+        address: (host, port) for IPv4, and for IPv6 without a scope; else (host, port, flow,
+            scope).
 
     Raises:
         OSError: the host is no numeric address.
@@ -83,7 +82,6 @@ def pack_address(address: tuple[str, int] | tuple[str, int, int, int]) -> RawAdd
 
 
 def unpack_address(raw: RawAddress) -> tuple[str, int] | tuple[str, int, int, int]:
-    """Address as `socket.recvfrom` returns it."""
     if len(raw) == _IPV4.size:
         _, port, number = _IPV4.unpack(raw)
         return socket.inet_ntop(socket.AF_INET, number), socket.ntohs(port)
@@ -93,7 +91,7 @@ def unpack_address(raw: RawAddress) -> tuple[str, int] | tuple[str, int, int, in
 
 
 class _Headers:
-    """Array of `struct mmsghdr`, each with one buffer and one name.
+    """Array of `struct mmsghdr`, each with one buffer and one address.
 
     Args:
         stride: distance of two buffers [B].
@@ -102,16 +100,16 @@ class _Headers:
     """
 
     def __init__(self, stride: int, size: int, name_bytes: int) -> None:
-        # Pages that were never written to take no memory: a process that receives one datagram at
-        # a time takes one page and not 9 MB, which a bytearray would, or a huge page.
-        room = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        # An anonymous mapping takes memory only for pages that were written to: a process that
+        # receives one datagram at a time uses one page. A bytearray or huge pages would take 9 MB.
+        memory = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with contextlib.suppress(OSError):  # a kernel without huge pages
-            room.madvise(mmap.MADV_NOHUGEPAGE)
-        self.room = memoryview(room)
+            memory.madvise(mmap.MADV_NOHUGEPAGE)
+        self.room = memoryview(memory)
         self.names = bytearray(name_bytes * BATCH_MAX)
         buffers, headers = bytearray(_BUFFER.size * BATCH_MAX), bytearray(_HEADER.size * BATCH_MAX)
         stamps = bytearray(_STAMP.size * BATCH_MAX)
-        parts = room, self.names, buffers, stamps
+        parts = memory, self.names, buffers, stamps
         at, names_at, buffers_at, stamps_at = (_address(each) for each in parts)
         for i in range(BATCH_MAX):
             _BUFFER.pack_into(buffers, i * _BUFFER.size, at + i * stride, size)
@@ -120,29 +118,24 @@ class _Headers:
             row = name, name_bytes, buffer, 1, stamp, 0, 0, 0
             _HEADER.pack_into(headers, i * _HEADER.size, *row)
         self.first = ctypes.c_void_p(_address(headers))
-        """Address of the array."""
         self.sizes = memoryview(buffers).cast("Q")[1::2]
-        """Sizes of the buffers [B]; shape (BATCH_MAX,)."""
+        """Shape (BATCH_MAX,) [B]."""
         self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
-        """Sizes of what was received [B]; shape (BATCH_MAX,)."""
+        """Sizes of received payloads; shape (BATCH_MAX,) [B]."""
         self.stamp_sizes = memoryview(headers).cast("Q")[5 :: _HEADER.size // 8]
-        """Sizes of the control data, which the kernel shortens to what there is [B]."""
+        """Sizes of the control data [B]; the kernel lowers each to the size that it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
-        """Times of arrival of the clock that tells the time of day: seconds, and nanoseconds beyond
-        them; each of shape (BATCH_MAX,)."""
+        """Arrival times by CLOCK_REALTIME: seconds, and the rest [ns]; shape (BATCH_MAX,)."""
 
 
 def _address(room: bytearray | mmap.mmap) -> int:
-    """Address of memory, which cannot be moved any more."""
+    """Address of memory; a bytearray can no longer be resized after this."""
     return ctypes.addressof(ctypes.c_char.from_buffer(room))
 
 
 class DatagramBatch:
     """Preallocated arrays with which all sockets of one family receive and send.
-
-    Args:
-        family: AF_INET or AF_INET6.
 
     Raises:
         OSError: this system has no such calls.
@@ -151,8 +144,8 @@ class DatagramBatch:
     def __init__(self, family: int) -> None:
         if sys.platform != "linux" or _HEADER.size != 64:
             raise OSError(errno.ENOSYS, "recvmmsg and sendmmsg are used on 64-bit Linux alone")
-        # The interpreter's lock is kept: neither call ever waits, and a thread that took the lock
-        # meanwhile would keep it for 5 ms.
+        # `PyDLL` keeps the interpreter's lock: neither call ever waits, and another thread that
+        # took the lock could hold it for 5 ms.
         libc = ctypes.PyDLL(None)
         try:
             self._receive, self._send = libc.recvmmsg, libc.sendmmsg
@@ -175,13 +168,16 @@ class DatagramBatch:
         """Payloads and senders of the datagrams that have arrived, at most BATCH_MAX.
 
         Args:
-            sock: socket of this family, see `stamp`.
+            sock: socket of this family, prepared by `stamp`.
 
         Returns:
-            payloads, senders, and when each has arrived [ns; CLOCK_MONOTONIC], in the order of
-            arrival; none if nothing came, or an error did. Times are computed from the kernel's
-            stamps, which show the time of day and so jump when that clock is set; a datagram
-            without a stamp gets the present time.
+            payloads, senders, and arrival times [ns; CLOCK_MONOTONIC], in the order of arrival; all
+            empty
+            if there was no datagram, or an error. Arrival times are converted from the kernel's
+            time of
+            day, so they are wrong by the step when that clock is set; a datagram without one gets
+            the
+            present time.
         """
         rows, size = self._in, self._name_bytes
         rows.stamp_sizes[:] = _WHOLE
@@ -189,10 +185,10 @@ class DatagramBatch:
         ahead_ns, now_ns = _clocks()
         if count <= 0:
             return [], [], []
-        room, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
+        memory, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
         lengths = rows.done[:count].tolist()
         payloads = [
-            room[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
+            memory[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
         ]
         columns = rows.stamp_sizes, rows.stamps_s, rows.stamps_ns
         times = zip(*(column[:count].tolist() for column in columns), strict=True)
@@ -202,20 +198,21 @@ class DatagramBatch:
     def send(
         self, sock: socket.socket, payloads: Sequence[bytes], peers: Sequence[RawAddress]
     ) -> int:
-        """Send datagrams in their order; returns how many went, from the first on.
+        """Send datagrams in order; returns how many were sent, from the first on.
+
+        Nothing is sent if a payload is longer than SIZE_MAX, or a peer of another family.
 
         Args:
-            sock: socket of this family.
-            payloads: at most BATCH_MAX; none goes where one is longer than SIZE_MAX.
-            peers: address of each; none goes where one is of another family.
+            payloads: at most BATCH_MAX.
+            peers: address of each payload's receiver.
         """
         rows, count, at, name_bytes = self._out, len(payloads), 0, self._name_bytes
         if max(map(len, payloads)) > SIZE_MAX or any(len(peer) != name_bytes for peer in peers):
             return 0
-        room, sizes = rows.room, rows.sizes
+        memory, sizes = rows.room, rows.sizes
         for i, payload in enumerate(payloads):
             size = sizes[i] = len(payload)
-            room[at : at + size] = payload
+            memory[at : at + size] = payload
             at += SIZE_MAX
         rows.names[: count * name_bytes] = b"".join(peers)
         return max(0, self._send(sock.fileno(), rows.first, count, _MSG_DONTWAIT))
@@ -226,11 +223,12 @@ class Segments:
 
     def __init__(self) -> None:
         self.size_max = SEGMENT_BYTES_MAX if sys.platform == "linux" else 0
-        """Largest payload of one datagram for which it is tried [B]. The kernel refuses what is
-        longer than the path's MTU, and old kernels refuse all; neither is tried again."""
+        """Largest payload for which segmentation is tried [B]; lowered when the kernel refuses a
+        size, because it exceeds the path's MTU, and to 0 when the kernel has no segmentation.
+        """
 
     def suits(self, payloads: Sequence[bytes]) -> bool:
-        """Whether payloads in this order are sent in fewer calls, and may be."""
+        """Whether segmentation sends payloads, in this order, in fewer calls."""
         sizes = list(map(len, payloads))
         if not 0 < min(sizes) <= max(sizes) <= self.size_max:
             return False
@@ -239,18 +237,17 @@ class Segments:
         return 2 * (changes + 1) <= len(sizes)
 
     def send(self, sock: socket.socket, payloads: Sequence[bytes], peer: tuple[Any, ...]) -> int:
-        """Send datagrams in their order; returns how many went, from the first on.
+        """Send datagrams in order; returns how many were sent, from the first on.
 
         Args:
-            sock: socket to send from.
-            payloads: payloads that suit.
-            peer: their receiver, as the kernel takes it.
+            payloads: payloads for which `suits` is true.
+            peer: their receiver, as `socket.sendmsg` takes it.
         """
         first, count = 0, len(payloads)
         while first < count:
             size, last = len(payloads[first]), first + 1
             most = min(count, first + min(SEGMENTS_MAX, SEGMENTED_BYTES_MAX // size))
-            # Mostly all are of one size.
+            # All payloads usually have one size.
             if len(set(map(len, payloads[first:most]))) == 1:
                 last = most
             while last < most and len(payloads[last]) == size:
@@ -259,7 +256,7 @@ class Segments:
             try:
                 sock.sendmsg(payloads[first:last], control, 0, peer)
             except BlockingIOError:
-                break  # no room for all of them; perhaps there is some for one
+                break  # the send buffer cannot take all of them, but perhaps one
             except OSError:
                 self.size_max = min(self.size_max, size - 1)
                 break
@@ -268,10 +265,10 @@ class Segments:
 
 
 def _clocks() -> tuple[int, int]:
-    """Lead of the time of day over CLOCK_MONOTONIC, and the time of that clock [ns].
+    """Lead of CLOCK_REALTIME over CLOCK_MONOTONIC, and the time of the latter [ns].
 
-    A process may lose its core between the two clocks: on a busy machine that moved stamps by 20
-    ms. So they are read again unless they were read within NEAR_NS of each other.
+    The process may lose its core between the two readings: on a busy machine that moved arrival
+    times by 20 ms. So both clocks are read again unless the readings lie within NEAR_NS.
     """
     nearest: tuple[int, int, int] | None = None
     for _ in range(READINGS):

@@ -1,7 +1,7 @@
-"""Common parts of all commands, from arguments to the one line that reports an error.
+"""Parts that all commands share, from parsing arguments to the one line that reports an error.
 
-A command's options are a dataclass with a field `scenario` for the name and a field `config` for
-the scenario itself, whose every key is a flag: the file comes first, flags lie over it.
+A command's options are a dataclass with a field `scenario` for the scenario's name and a field
+`config` for the scenario itself. Every key of the scenario is a flag; flags override the file.
 """
 
 import os
@@ -42,7 +42,6 @@ from skytether.shell.udp import (
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
 """Exit codes: 2 the request is impossible, 1 something failed on the way, 130 ended by Ctrl-C."""
 OUTPUTS = ("json", "figure", "record")
-"""Options that name an output file, in any command."""
 
 ScenarioName = Annotated[str, Argument(metavar="SCENARIO", positional=True)]
 ScenarioFlags = Annotated[Scenario, Argument(name="")]
@@ -51,7 +50,7 @@ Plugins = Annotated[
     Argument(
         metavar="FILE",
         append=True,
-        help="Python file with triggers or references of one's own; may come several times. See "
+        help="Python file with triggers or references of your own; may be repeated. See "
         "`skytether triggers` and `skytether references`.",
     ),
 ]
@@ -59,8 +58,6 @@ Plugins = Annotated[
 
 @dataclass(frozen=True)
 class ScenarioOptions:
-    """Options of a command that flies a scenario."""
-
     scenario: ScenarioName = "demo"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     plugin: Plugins = ()
@@ -68,7 +65,7 @@ class ScenarioOptions:
 
 
 class CommandError(Exception):
-    """Error that ends a command: one line for the user, and the exit code."""
+    """Error that ends a command: a message of one line, and the exit code."""
 
     def __init__(self, message: str, code: int = RUN) -> None:
         super().__init__(message)
@@ -76,15 +73,11 @@ class CommandError(Exception):
 
 
 class Options(Protocol):
-    """Options of a command that is about a scenario."""
+    @property
+    def scenario(self) -> str: ...
 
     @property
-    def scenario(self) -> str:
-        """Name or file of the scenario."""
-
-    @property
-    def config(self) -> Scenario:
-        """The scenario."""
+    def config(self) -> Scenario: ...
 
 
 T = TypeVar("T")
@@ -100,28 +93,24 @@ def parse(
     leads: bool = True,
     is_final: bool = True,
 ) -> O:
-    """Parse a command line; returns its options, laid over the scenario it names.
+    """Parse a command line; returns its options, laid over the scenario that it names.
 
-    The scenario is checked once, in its final values: a flag may repair what contradicts in the
+    The scenario is checked once, with its final values: a flag may repair a contradiction in the
     file.
 
     Args:
-        defaults: options where nothing is given.
-        argv: arguments of the command.
-        prog: its name.
-        help_: what it does.
-        leads: whether an argument without a flag, at the front, is the scenario's name.
-        is_final: whether the scenario is flown as the flags leave it; else the command itself
-            changes more keys, and checks it after that.
+        leads: whether a first argument without a flag is the scenario's name.
+        is_final: whether to check the scenario; False for a command that changes further keys and
+            checks the scenario itself.
 
     Raises:
         CommandError: an output file cannot be written, is an input, or is locked.
         ConfigError: the scenario cannot be flown, or a plug-in cannot be imported.
-        SystemExit: tyro has shown the help, or what is wrong with a flag.
+        SystemExit: tyro has shown the help, or an error in a flag.
     """
     plugins.load(plugins.named(argv))
     argv, values = key_values(argv, type(defaults))
-    if HELP_KEYS in argv:  # it shows the keys as they are in the scenario
+    if HELP_KEYS in argv:  # the help shows the keys' values in the scenario
         named = leads and argv and not argv[0].startswith("-")
         base = reading.load_base(argv[0] if named else defaults.scenario)
         defaults = replace(defaults, config=base)  # type: ignore[type-var]
@@ -139,62 +128,43 @@ def parse(
 
 
 def address(flag: str, text: str) -> Address:
-    """Address given to a flag as HOST:PORT, with an IPv6 host in brackets.
-
-    Raises:
-        CommandError: the text is no address.
-    """
-    found = parse_address(text)
-    if found is None:
+    """Address given to a flag as HOST:PORT, with an IPv6 host in brackets."""
+    parsed = parse_address(text)
+    if parsed is None:
         raise CommandError(f"{flag}: got {text!r}, expected {HOST_PORT}", CONFIGURATION)
-    return found
+    return parsed
 
 
 def flight_warnings(scenario: Scenario) -> list[Event]:
-    """Warnings for the operator before a scenario is flown."""
     return [NoFailsafe()] if scenario.vehicle.exhausted == "hold" else []
 
 
 def optional_address(flag: str, text: str | None) -> Address | None:
-    """Address given to a flag, see `address`; None where the flag was given none."""
     return None if text is None else address(flag, text)
 
 
 def check_count(flag: str, given: int, most: int) -> None:
-    """Refuse a count that is less than 1 or more than `most`.
-
-    Raises:
-        CommandError: with the flag, its value and what was expected.
-    """
+    """Refuse a count outside 1 to `most`."""
     if not 1 <= given <= most:
         raise CommandError(f"{flag}: got {given}, expected 1 to {most}", CONFIGURATION)
 
 
 def check_sealed(bind: Address, *, secure: bool) -> None:
-    """Refuse to run without keys at an address that other machines can reach.
-
-    Raises:
-        CommandError: with the options that would be accepted.
-    """
+    """Refuse to run without keys at an address that other machines can reach."""
     with suppress(OSError):  # an unusable address is reported when the socket is bound
         if not (secure or is_loopback(look_up(bind))):
             raise unsealed(bind)
 
 
 def unsealed(*addresses: Address) -> CommandError:
-    """Error of a process without keys that uses addresses which other machines can reach."""
     at = ", ".join(address_text(*address) for address in addresses)
     expected = "expected --keys FILE (see skytether keygen), or --insecure"
-    said = f"{at}: other machines can reach it and there are no keys, {expected}"
-    return CommandError(said, CONFIGURATION)
+    message = f"{at}: other machines can reach it and there are no keys, {expected}"
+    return CommandError(message, CONFIGURATION)
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Let this process open so many sockets.
-
-    Raises:
-        CommandError: the system does not allow as many open files.
-    """
+    """Raise this process's limit of open files for so many sockets, or refuse the number."""
     most = sockets_max()
     if given > most:
         needed = f"got {given}, which takes {given + SPARE_FILES} open files"
@@ -204,26 +174,26 @@ def check_sockets(flag: str, given: int) -> None:
 
 
 def claim_output(flag: str, path: Path | None, *, is_input: bool = False) -> None:
-    """Lock a file to be written until the command ends, before anything is flown for it.
+    """Lock an output file until the command ends, before anything is flown.
 
     Args:
-        is_input: whether the command may read the file as well.
+        is_input: whether the command may also read the file.
 
     Raises:
-        CommandError: it cannot be written, is an input, or is locked by another command.
+        CommandError: the file cannot be written, is an input, or is locked by another command.
     """
     _claim(partial(files.claim, is_input=is_input), flag, path)
 
 
 def claim_folder(flag: str, path: Path | None, *names: str) -> None:
-    """Lock a folder to write files in until the command ends; one that is missing is made.
+    """Lock an output folder until the command ends; a missing folder is created.
 
     Args:
         names: files that will be written in it.
 
     Raises:
-        CommandError: it cannot be made, is locked by another command, or one of the files cannot be
-            written or is an input.
+        CommandError: the folder cannot be created, is locked by another command, or one of the
+            files cannot be written or is an input.
     """
     _claim(files.claim_folder, flag, path)
     for name in names:
@@ -235,15 +205,13 @@ def _claim(claim: Callable[[Path], object], flag: str, path: Path | None) -> Non
         if path is not None:
             claim(path)
     except OSError as error:
-        said = f"{flag}: {path}: cannot be written: {error.strerror}"
-        raise CommandError(said, CONFIGURATION) from None
+        message = f"{flag}: {path}: cannot be written: {error.strerror}"
+        raise CommandError(message, CONFIGURATION) from None
 
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C or SIGTERM end work in order; yields a function that tells whether one has
-    come.
-    """
+    """Handle Ctrl-C and SIGTERM inside the block; yields a function that says if one has come."""
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
@@ -271,34 +239,28 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
     # a fault of the machine: a full disk, too few open files, a broken pipe
     except OSError as error:
         # the reader of our output has closed it, as `head` does
-        gone = isinstance(error, BrokenPipeError)
+        is_closed = isinstance(error, BrokenPipeError)
         with suppress(OSError):
             sys.stdout.flush()
-            return RUN if gone else _refuse(prog, _reason(error), RUN)
+            return RUN if is_closed else _refuse(prog, _reason(error), RUN)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return RUN if gone else _refuse(prog, _reason(error), RUN)
+        return RUN if is_closed else _refuse(prog, _reason(error), RUN)
     return 0
 
 
 def _refuse(prog: str, message: str, code: int) -> int:
-    """Print an error as a single line, whatever characters are in it; returns the exit code."""
+    """Print an error as one line, whatever characters it contains; returns the exit code."""
     print(printable(f"{prog}: {message}"), file=sys.stderr)
     return code
 
 
 def _reason(error: OSError) -> str:
-    """Text of a system's error, and the file it is about."""
     where = f"{error.filename}: " if error.filename else ""
     allowed = f"; {files_max()} may be open here (ulimit -n)" if error.errno == EMFILE else ""
     return f"{where}{error.strerror or error}{allowed}"
 
 
 def write(path: Path, json: bytes) -> None:
-    """Write a file of indented JSON.
-
-    Raises:
-        CommandError: the file cannot be written.
-    """
     try:
         files.write(path, msgspec.json.format(json, indent=2) + b"\n")
     except OSError as error:

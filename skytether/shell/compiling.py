@@ -1,8 +1,8 @@
 """Compilation of kernels, in as many processes as there are cores.
 
-Numba compiles one function at a time in a process. So other processes compile, and leave the
-machine code on disk, where this one finds it. Each takes the next kernel when it has finished one,
-because nobody knows beforehand how long a kernel takes.
+Numba compiles one function at a time in a process. So several processes compile, and this process
+reads the machine code that they store on disk. Each takes the next kernel from a queue, because
+compile times are not known beforehand.
 """
 
 import os
@@ -13,33 +13,33 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-# for type checking alone: what flies aboard has no kernels
+# for type checking only: the vehicle's client has no kernels
 if TYPE_CHECKING:
     from skytether.shared.base.kernel import Missing
 
 
 def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -> None:
-    """Compile kernels, side by side where there are several cores.
+    """Compile kernels, in parallel where there are several cores.
 
     Args:
         kernels: kernels to compile; those that take longest should come first.
         on_done: called after each kernel, from any thread.
     """
-    kept = deque(each for each in kernels if each.is_stored)
-    cores = min(len(os.sched_getaffinity(0)), len(kept))
+    queue = deque(each for each in kernels if each.is_stored)
+    cores = min(len(os.sched_getaffinity(0)), len(queue))
     if cores > 1:
         with ThreadPoolExecutor(cores) as helpers:
             for _ in range(cores):
-                helpers.submit(_have_compiled, kept, on_done)
+                helpers.submit(_have_compiled, queue, on_done)
     for each in kernels:
-        # What others have compiled is only read now; what they have failed to is compiled.
+        # Loads code that other processes have compiled, and compiles kernels for which they failed.
         each.compile()
         if cores < 2 or not each.is_stored:
             on_done()
 
 
 def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> None:
-    """Have another process compile kernels from the front of a queue, until it is empty."""
+    """Let another process compile kernels from the front of a queue, until the queue is empty."""
     with subprocess.Popen(
         [sys.executable, "-P", "-m", __name__],
         stdin=subprocess.PIPE,
@@ -61,7 +61,7 @@ def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> No
 
 
 def _help() -> None:
-    """Compile the kernels that are named on stdin, one a line, and answer each by a line."""
+    """Compile the kernels named on stdin, one a line; answer each with a line on stdout."""
     from skytether.shared.base.kernel import compile_named
 
     for line in sys.stdin:

@@ -1,8 +1,8 @@
-"""Control socket, through which keys are changed in flight: a Unix socket for its owner alone.
+"""Control socket: a Unix socket, for its owner alone, through which keys are changed in flight.
 
-A datagram is a request of `shared.core.change`, and its answer goes back to the sender. After each
-request the socket pauses, so a flood of requests delays the sender and not the endpoint. An answer
-that cannot be delivered is dropped.
+A datagram is a request (`shared.core.change`); the answer goes back to the sender. The socket
+pauses after each request, so that a flood of requests delays the sender and not the endpoint. An
+answer that cannot be delivered is dropped.
 """
 
 import asyncio
@@ -23,30 +23,28 @@ from skytether.shell.journal import Journal
 from skytether.shell.local import Local
 
 REST_S = 0.01
-"""Shortest pause from a request until the next is read [s]."""
+"""Shortest pause after a request."""
 RESTS = 20
-"""Smallest ratio of the pause to the time that the request took: requests take at most 1/21 of the
-endpoint's time."""
+"""Ratio of the pause to the time of the request: requests take at most 1/21 of all time."""
 PATIENCE_S = 5.0
-"""Longest time to wait for an answer [s]."""
+"""Longest time to wait for an answer."""
 ANSWER_BYTES_MAX = 65_536
-"""Largest size of an answer [B]."""
 
 
 class ControlError(OSError):
-    """Error: no process answers at the socket; the message says why."""
+    """No process answers at the socket; the message says why."""
 
 
 class Control:
-    """Server of requests to change an endpoint's keys.
+    """Server side of a control socket.
 
     Args:
-        path: path of the socket, mode 0600; a socket that no process listens at is replaced.
+        path: path of the socket, mode 0600; a socket at which no process listens is replaced.
         running: the endpoint's keys that may change.
-        journal: where what is set is kept for the next run of the process.
+        journal: file in which new values are kept for the next run of the process.
 
     Raises:
-        LocalError: the socket cannot be made there.
+        LocalError: the socket cannot be created.
     """
 
     def __init__(self, path: Path, running: Running, journal: Journal | None = None) -> None:
@@ -57,12 +55,7 @@ class Control:
         self._after: Callable[[], None] = lambda: None
 
     def begin(self, loop: asyncio.AbstractEventLoop, after: Callable[[], None]) -> None:
-        """Answer requests from now on.
-
-        Args:
-            loop: event loop that watches the socket.
-            after: called after each request.
-        """
+        """Answer requests from now on; calls `after` after each request."""
         self._loop, self._after = loop, after
         self._listen()
 
@@ -80,7 +73,7 @@ class Control:
             answer = self._running.answer(request, now_ns=time.monotonic_ns())
             is_writing = self._journal is not None and self._running.settings is not before
             if is_writing:
-                # The endpoint goes on meanwhile, however slow the disk is.
+                # In a thread, so that a slow disk does not delay the endpoint.
                 threading.Thread(target=self._keep, args=(answer, sender), daemon=True).start()
             else:
                 self._answer(answer, sender)
@@ -93,22 +86,21 @@ class Control:
             self._after()
 
     def _keep(self, answer: bytes, sender: Any) -> None:
-        """Write what was set, and acknowledge it then; in a thread."""
+        """Write new values to the journal, then acknowledge them; runs in a thread."""
         assert self._journal is not None
         fault = ""
         try:
             self._journal.write(self._running.settings)
         except OSError as error:
             fault = str(error.strerror or error)
-            said = f"it is in force, and forgotten when the process restarts: {fault}"
-            answer = msgspec.json.encode(Answer(refused=said))
+            message = f"it is in force, but will be lost when the process restarts: {fault}"
+            answer = msgspec.json.encode(Answer(refused=message))
         self._answer(answer, sender)
         if loop := self._loop:
-            with suppress(RuntimeError):  # it has closed meanwhile
+            with suppress(RuntimeError):  # the loop has closed meanwhile
                 loop.call_soon_threadsafe(self._go_on, fault)
 
     def _go_on(self, fault: str) -> None:
-        """Go on after what was set is kept, or could not be."""
         if fault:
             self._running.tell(NotKept(reason=fault))
         if self._loop is not None:
@@ -121,7 +113,6 @@ class Control:
                 self._socket.sendto(answer, sender)
 
     def end(self) -> None:
-        """Answer no more requests."""
         if self._loop is not None:
             self._loop.remove_reader(self._socket)
             self._loop = None
@@ -132,7 +123,7 @@ class Control:
 
 
 class Caller:
-    """Client of a control socket, which asks for changes.
+    """Client side of a control socket.
 
     Args:
         path: socket of a server, netem or client.
@@ -157,7 +148,7 @@ class Caller:
             raise self._failed(error) from None
 
     def ask(self, values: Mapping[str, Any]) -> Answer:
-        """Ask for other values, or without arguments for the keys that may change.
+        """Ask for new values; without values, for the list of keys that may change.
 
         Raises:
             ControlError: no answer has come.
@@ -173,7 +164,6 @@ class Caller:
             raise ControlError(f"{self._path}: {error}") from None
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
         self._folder.cleanup()
 
@@ -183,10 +173,10 @@ class Caller:
 
 
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """Bind a socket to an address for answers that no other process uses; returns its folder.
+    """Bind a socket to a new address for answers; returns its folder.
 
-    The address lies beside the socket that is asked: a process in another container may see no
-    other folder of ours. If nothing can be created there, a temporary folder is used.
+    The address lies beside the control socket, because a process in another container may see no
+    other folder of this one. If nothing can be created there, a temporary folder is used.
 
     Raises:
         OSError: the address cannot be created anywhere.
@@ -207,11 +197,6 @@ _DECODER = msgspec.json.Decoder(Answer)
 
 
 def answer_of(text: bytes) -> Answer:
-    """Answer in a datagram.
-
-    Raises:
-        ControlError: the datagram is no answer.
-    """
     try:
         return _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -222,10 +207,10 @@ def answer_of(text: bytes) -> Answer:
 def controlled(
     path: Path | None, running: Running, journal: Journal | None = None
 ) -> Iterator[Control | None]:
-    """Control socket at a path for as long as the block takes; None without a path.
+    """Control socket that exists during the block; None without a path.
 
     Raises:
-        LocalError: the socket cannot be made.
+        LocalError: the socket cannot be created.
     """
     if path is None:
         yield None

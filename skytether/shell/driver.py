@@ -1,8 +1,8 @@
 """The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
 
-asyncio and signals are used here and in `shell.timer` alone, sockets in `shell.udp` and
-`shell.batch` alone. The shell knows nothing of control or of the protocol: datagrams and time go
-in, datagrams and events come out.
+asyncio and signals are used only here and in `shell.timer`, sockets only in `shell.udp` and
+`shell.batch`. The shell knows neither control nor protocol: datagrams and time go in, datagrams and
+events come out.
 """
 
 import asyncio
@@ -44,33 +44,28 @@ from skytether.shell.udp import (
 BURST_MAX = BATCH_MAX
 """Most datagrams read from one socket before timers and other sockets have their turn."""
 TOGETHER_MIN = 4
-"""Smallest number of datagrams for one `sendmmsg`, and for a socket to stay crowded, within the
-endpoint's patience: fewer than that are faster one by one."""
+"""Smallest number of datagrams worth a batch call: fewer are faster one by one."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Smallest number of datagrams, within the endpoint's patience, that makes a socket crowded."""
+"""Number of datagrams within `patience_ns` from which on a socket is read in batches."""
 BATCHES_MAX = 4
 """Most batches read from one socket before timers and other sockets have their turn."""
 SOCKET = itemgetter(2)
-"""Function that takes the number of its socket from a datagram."""
+"""Socket number of a datagram."""
 CAME = itemgetter(0)
-"""Function that takes the time from a pair of arrival time and datagram."""
+"""Arrival time, from a pair of time and datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
-"""Time after which names are looked up again [s]: a restarted host may have a new address."""
+"""Interval at which names are looked up again [s]: a restarted host may have a new address."""
 
 
 @dataclass(slots=True)
 class Arrivals:
-    """Datagrams that come to a socket of a patient endpoint."""
-
     since_ns: int
-    """Time since which they are counted."""
     count: int = 0
-    """Number of datagrams since then."""
 
 
 def new_event_loop() -> asyncio.AbstractEventLoop:
-    """An event loop: uvloop's where it exists, else asyncio's own."""
+    """Event loop: uvloop's where it is installed, else asyncio's own."""
     try:
         import uvloop
     except ImportError:
@@ -82,19 +77,18 @@ class Shell:
     """Drives one endpoint.
 
     Args:
-        endpoint: what to drive.
-        bind: address of its socket 0, where port 0 takes a free one, or that socket itself; None
-            takes a free port from which the peers can be reached. Other sockets open as the
-            endpoint uses them.
-        peers: addresses the endpoint will send to, names or numbers; the endpoint sees each address
-            as it is written here, and not in the kernel's form.
+        bind: address of socket 0, where port 0 takes a free one, or a bound socket; None takes a
+            free port from which the peers can be reached. Further sockets open when the endpoint
+            sends from them.
+        peers: addresses the endpoint will send to, names or numbers; the endpoint sees them as
+            written here and not in the kernel's form.
         stopwatch: measures receiving and sending.
-        forms: forms of the datagrams that may come to socket 0; without any, all may.
-        control: accepts changes of keys in flight.
-        feed: sends rows and events to readers.
-        line: address of a line to hardware, which becomes socket 1.
-        is_patient: whether to start although a peer's name cannot be resolved yet; it is then
-            looked up until it can.
+        forms: forms of the datagrams accepted at socket 0; empty accepts all.
+        control: control socket for changes of keys in flight.
+        feed: socket that sends rows and events to readers.
+        line: connection to an autopilot, which becomes socket 1.
+        is_patient: whether to start although a peer's name cannot be resolved yet; the lookup is
+            then repeated.
         memory: file of what the endpoint keeps for the next run of its process.
 
     Raises:
@@ -120,9 +114,8 @@ class Shell:
         self._stopwatch = stopwatch or Stopwatch()
         self._control, self._feed = control, feed
         self.send_errors = 0
-        """Number of datagrams that could not be sent."""
         self._drops = 0
-        """Number of datagrams that the kernel dropped at sockets now closed."""
+        """Datagrams that the kernel dropped at sockets closed since."""
         self._names = Names(peers, is_patient=is_patient)
         self._elsewhere = within_reach_of(self._names.numbers())
         bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
@@ -131,38 +124,32 @@ class Shell:
             admit_only(bound, forms)
         self._sockets = {0: bound}
         self._stream: ByteStream | None = None
-        """Stream that serves as socket 1; None without a line."""
         if line is not None:
             with contextlib.ExitStack() as failed:
                 failed.enter_context(bound)
                 self._add(line)
                 failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer for every datagram: to copy out of it costs less than a new one of full size."""
+        """One buffer for all datagrams: copying out of it is faster than allocating many."""
         self._batches: dict[int, DatagramBatch | None] = {}
-        """Arrays for the sockets of each family; None where the system has no such calls."""
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
-        """Counts of arrivals by socket, of an endpoint with `patience_ns`."""
         self._crowded: dict[int, DatagramBatch] = {}
-        """Sockets that are read in slices of time, and the arrays that read them."""
+        """Arrays by the number of each socket that is read in batches."""
         self._heard_ns = 0
-        """Newest time that the endpoint was given [ns]; later ones may not be earlier."""
+        """Newest time passed to the endpoint [ns]; times must not decrease."""
         self._woken_ns = 0
-        """Time of its last wake."""
         self._segments = Segments()
         self.address = from_kernel(bound.getsockname())
-        """Address of socket 0."""
 
     @property
     def is_local(self) -> bool:
-        """Whether its socket and all its peers are on this machine."""
+        """Whether socket 0 and all peers are on this machine."""
         if self._names.missing:
             return False
         return is_loopback(self.address) and is_loopback(self._elsewhere)
 
     def _add(self, line: Line) -> None:
-        """Use a line as socket 1."""
         if line.kind in ("tcp", "serial"):
             self._stream = ByteStream(line, self._hear_line)
         elif line.kind == "udp":
@@ -178,7 +165,6 @@ class Shell:
             self._after()
 
     async def run(self, on_event: Callable[[Event], None] = lambda _: None) -> None:
-        """Drive the endpoint until it has finished, or this task is cancelled."""
         self._loop = asyncio.get_running_loop()
         self._done = self._loop.create_future()
         self._on_event = on_event
@@ -220,7 +206,6 @@ class Shell:
                 task.cancel()
 
     def kernel_drops(self) -> int:
-        """Number of datagrams that the kernel dropped, see `shell.udp.kernel_drops`."""
         return self._drops + sum(map(kernel_drops, self._sockets.values()))
 
     def _listen(self, number: int) -> None:
@@ -229,50 +214,50 @@ class Shell:
     def _hear(self, number: int) -> None:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names.name
-        room, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
+        buffer, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch, is_refused = self._stopwatch, False
         try:
             for count in range(BURST_MAX):
                 stopwatch.start()
                 try:
-                    size, sender = receive(room)
+                    size, sender = receive(buffer)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
-                    is_refused |= count == 0  # for what else are we here
+                    is_refused |= count == 0  # the socket was readable, so an error was pending
                     break
-                except OSError:  # an earlier packet of ours found the peer's port closed
+                except OSError:  # ICMP: the peer's port was closed when an earlier packet arrived
                     is_refused = True
                     continue
                 stopwatch.lap("receive")
-                hear(Datagram(room[:size].tobytes(), peer, number), now_ns=clock_ns())
+                hear(Datagram(buffer[:size].tobytes(), peer, number), now_ns=clock_ns())
             if is_refused:
                 for reason in refusals(self._sockets[number]):
                     self.endpoint.undelivered(number, reason)
-                if number not in self._crowded:  # libuv stops to watch a socket that has an error
+                if number not in self._crowded:  # libuv stops watching a socket that has an error
                     self._loop.remove_reader(self._sockets[number])
                     self._listen(number)
             if self._patience_ns:
                 self._count(number, count)
-        finally:  # a fault of ours goes to the loop's handler, and the flight goes on
+        finally:  # an exception goes to the loop's handler, and the flight goes on
             if self._patience_ns:
                 self._heard_ns = clock_ns()
             self._after()
 
     def _count(self, number: int, count: int) -> None:
-        """Count datagrams at a socket, and begin to read it in slices of time if they are many."""
+        """Count datagrams at a socket, and switch to batches if they are many."""
         now_ns = time.monotonic_ns()
-        came = self._arrivals.setdefault(number, Arrivals(now_ns))
-        if now_ns - came.since_ns >= self._patience_ns:
-            if number in self._crowded and came.count < TOGETHER_MIN:
+        arrivals = self._arrivals.setdefault(number, Arrivals(now_ns))
+        if now_ns - arrivals.since_ns >= self._patience_ns:
+            if number in self._crowded and arrivals.count < TOGETHER_MIN:
                 del self._crowded[number]
                 self._listen(number)
-            came.count, came.since_ns = 0, now_ns
-        came.count += count
-        if came.count >= CROWD_MIN and number not in self._crowded:
+            arrivals.count, arrivals.since_ns = 0, now_ns
+        arrivals.count += count
+        if arrivals.count >= CROWD_MIN and number not in self._crowded:
             self._crowd(number, now_ns)
 
     def _crowd(self, number: int, now_ns: int) -> None:
-        """Read a socket in slices of time from now on, if the system has a call for batches."""
+        """Read a socket in batches from now on, if the system has such a call."""
         sock = self._sockets[number]
         batch = self._batch(sock)
         if batch is None or self._slices is None:
@@ -283,17 +268,17 @@ class Shell:
         self._slices.set(now_ns + self._patience_ns)
 
     def _hear_slice(self) -> None:
-        """Hand over the datagrams at crowded sockets, at the end of a slice."""
         try:
             self._read_slice()
         finally:
             self._after()
 
     def _read_slice(self) -> None:
-        """Read what has come to crowded sockets since the last slice, at most BATCHES_MAX each.
+        """Read the datagrams at crowded sockets since the last slice, at most BATCHES_MAX calls
+        each.
 
-        Datagrams that are handled in a row take half the time of those that wake the process one by
-        one, with cold caches. The kernel's stamps tell when each arrived.
+        Handling datagrams in a row takes half the time of waking the process for each, with cold
+        caches. The kernel's timestamps give the arrival time of each.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -308,13 +293,13 @@ class Shell:
                 if count < BURST_MAX:
                     break
             is_left |= count == BURST_MAX
-        came.sort(key=CAME)  # in the order in which they came to this machine
+        came.sort(key=CAME)  # by time of arrival
         hear = self.endpoint.receive
         for came_ns, datagram in came:
             self._heard_ns = came_ns
             try:
                 hear(datagram, now_ns=came_ns)
-            except Exception as error:  # a fault of ours is told, and the next datagram is heard
+            except Exception as error:  # report an exception, and go on with the next datagram
                 self._loop.call_exception_handler({"message": str(error), "exception": error})
         for number in nothing_came:
             self._hear(number)  # the plain call shows whether there was an error
@@ -322,7 +307,6 @@ class Shell:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 
     def _batch(self, sock: socket) -> DatagramBatch | None:
-        """Arrays of the socket's family, made when they are first used."""
         if sock.family not in self._batches:
             try:
                 self._batches[sock.family] = DatagramBatch(sock.family)
@@ -331,18 +315,19 @@ class Shell:
         return self._batches[sock.family]
 
     def _read_batch(self, number: int, batch: DatagramBatch) -> list[tuple[int, Datagram]]:
-        """Datagrams that one call reads from a socket, each with the time at which it came [ns]."""
+        """Datagrams that one call reads from a socket, each with its arrival time [ns]."""
         self._stopwatch.start()
         payloads, raws, came_ns = batch.receive(self._sockets[number])
         if not payloads:
             return []
         self._count(number, len(payloads))
-        # The clock of the stamps may be set meanwhile, ours may not.
+        # Timestamps are of CLOCK_REALTIME, which may have been set; endpoint times must not
+        # decrease.
         now_ns, last_ns = time.monotonic_ns(), self._heard_ns
         stamps_ns = [min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
             peers = self._names.heard_all(raws)
-        except OSError:  # an interface has gone since
+        except OSError:  # a network interface is gone
             payloads, peers, stamps_ns = self._still_here(payloads, raws, stamps_ns)
         self._stopwatch.lap("receive")
         return [
@@ -353,21 +338,21 @@ class Shell:
     def _still_here(
         self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
     ) -> tuple[list[bytes], list[Address], list[int]]:
-        """Datagrams among these that came over an interface which still exists."""
-        kept: list[bytes] = []
+        """Datagrams that came over an interface which still exists."""
+        received: list[bytes] = []
         peers: list[Address] = []
         kept_ns: list[int] = []
         for payload, raw, came_ns in zip(payloads, raws, stamps_ns, strict=True):
             with contextlib.suppress(OSError):
                 peers.append(self._names.heard(raw))
-                kept.append(payload)
+                received.append(payload)
                 kept_ns.append(came_ns)
-        return kept, peers, kept_ns
+        return received, peers, kept_ns
 
     def _wake(self) -> None:
         self._armed = None
         try:
-            if self._crowded:  # what has come belongs to what is due
+            if self._crowded:  # datagrams that have arrived come before due work
                 self._read_slice()
             now_ns, due_ns = time.monotonic_ns(), self.endpoint.next_wake_ns()
             if due_ns is not None and due_ns <= now_ns:
@@ -377,12 +362,11 @@ class Shell:
             self._after()
 
     def _changed(self) -> None:
-        """Go on after a change of keys, at which the endpoint was given the present time."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 
     def _after(self) -> None:
-        """Send the endpoint's datagrams, arm its timer, and hand on its events and rows."""
+        """Send the endpoint's datagrams, arm its timer, and pass on its events and rows."""
         endpoint = self.endpoint
         self._stopwatch.start()
         out = endpoint.outbox()
@@ -407,18 +391,19 @@ class Shell:
             self._feed.take()
 
     def _send_all(self, datagrams: Sequence[Datagram]) -> None:
-        """Send datagrams in their order; those in a row that use one socket go together."""
-        for _, each in groupby(datagrams, SOCKET):
-            same = list(each)
+        """Send datagrams in order; consecutive ones from one socket go in one call."""
+        for _, group in groupby(datagrams, SOCKET):
+            same = list(group)
             for first in range(0, len(same), BURST_MAX):
                 row = same[first : first + BURST_MAX]
                 sent = self._send_together(row) if len(row) > 1 else 0
-                # The rest is sent one by one; a datagram that failed in the batch fails here, too.
+                # The rest is sent one by one; a datagram that failed in the batch raises its error
+                # there.
                 for datagram in row[sent:]:
                     self._send(datagram)
 
     def _send_together(self, row: Sequence[Datagram]) -> int:
-        """Send datagrams of one socket in few calls; returns how many went, from the first on."""
+        """Send datagrams of one socket in few calls; returns how many were sent."""
         sock = self._sockets.get(row[0].socket)
         if sock is None:
             return 0
@@ -428,7 +413,7 @@ class Shell:
                 return self._segments.send(sock, payloads, self._names.kernel(peers[0]))
             batch = self._batch(sock) if len(row) >= TOGETHER_MIN else None
             return batch.send(sock, payloads, list(map(self._names.raw, peers))) if batch else 0
-        except OSError:  # an address that is none
+        except OSError:  # an invalid address
             return 0
 
     def _send(self, datagram: Datagram) -> None:
@@ -452,16 +437,18 @@ class Shell:
             self._on_event(HostMissing(host=host, reason=reason))
         while self._names.may_change:
             await asyncio.sleep(RESOLVE_EVERY_S)
-            found: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
-            # No executor: it would be waited for at the end, and where a name is gone a look-up
-            # can take 20 s.
-            threading.Thread(target=self._look_up, args=(found,), daemon=True).start()
-            self._learn(await found)
+            addresses: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
+            # A thread and no executor: the loop waits for executors at its end, and a lookup may
+            # take 20 s.
+            threading.Thread(target=self._look_up, args=(addresses,), daemon=True).start()
+            self._learn(await addresses)
 
-    def _learn(self, found: dict[Address, Address]) -> None:
-        """Use these addresses of peers from now on; report those that were missing before."""
-        late = [(host, found[host, port][0]) for host, port in self._names.missing.keys() & found]
-        self._names.learn(found)
+    def _learn(self, addresses: dict[Address, Address]) -> None:
+        late = [
+            (host, addresses[host, port][0])
+            for host, port in self._names.missing.keys() & addresses
+        ]
+        self._names.learn(addresses)
         if not late:
             return
         for host, number in late:
@@ -499,12 +486,12 @@ def run(
     """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
 
     Args:
-        on_start: called once signals are heeded and the endpoints are about to be driven.
-        on_event: called with each event of an endpoint, and with each fault of its code.
+        on_start: called once signals are handled, before the endpoints run.
+        on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
     """
-    # Everything imported so far lives on; without this, a collection of it pauses for 13 ms.
+    # Imported objects live as long as the process; without `freeze`, collecting them takes 13 ms.
     gc.collect()
     gc.freeze()
 
@@ -513,7 +500,7 @@ def run(
         task = asyncio.gather(*(shell.run(on_event) for shell in shells))
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
-        # The loop would let SIGUSR1 end the process once it is closed itself.
+        # A closed loop restores the default action of SIGUSR1, which would end the process.
         signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))
 
@@ -534,7 +521,6 @@ def run(
 
 
 def _fault(context: dict[str, Any]) -> Fault:
-    """Event that reports an exception caught in the event loop."""
     error = context.get("exception")
     trace = traceback.format_exception(error) if error else [context["message"]]
     return Fault(traceback="".join(trace))

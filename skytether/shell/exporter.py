@@ -1,11 +1,11 @@
 """Metrics over HTTP for Prometheus, and a health check.
 
-    GET /metrics   counted figures, as text for Prometheus
+    GET /metrics   figures, as text for Prometheus
     GET /healthz   200 while the process is healthy, else 503; JSON either way
 
-The loop hands over its figures once a second; threads render them and answer, and never touch the
-endpoint. A connection has a bounded time, and the oldest is closed where there are too many, so
-that no client keeps others out; at most 50 are accepted per second. A request whose Host header is
+The event loop hands over its figures once a second; threads render them and answer requests, and
+never touch the endpoint. Connections are bounded in time and in number (the oldest is closed), so
+that no client locks others out; at most 50 are accepted per second. A request whose Host header is
 a website's name is refused: its owner may have pointed that name at this machine (DNS rebinding).
 """
 
@@ -33,47 +33,42 @@ from skytether.shell.udp import from_kernel, look_up
 from skytether.shell.web import HEADERS, host_name, is_ours
 
 CONNECTIONS_MAX = 8
-"""Most connections at once; a new one closes the oldest."""
+"""Most connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
-"""Longest time for a request and its answer [s]."""
+"""Longest time for a request and its answer."""
 REQUEST_BYTES_MAX = 8192
-"""Largest size of a request [B]."""
 POLL_S = 0.1
-"""Interval at which connections that take too long are closed [s]."""
+"""Interval at which connections that take too long are closed."""
 REST_S = 0.02
-"""Pause between two accepted connections [s]."""
+"""Pause between two accepted connections."""
 FRESH_S = 3.0
 """Age from which figures count as stale, and the process as stuck [s]."""
-BY_NAME = b"by a name; a number, localhost, a name without a dot or that of --metrics is expected\n"
-"""Answer to a request under the name of a website."""
+BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"
 
 
 class MetricsError(OSError):
-    """Error: the metrics' address cannot be listened at; the message says which and why."""
+    """The metrics' address cannot be listened at; the message says which and why."""
 
 
 class Collected(Collector):
-    """Metrics of the newest figures of a process.
+    """Collector of the newest figures of a process.
 
     Args:
         process: server, netem or client; `server.N` is worker N of a server.
-        scenario: name of the scenario.
-        step_s: length of a step [s].
     """
 
     def __init__(self, process: str, scenario: str, step_s: float) -> None:
         self._process = process
         self._kind = process.partition(".")[0]
         self._scenario, self._step_s = scenario, step_s
-        # Replaced as a whole, so the thread sees either the old or the new figures.
+        # Replaced as a whole, so that threads see either the old or the new figures.
         self._snapshot: tuple[Mapping[str, Any], float] | None = None
 
     def take(self, figures: Mapping[str, Any]) -> None:
-        """Take new figures, which the caller must not change any more."""
+        """Replace the figures; the caller must not change them afterwards."""
         self._snapshot = figures, time.monotonic()
 
     def collect(self) -> Iterable[Exposed]:
-        """Metrics for prometheus_client, which calls this method."""
         labels = {"process": self._process, "scenario": self._scenario}
         info, step_s, age_s, unmapped = (metric.exposed() for metric in OWN)
         info.add_sample(info.name, labels, 1.0)
@@ -82,13 +77,12 @@ class Collected(Collector):
         if self._snapshot is None:
             return
         figures, taken_s = self._snapshot
-        told, unknown = families(self._kind, figures)
+        metrics, unknown = families(self._kind, figures)
         age_s.add_sample(age_s.name, {}, time.monotonic() - taken_s)
         unmapped.add_sample(unmapped.name, {}, float(len(unknown)))
-        yield from (age_s, unmapped, *told)
+        yield from (age_s, unmapped, *metrics)
 
     def trouble(self) -> str:
-        """Reason why the process is unhealthy; empty for a healthy one."""
         if self._snapshot is None:
             return "it has not begun"
         figures, taken_s = self._snapshot
@@ -98,23 +92,15 @@ class Collected(Collector):
         return trouble(self._kind, figures)
 
     def health(self) -> tuple[str, bytes]:
-        """Status and body of the answer to a health check."""
         why = self.trouble()
-        told = {"process": self._process, "healthy": not why, "trouble": why}
-        return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(told) + b"\n"
+        answer = {"process": self._process, "healthy": not why, "trouble": why}
+        return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(answer) + b"\n"
 
 
 class _Bounded(io.BufferedReader):
-    """Lines of a request, as long as all of them together may be."""
-
     left = REQUEST_BYTES_MAX
 
     def readline(self, _: int | None = -1, /) -> bytes:
-        """Read the next line.
-
-        Raises:
-            OSError: the request is too long.
-        """
         line = super().readline(self.left + 1)
         self.left -= len(line)
         if self.left < 0:
@@ -123,18 +109,16 @@ class _Bounded(io.BufferedReader):
 
 
 class _Handler(WSGIRequestHandler):
-    """Handler of a request; error answers have the common headers, too."""
+    """Handler of a request, whose error answers have the common headers, too."""
 
     def setup(self) -> None:
-        """Prepare to read."""
         super().setup()
         self.rfile = _Bounded(self.rfile.detach())
 
     def log_message(self, *_: object) -> None:
-        """Log nothing."""
+        pass
 
     def end_headers(self) -> None:
-        """Add the common headers."""
         for name, value in HEADERS.items():
             self.send_header(name, value)
         super().end_headers()
@@ -145,7 +129,6 @@ class Metrics(ThreadingMixIn, WSGIServer):
 
     Args:
         address: address to listen at; port 0 takes a free one.
-        collected: metrics that it serves.
 
     Raises:
         MetricsError: the address cannot be listened at.
@@ -159,14 +142,12 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self.socket.close()
         self.socket = listening
         self.address = from_kernel(listening.getsockname())
-        """Address that the server listens at."""
-        # not looked up in the DNS, as `server_bind` would
+        # set here, because `server_bind` would look the name up in the DNS
         self.server_name, self.server_port = self.address
         self.setup_environ()
         self.set_app(self._answer)
         self._collected = collected
         self._name = address[0].lower()
-        """Name that the user has given this machine."""
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
         self._connections: dict[socket.socket, float] = {}
@@ -175,46 +156,40 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop answering."""
         self.shutdown()
         self.server_close()
 
     def take(self, figures: Mapping[str, Any]) -> None:
-        """Take new figures, which the caller must not change any more."""
         self._collected.take(figures)
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Next connection, after a pause."""
         time.sleep(REST_S)
         return super().get_request()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread; it takes the place of the oldest if there are many."""
+        """Answer a connection in a thread; with CONNECTIONS_MAX open, the oldest is closed."""
         for oldest in list(self._connections)[: 1 - CONNECTIONS_MAX]:
             self._hang_up(oldest)
         self._connections[request] = time.monotonic() + PATIENCE_S
         super().process_request(request, client_address)
 
     def service_actions(self) -> None:
-        """Close the connections that take too long."""
         now_s = time.monotonic()
         for connection, until_s in list(self._connections.items()):
             if now_s >= until_s:
                 self._hang_up(connection)
 
     def _hang_up(self, connection: socket.socket) -> None:
-        """End a connection, which its thread notices."""
         self._connections.pop(connection, None)
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forget a connection that is answered, or has failed."""
         self._connections.pop(request, None)
         super().shutdown_request(request)
 
     def handle_error(self, *_: object) -> None:
-        """Nothing: the client is gone, or too slow."""
+        """Ignore the error: the client is gone, or too slow."""
 
     def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"
@@ -222,7 +197,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         if not self._is_ours(environ.get("HTTP_HOST")):
             status, body = "403 Forbidden", BY_NAME
         elif environ["REQUEST_METHOD"] != "GET":
-            status, body = "405 Method Not Allowed", b"GET alone\n"
+            status, body = "405 Method Not Allowed", b"only GET is supported\n"
             more.append(("Allow", "GET"))
         elif environ["PATH_INFO"] == "/metrics":
             status, kind, body = "200 OK", CONTENT_TYPE_LATEST, generate_latest(self._registry)
@@ -234,18 +209,13 @@ class Metrics(ThreadingMixIn, WSGIServer):
 
     def _is_ours(self, host: str | None) -> bool:
         """Whether a Host header names this machine in a way that no website's owner can imitate."""
-        if host is None or "," in host:  # there is none, or there are several
+        if host is None or "," in host:  # no Host header, or several
             return host is None
         name = host_name(host)
         return is_ours(name) or name == self._name or (name != "" and "." not in name)
 
 
 def _listening(address: Address) -> socket.socket:
-    """Listening TCP socket.
-
-    Raises:
-        MetricsError: the address cannot be listened at.
-    """
     try:
         host, port = look_up(address)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -1,8 +1,8 @@
-"""The feed's socket: a process sends rows and events to its readers, and never waits for them.
+"""The feed's socket, through which a process sends rows and events to readers without waiting.
 
-It runs in the process's own event loop, between two steps, and never blocks: bytes that a reader
-has not taken are queued, up to a bound, and a reader whose queue is full is dropped.
-`shared.telemetry.feed` defines the frames; `Subscriber` is the other end.
+The feed runs in the process's own event loop and never blocks: bytes for a slow reader are queued,
+up to a bound, and a reader whose queue is full is dropped. `shared.telemetry.feed` defines the
+frames; `Subscriber` is the other end.
 """
 
 import asyncio
@@ -37,22 +37,21 @@ READERS_MAX = 8
 WAITING_BYTES_MAX = 4 * 1024 * 1024
 """Most bytes queued for a reader; a reader with more is dropped and counted."""
 BACKLOG_BYTES_MAX = 1024 * 1024
-"""Bytes of the newest frames that are kept for future readers."""
+"""Most bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Size of rows after which a frame is full [B]."""
+"""Size of rows after which a frame is full."""
 SEND_BYTES_MAX = 64 * 1024
-"""Most bytes that a reader is sent in one turn of the loop."""
+"""Most bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
-"""Time for which frames gather before they are sent [s]."""
+"""Time for which frames are collected before they are sent."""
 REST_S = 0.02
-"""Pause between two accepted readers [s], so that one that reconnects in a loop costs little."""
+"""Pause between two accepted readers [s], which bounds the cost of reconnecting in a loop."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until readers have received everything [s]."""
+"""Longest time to wait at the end until readers have received everything."""
 
 READ_BYTES = 256 * 1024
-"""Most bytes that are read from a feed at a time."""
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process [s]."""
+"""Time between two attempts to connect to a process."""
 
 
 class _Part:
@@ -63,11 +62,9 @@ class _Part:
         self.rows: list[bytes] = []
 
     def write(self, rows: bytes) -> None:
-        """Take whole rows."""
         self.rows.append(rows)
 
     def frames(self, now_ns: int) -> Iterator[bytes]:
-        """Frames of all pending rows; none are pending afterwards."""
         rows, self.rows = self.rows, []
         first = size = 0
         for last, piece in enumerate(rows, start=1):
@@ -79,15 +76,13 @@ class _Part:
 
 
 class _Reader:
-    """Reader of the feed, and the bytes that it has not taken yet."""
-
     def __init__(self, connection: socket.socket, waiting: bytes) -> None:
         connection.setblocking(False)
         self.connection = connection
         self.waiting = bytearray(waiting)
 
     def send(self) -> None:
-        """Send what the socket takes, but no more than one turn's share.
+        """Send what the socket accepts, at most SEND_BYTES_MAX.
 
         Raises:
             OSError: the reader is gone.
@@ -97,15 +92,13 @@ class _Reader:
 
 
 class Feed:
-    """The feed of a process.
-
-    Only the thread that drives the endpoint may use the feed.
+    """The feed of a process; for the thread that drives the endpoint only.
 
     Args:
         path: path of the socket, see `Local`.
 
     Raises:
-        LocalError: the socket cannot be made there.
+        LocalError: the socket cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -114,60 +107,50 @@ class Feed:
         self._columns: dict[str, np.dtype[np.void]] = {}
         self._parts: list[_Part] = []
         self._fresh: list[bytes] = []
-        """Frames that were not sent to anybody yet."""
         self._backlog: deque[bytes] = deque()
-        """Newest frames that were sent already; each item is one frame, or several."""
+        """Newest frames that were sent; each item is one frame, or several."""
         self._backlog_bytes = 0
         self._readers: list[_Reader] = []
         self._behind: set[_Reader] = set()
-        """Readers whose sockets are full; the loop calls back when they have room."""
+        """Readers whose sockets are full; the loop calls back when they can send again."""
         self._loop: AbstractEventLoop | None = None
         self._armed: TimerHandle | None = None
         self._opened: Callable[[], Opened] | None = None
         self._dropped = self._refused = 0
 
     def part(self, name: str, columns: np.dtype[np.void]) -> _Part:
-        """Sink for rows of a part of the record, which the feed contains from now on."""
         self._columns[name] = columns
         self._parts.append(_Part(name))
         return self._parts[-1]
 
     @property
     def parts(self) -> dict[str, str]:
-        """Parts of the record, in the form that `Opened` has."""
+        """Parts of the record, in the form of `Opened`."""
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Accept readers once the loop runs.
-
-        Args:
-            opened: makes the first frame that a reader gets.
-        """
+        """Accept readers once the loop runs; `opened` makes the first frame for each."""
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:
-        """Serve readers from now on, in an event loop."""
         self._loop = loop
         self._listen()
 
     def take(self) -> None:
-        """Put the newly written rows into frames."""
+        """Put newly written rows into frames."""
         for part in self._parts:
             if part.rows:
                 for frame in part.frames(time.monotonic_ns()):
                     self._add(frame)
 
     def say(self, event: Event) -> None:
-        """Add an event."""
         self.take()
         self._add(encode(Said(time_ns=time.monotonic_ns(), event=event)))
 
     def count(self, figures: Mapping[str, Any]) -> None:
-        """Add the figures of the process."""
         self._add(encode(Figures(time_ns=time.monotonic_ns(), figures=dict(figures))))
 
     def figures(self) -> dict[str, Any]:
-        """Counters of the feed itself, in the form of `Endpoint.figures`."""
         return {
             "readers": len(self._readers),
             "dropped": self._dropped,
@@ -175,7 +158,6 @@ class Feed:
         }
 
     def end(self) -> None:
-        """Stop serving readers in the loop."""
         if self._loop is None:
             return
         self._loop.remove_reader(self._local.socket)
@@ -188,7 +170,7 @@ class Feed:
         self._loop = None
 
     def close(self) -> None:
-        """Send readers the rest, within a bounded time, and remove the socket."""
+        """Send readers the rest, within PATIENCE_S, and remove the socket."""
         self.end()
         self.take()
         self._send()
@@ -209,7 +191,6 @@ class Feed:
             self._armed = self._loop.call_later(GATHER_S, self._send)
 
     def _send(self) -> None:
-        """Send the frames that have gathered."""
         self._armed = None
         if not self._fresh:
             return
@@ -228,7 +209,6 @@ class Feed:
             self._backlog_bytes -= len(self._backlog.popleft())
 
     def _go_on(self, reader: _Reader) -> None:
-        """Send a reader more; if its socket is full, the loop goes on later."""
         try:
             reader.send()
         except OSError:
@@ -255,7 +235,6 @@ class Feed:
             self._loop.add_reader(self._local.socket, self._let_in)
 
     def _let_in(self) -> None:
-        """Accept the next reader, then pause."""
         assert self._loop is not None
         assert self._opened is not None
         self._loop.remove_reader(self._local.socket)
@@ -275,12 +254,13 @@ class Feed:
 
 
 class Subscriber:
-    """Reader of processes' feeds in a thread of its own, which reconnects after a feed's end.
+    """Reader of processes' feeds in a thread of its own; reconnects after a feed ends.
 
     Args:
-        paths: sockets of the feeds by a name of the process; the processes need not run yet.
-        take: called in the thread with a name and each frame; a feed begins with `Opened`.
-        lost: called in the thread with a name when a feed that had begun has ended.
+        paths: feeds' sockets by process name; the processes need not run yet.
+        take: called in the thread with the process name and each frame; a feed begins with
+            `Opened`.
+        lost: called in the thread with the process name when a feed has ended.
     """
 
     def __init__(
@@ -314,7 +294,7 @@ class Subscriber:
                 readers.create_task(self._follow(name, path))
 
     async def _follow(self, name: str, path: Path) -> None:
-        """Read the feed of a process, and of each that comes after it."""
+        """Read the feed of a process, and of each process that listens at the same path later."""
         while not self._closed:
             with suppress(OSError):  # no process listens, or its queue of connections is full
                 stream, connection = await asyncio.open_unix_connection(path, limit=READ_BYTES)
@@ -328,7 +308,7 @@ class Subscriber:
         """Read a feed until it ends.
 
         Raises:
-            OSError, FeedError: it is broken.
+            OSError, FeedError: the connection or a frame is broken.
         """
         reader = Reader()
         while piece := await stream.read(READ_BYTES):

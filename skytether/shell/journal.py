@@ -1,9 +1,9 @@
-"""Journal of what an operator has set in flight, beside the control socket of its process.
+"""Journal of values that an operator has set in flight, beside the process's control socket.
 
-What is set by `skytether set` or on the page outlives the process: zones, goals, whether a vehicle
-is armed. A value is written before it is acknowledged, and read when the process starts again. If
-the journal is damaged, of another scenario or older than a day, the process refuses to start: a
-server that has lost a zone must not plan.
+Values set by `skytether set` or on the page (zones, goals, whether a vehicle is armed) survive a
+restart of the process. A value is written before it is acknowledged, and read when the process
+starts again. If the journal is damaged, belongs to another scenario or is older than a day, the
+process refuses to start: a server that has lost a zone must not plan.
 """
 
 import time
@@ -24,27 +24,20 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell.command import CONFIGURATION, CommandError
 
 SUFFIX = ".set"
-"""Ending of a journal's name, behind that of the socket."""
 BYTES_MAX = 1_000_000
-"""Largest size of a journal [B]."""
 DAY_S = 86_400.0
-"""Age above which a journal counts as one of another flight [s]."""
+"""Age above which a journal belongs to another flight [s]."""
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """Content of a journal."""
-
     scenario: str
     """Digest of the scenario that the process was started with."""
     time_s: float
-    """Time at which something was set last [s; Unix time]."""
+    """Time of the last change [s; Unix time]."""
     values: dict[str, Any]
-    """Values that were set, by key."""
     digest: str = ""
-    """Digest of the other fields."""
 
     def sealed(self) -> "_Entry":
-        """Copy with the digest that belongs to it."""
         bare = msgspec.structs.replace(self, digest="")
         return msgspec.structs.replace(self, digest=_digest(msgspec.json.encode(bare)))
 
@@ -53,7 +46,6 @@ class Journal:
     """Journal of one process.
 
     Args:
-        path: path of it.
         scenario: scenario that the process is started with.
     """
 
@@ -61,19 +53,17 @@ class Journal:
         self._path, self._base = path, scenario
         self._name = _digest(reading.to_toml(scenario))
         self.values: Mapping[str, Any] = {}
-        """Values that were set in an earlier run."""
         self.scenario = scenario
-        """The scenario with these."""
 
     def read(self) -> SettingsRecalled | None:
-        """Take up what was set in an earlier run; None where there is nothing.
+        """Restore values that were set in an earlier run; None if there is no journal.
 
         Raises:
-            CommandError: there is a journal that cannot be followed.
+            CommandError: the journal cannot be used.
         """
         try:
-            held = files.read(self._path, BYTES_MAX, private=True)
-            entry = msgspec.json.decode(held, type=_Entry)
+            content = files.read(self._path, BYTES_MAX, private=True)
+            entry = msgspec.json.decode(content, type=_Entry)
             self._check(entry)
             self.scenario, self.values = with_values(self._base, entry.values), entry.values
         except FileNotFoundError:
@@ -87,15 +77,9 @@ class Journal:
         return SettingsRecalled(path=str(self._path), values=dict(entry.values))
 
     def running(self, endpoint: Endpoint) -> Running:
-        """Keys of an endpoint that was made with the scenario of this journal."""
         return Running(endpoint, self.scenario, self.values)
 
     def _check(self, entry: _Entry) -> None:
-        """Refuse an entry that is not of this flight.
-
-        Raises:
-            ConfigError: with the reason.
-        """
         if entry != entry.sealed():
             raise ConfigError("it is damaged")
         if entry.scenario != self._name:
@@ -105,52 +89,43 @@ class Journal:
             raise ConfigError(f"it was set {abs(age_s) / DAY_S:.1f} days ago")
 
     def _refused(self, why: str) -> CommandError:
-        said = f"{self._path}: what was set in flight cannot be taken up: {why}"
-        return CommandError(f"{said}; --new-flight begins without it", CONFIGURATION)
+        message = f"{self._path}: values set in flight cannot be restored: {why}"
+        return CommandError(f"{message}; --new-flight starts without them", CONFIGURATION)
 
     def write(self, values: Mapping[str, Any]) -> None:
-        """Write all that was set so far; returns when it is on the disk.
+        """Write all values set so far; returns when they are on the disk.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         entry = _Entry(scenario=self._name, time_s=time.time(), values=dict(values)).sealed()
         with files.replacing(self._path, is_input=True, mode=0o600) as file:
             file.write(msgspec.json.encode(entry))
 
     def forget(self) -> None:
-        """Remove it: a person begins a new flight.
-
-        Raises:
-            CommandError: it cannot be removed.
-        """
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:
-            said = f"{self._path}: cannot be removed: {error.strerror or error}"
-            raise CommandError(said, CONFIGURATION) from None
+            message = f"{self._path}: cannot be removed: {error.strerror or error}"
+            raise CommandError(message, CONFIGURATION) from None
 
 
 class TakenUp(NamedTuple):
-    """Scenario of a process that begins, with what was set in an earlier run."""
+    """Scenario of a process that starts, with the values set in an earlier run."""
 
     journal: Journal | None
-    """Journal of what will be set; None without a control socket."""
+    """None without a control socket."""
     scenario: Scenario
     news: list[Event]
-    """Events that tell the operator which values are in force again."""
 
 
 def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
-    """Take up what was set in an earlier run, from the journal beside a control socket.
+    """Restore values that were set in an earlier run, from the journal beside a control socket.
 
     Args:
-        control: path of the socket; None without one.
+        control: path of the control socket; None without one.
         scenario: scenario that the process is started with.
-        new_flight: whether values that were set before are discarded.
-
-    Raises:
-        CommandError: there is a journal that cannot be followed.
+        new_flight: whether to discard values that were set before.
     """
     if control is None:
         return TakenUp(None, scenario, [])

@@ -1,4 +1,4 @@
-"""Rate limit of log lines: the log stays readable whatever peers cause."""
+"""Rate limit of log lines, so that no peer can flood the log."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,37 +12,32 @@ KIND_MAX = 5
 
 @dataclass(slots=True)
 class _Second:
-    """Events of a kind in one second, which begins with the first of them."""
-
     end_ns: int
-    told: int = 0
-    """Number of logged events."""
+    logged: int = 0
     omitted: int = 0
-    """Number of events left out."""
 
 
 class Limit:
     """Limiter of log events: the first few of each kind in a second are logged.
 
-    The limit is per kind, not per kind and vehicle: a stranger may claim any vehicle's number.
+    The limit is per kind, not per kind and vehicle: an attacker may claim any vehicle's number.
     """
 
     def __init__(self) -> None:
         self._seconds: dict[str, _Second] = {}
 
     def admit(self, event: Event, *, now_ns: int) -> Sequence[Event]:
-        """Events to log now: counts of those omitted in past seconds, and this one if within the
-        limit.
+        """Events to log now: `Omitted` counts of past seconds, and this event if within the limit.
 
-        An `Omitted` event itself adds to the count of its kind.
+        An `Omitted` event adds its count to that of its kind.
         """
         kind = event.kind if isinstance(event, Omitted) else type(event).__name__
         over = self.omitted(kind, now_ns=now_ns)
         second = self._seconds.setdefault(kind, _Second(now_ns + SECOND_NS))
         if isinstance(event, Omitted):
             second.omitted += event.count
-        elif second.told < KIND_MAX:
-            second.told += 1
+        elif second.logged < KIND_MAX:
+            second.logged += 1
             return [*over, event]
         else:
             second.omitted += 1
@@ -52,14 +47,14 @@ class Limit:
         """Counts of events omitted in the seconds that are over, each returned once.
 
         Args:
-            kinds: kinds to look at; if empty, all.
-            now_ns: time at which a second is over or not; None ends every second.
+            kinds: if empty, all.
+            now_ns: None ends every second.
         """
-        told = []
+        events = []
         for kind in kinds or tuple(self._seconds):
             second = self._seconds.get(kind)
             if second is not None and (now_ns is None or now_ns >= second.end_ns):
                 del self._seconds[kind]
                 if second.omitted:
-                    told.append(Omitted(kind=kind, count=second.omitted))
-        return told
+                    events.append(Omitted(kind=kind, count=second.omitted))
+        return events

@@ -1,4 +1,4 @@
-"""Unix sockets that only their owner can use, and that are removed with their maker."""
+"""Unix sockets that only their owner can use, and that are removed at close."""
 
 import os
 import socket
@@ -9,25 +9,24 @@ from pathlib import Path
 
 
 class LocalError(OSError):
-    """Error: a Unix socket cannot be made; the message says where and why."""
+    """A Unix socket cannot be created; the message says where and why."""
 
 
 class Local:
     """Non-blocking Unix socket, bound to a path with mode 0600.
 
     Args:
-        path: path of the socket; a socket that no process listens at is replaced, and a folder that
-            is missing is made.
+        path: path of the socket; a socket at which no process listens is replaced, and a missing
+            folder is created.
         kind: SOCK_DGRAM or SOCK_STREAM.
 
     Raises:
-        LocalError: the socket cannot be made there.
+        LocalError: the socket cannot be created.
     """
 
     def __init__(self, path: Path, kind: socket.SocketKind) -> None:
         self._path = path
         self.socket = socket.socket(socket.AF_UNIX, kind)
-        """Bound socket."""
         try:
             self.socket.setblocking(False)
             path.parent.mkdir(0o700, parents=True, exist_ok=True)
@@ -37,33 +36,35 @@ class Local:
                 self.socket.bind(str(path))
             finally:
                 os.umask(before)
-            made = path.lstat()
+            status = path.lstat()
         except OSError as error:
             self.socket.close()
-            taken = "somebody listens there" if error.errno == EADDRINUSE else error.strerror
-            raise LocalError(f"{path}: no socket can be made: {taken or error}") from None
-        self._made = made.st_dev, made.st_ino
+            reason = (
+                "another process listens there" if error.errno == EADDRINUSE else error.strerror
+            )
+            raise LocalError(f"{path}: cannot create the socket: {reason or error}") from None
+        self._made = status.st_dev, status.st_ino
 
     def close(self) -> None:
         """Remove the socket, if the path still leads to it."""
         self.socket.close()
         with suppress(OSError):
-            found = self._path.lstat()
-            if (found.st_dev, found.st_ino) == self._made:
+            status = self._path.lstat()
+            if (status.st_dev, status.st_ino) == self._made:
                 self._path.unlink()
 
 
 def _clear(path: Path, kind: socket.SocketKind) -> None:
-    """Remove a socket of this user that no process listens at; leave anything else alone.
+    """Remove a socket of this user at which no process listens; leave anything else alone.
 
     Raises:
-        OSError: the socket cannot be removed, or another reason not to listen there.
+        OSError: the path is in use.
     """
     try:
-        found = path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
+    if not stat.S_ISSOCK(status.st_mode) or status.st_uid != os.geteuid():
         raise OSError("expected a new path, or a socket that an ended process left behind")
     with socket.socket(socket.AF_UNIX, kind) as caller:
         caller.setblocking(False)  # a listener whose queue is full counts as alive

@@ -1,9 +1,8 @@
 """The log of a process: its events on stdout, as text for an operator or as JSON for a program.
 
-A line of text begins with the local time and the name of the process.
-
-Logging never blocks the process. Lines wait for their reader in a thread of their own, up to a
-bound; if standard output is closed or full, lines are lost, and this is no error.
+A line of text begins with the local time and the name of the process. Lines wait in a bounded queue
+and are written by a thread, so that logging never blocks the process; if stdout is closed or full,
+lines are lost without an error.
 """
 
 import errno
@@ -23,19 +22,16 @@ from skytether.shell.writer import Writer
 ROOM_BYTES = 256 * 1024
 """Most bytes of lines that wait to be written."""
 TOGETHER_BYTES = 4096
-"""Most bytes of lines in one write: PIPE_BUF, which a pipe takes whole even with several
-writers."""
+"""Most bytes in one write: PIPE_BUF, which a pipe takes whole even with several writers."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until all lines are written [s]."""
+"""Longest time to wait at the end until all lines are written."""
 
 LogFormat = Literal["text", "json"]
 
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
-    """Line of a JSON log: an event, its process and its time."""
-
     process: str
-    """Name of the process: server, netem or client; `server.N` is worker N of a server."""
+    """Server, netem or client; `server.N` is worker N of a server."""
     time_ns: int
     """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event
@@ -43,11 +39,10 @@ class LogLine(msgspec.Struct, frozen=True, kw_only=True):
 
 _DECODER = msgspec.json.Decoder(LogLine)
 _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
-"""Errors of the decoder for text that is no log line."""
 
 
 def line_of(text: bytes) -> LogLine | None:
-    """Event in a printed line; None where the line is none of the log's: a traceback, say."""
+    """Parse a printed line; None if it is no line of the log, such as one of a traceback."""
     try:
         return _DECODER.decode(text)
     except _UNDECODABLE:
@@ -58,8 +53,7 @@ class Log:
     """Log of a process; writing to it never blocks and never raises.
 
     Args:
-        process: name of the process.
-        form: form of its lines.
+        form: text or JSON.
         beside: called with each event that is logged.
     """
 
@@ -73,15 +67,14 @@ class Log:
         self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
-        """Number of lines that were dropped for lack of room and not reported yet."""
 
     def hear(self, event: Event) -> None:
         """Log an event of an endpoint, within the limit of each kind."""
-        for told in self._limit.admit(event, now_ns=time.monotonic_ns()):
-            self.say(told)
+        for admitted in self._limit.admit(event, now_ns=time.monotonic_ns()):
+            self.say(admitted)
 
     def say(self, event: Event) -> None:
-        """Print an event, whole lines in one write: several workers may share the output."""
+        """Log an event in one write of whole lines: several workers may share the output."""
         self._beside(event)
         for line in self._lines(event):
             if not self._writer.write(line):
@@ -99,7 +92,6 @@ class Log:
                 self._unread = before
 
     def close(self) -> None:
-        """Wait until all lines are written, for a bounded time."""
         self._writer.close(PATIENCE_S)
 
     def _lines(self, event: Event) -> list[bytes]:
@@ -110,7 +102,7 @@ class Log:
         if isinstance(event, Counted):
             lines += rendered(_for_people(event.figures), indent=2)
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
-        # Not `encode()` alone: a file's name need not be valid Unicode.
+        # `printable` and not `encode` alone: a file's name need not be valid Unicode.
         shown = (f"{now} {self._process}: {printable(line)}\n" for line in lines)
         return [line.encode(errors="replace") for line in shown]
 
@@ -118,7 +110,7 @@ class Log:
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
     """Figures as lines: names and numbers in two columns, nested groups indented.
 
-    Groups with the same names, such as the two directions, share their lines, a column each.
+    Two groups with the same names, such as the two directions, share their lines, a column each.
     """
     groups = {name: value for name, value in figures.items() if isinstance(value, Mapping)}
     if len(groups) == 2 and len({frozenset(group) for group in groups.values()} - {()}) == 1:
@@ -136,7 +128,6 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
 
 
 def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures without cumulative histograms, which only monitoring programs need."""
     return {
         name: _for_people(value) if isinstance(value, Mapping) else value
         for name, value in figures.items()
@@ -145,7 +136,6 @@ def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
-    """Groups of the same kind, a column each, with their names at the left."""
     flat = [_flat(group) for group in groups.values()]
     names = dict.fromkeys(name for each in flat for name in each)
     table = [
@@ -161,7 +151,6 @@ def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
 
 
 def _flat(group: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Numbers of a group and of its nested groups, by names joined by spaces."""
     flat: dict[str, Any] = {}
     for name, value in group.items():
         inner = isinstance(value, Mapping)

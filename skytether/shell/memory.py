@@ -1,10 +1,10 @@
-"""File in which a client keeps its memory, so that the next run of the process finds it.
+"""File in which a client keeps its memory for the next run of the process.
 
     MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
 
-A thread writes it beside its place and renames it: no step waits for a disk, and the file is always
-whole. It need not survive a reboot, which outlasts any motion. A file that is damaged, or of
-another vehicle, key or flight, is refused with its reason.
+A thread writes a new file beside it and renames that, so that no step waits for a disk and the file
+is always whole. The file need not survive a reboot, which outlasts any motion. A file that is
+damaged, or of another vehicle, key or flight, is refused with the reason.
 """
 
 import asyncio
@@ -26,34 +26,31 @@ from skytether.shared.core.events import NotKept
 MAGIC = b"skytether memory 1\n"
 DIGEST_BYTES = 32
 FILE_BYTES_MAX = 65_536
-"""Largest size of a file [B]."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-"""File that names this run of the host, on Linux; its monotonic clock begins anew with each."""
+"""File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 AGAIN_S = 1.0
-"""Time after which a file that could not be written is tried again [s]."""
+"""Time after which a failed write is tried again."""
 
 
 class MemoryRefused(ValueError):
-    """Error: there is a file that must not be used; the message says why."""
+    """The memory file must not be used; the message says why."""
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """Content of a file, with its owner and the time of writing."""
-
     host: str
     """Boot id of the host; empty if the system has none."""
     written_ns: int
-    """Monotonic clock of the host when it was written [ns]."""
+    """Time of writing [ns; monotonic clock of the host]."""
     identity: dict[str, str]
-    """Names and values that the reader must have, too: vehicle, flight."""
+    """Names and values that must match the reader's: vehicle, flight."""
     content: bytes
 
 
 def folder(given: str) -> Path:
-    """Folder for the memory file that a scenario asks for.
+    """Folder for the memory file.
 
     Args:
-        given: `vehicle.memory`: a path, or "auto" for the state folder of a service of systemd,
+        given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service,
             else of the user.
     """
     if given != "auto":
@@ -66,15 +63,15 @@ def folder(given: str) -> Path:
 
 
 class MemoryFile:
-    """File of what one client keeps.
+    """File in which one client keeps its memory.
 
     Args:
-        path: its path; the folder is made where there is none.
+        path: path of the file; a missing folder is created.
         identity: names and values that a file must have in order to be used: vehicle, flight.
-        secret: key of the vehicle, so that nobody else can make such a file; empty without keys.
+        secret: key of the vehicle, which authenticates the file; empty without keys.
 
     Raises:
-        OSError: the folder cannot be made, or another process has this file.
+        OSError: the folder cannot be created, or another process uses this file.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
@@ -88,41 +85,38 @@ class MemoryFile:
                 raise
             raise OSError(f"{path}: another process keeps its memory there") from None
         self._wanted: bytes | None = None
-        """Content to be written next."""
         self._changed = threading.Condition()
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._told = ""
-        """Why the newest content could not be written, and the reason that was reported last;
-        empty if it was written."""
+        """Reason why the newest content could not be written, and reason reported last."""
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
         return self._path
 
     def read(self) -> tuple[bytes, int | None] | None:
         """Content that the previous run has kept, and the time of writing; None without a file.
 
-        The time is of the monotonic clock [ns]; None if the host was booted since.
+        The time is of the monotonic clock [ns]; None if the host was rebooted since.
 
         Raises:
-            MemoryRefused: there is a file that must not be used.
+            MemoryRefused: the file must not be used.
         """
         try:
-            held = files.read(self._path, FILE_BYTES_MAX, private=True)
+            content = files.read(self._path, FILE_BYTES_MAX, private=True)
         except FileNotFoundError:
             return None
         except OSError as error:
             raise MemoryRefused(f"{self._path}: {error.strerror or error}") from None
-        found = self._opened(held)
+        envelope = self._opened(content)
         for name, expected in self._identity.items():
-            given = found.identity.get(name, "")
-            if given != expected:
-                said = f"{name}: got {given or 'nothing'}, expected {expected}"
-                raise MemoryRefused(f"{self._path}: it was kept by another flight: {said}")
-        is_now = bool(self._host) and found.host == self._host
-        return found.content, found.written_ns if is_now else None
+            written = envelope.identity.get(name, "")
+            if written != expected:
+                mismatch = f"{name}: got {written or 'nothing'}, expected {expected}"
+                raise MemoryRefused(f"{self._path}: it was kept by another flight: {mismatch}")
+        is_now = bool(self._host) and envelope.host == self._host
+        return envelope.content, envelope.written_ns if is_now else None
 
     def _opened(self, held: bytes) -> _Envelope:
         digest, body = held[len(MAGIC) :][:DIGEST_BYTES], held[len(MAGIC) + DIGEST_BYTES :]
@@ -137,29 +131,22 @@ class MemoryFile:
         return blake2b(body, key=self._secret, digest_size=DIGEST_BYTES, person=b"memory").digest()
 
     def sealed(self, content: bytes, written_ns: int) -> bytes:
-        """Bytes of the file for a content."""
         envelope = _Envelope(self._host, written_ns, self._identity, content)
         body = msgspec.msgpack.encode(envelope)
         return MAGIC + self._digest(body) + body
 
     def forget(self) -> None:
-        """Remove the file: a person begins a new flight.
-
-        Raises:
-            OSError: it cannot be removed.
-        """
         self._path.unlink(missing_ok=True)
 
     # -- in flight -----------------------------------------------------------------------------
 
     def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
-        """Start the thread that writes the content of an endpoint and acknowledges it."""
+        """Start the thread that writes the endpoint's memory and acknowledges it."""
         self._endpoint, self._loop = endpoint, loop
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def look(self) -> None:
-        """Fetch new content from the endpoint, for the thread to write."""
         now_ns = time.monotonic_ns()
         content = self._endpoint.keep(now_ns=now_ns)
         if content is not None:
@@ -168,10 +155,10 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Event that says why the file cannot be written; None if it can, or it was said before."""
-        failure, told = self._failure, self._told
+        """Event that says why the file cannot be written; None if it can, or that was reported."""
+        failure, reported = self._failure, self._told
         self._told = failure
-        return NotKept(reason=failure) if failure and failure != told else None
+        return NotKept(reason=failure) if failure and failure != reported else None
 
     def close(self) -> None:
         """Write the rest, within a bounded time, and release the file's lock."""
@@ -190,17 +177,17 @@ class MemoryFile:
                     self._changed.wait()
                 if self._wanted is None:
                     return
-                held = self._wanted
+                content = self._wanted
             try:
                 with files.replacing(
                     self._path, is_input=True, mode=0o600, is_synced=False
                 ) as file:
-                    file.write(held)
+                    file.write(content)
                 self._failure = ""
             except OSError as error:
                 self._failure = f"{self._path}: {error.strerror or error}"
             with self._changed:
-                is_newest = self._wanted is held
+                is_newest = self._wanted is content
                 if is_newest and not self._failure:
                     self._wanted = None
                 elif self._failure:
@@ -212,7 +199,6 @@ class MemoryFile:
                     self._loop.call_soon_threadsafe(self._tell)
 
     def _tell(self) -> None:
-        """Tell the endpoint that its newest content is written, unless there is newer content."""
         if self._wanted is None:
             self._endpoint.kept()
 

@@ -1,8 +1,7 @@
-"""Tables of metrics: names, units and labels of a process's figures for Prometheus, and its health.
+"""Metrics of a process for Prometheus: tables of names, units and labels, and its health.
 
-Each figure of an endpoint (`Endpoint.figures`) is either exported by a metric or left out on
-purpose; a figure that is neither is counted, and fails a test. Names follow Prometheus: base units,
-`_total` for counters. `shell.exporter` serves the metrics.
+Each figure of an endpoint (`Endpoint.figures`) is in a table, or in LEFT_OUT; a figure that is in
+neither is counted, and fails a test. Names follow Prometheus: base units, `_total` for counters.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,9 +12,7 @@ from prometheus_client.metrics_core import Metric as Exposed
 from skytether.shared.wire.protocol import Mode
 
 PREFIX = "skytether_"
-"""Prefix of all metrics' names."""
 UNITS = {"_ms": 1e-3, "_ns": 1e-9}
-"""Units in figures' names, and their factors to the metrics' base units."""
 
 
 class Metric(NamedTuple):
@@ -23,17 +20,15 @@ class Metric(NamedTuple):
 
     figure: str
     """Path of the figure: names of its groups and its own, with slashes between them. `{label}`
-    matches any name, which becomes the value of that label."""
+    matches any name, which becomes the value of that label.
+    """
     name: str
-    """Name of the metric, without the prefix."""
     labels: Mapping[str, str]
     """Fixed labels, which separate figures of the same metric."""
     help: str
-    """Help text of the metric: one sentence."""
 
     @property
     def kind(self) -> str:
-        """Kind of the metric: counter, histogram, summary or gauge, as its name and labels show."""
         if self.name.endswith("_total"):
             return "counter"
         if "{le}" in self.figure:
@@ -42,16 +37,14 @@ class Metric(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Factor from the figure's unit to the metric's."""
         return next((scale for unit, scale in UNITS.items() if unit in self.figure), 1.0)
 
     def exposed(self) -> Exposed:
-        """The metric as prometheus_client knows it, without numbers."""
         # prometheus_client adds the suffix of a counter's name itself.
         return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
 
     def add(self, exposed: Exposed, labels: Mapping[str, str], value: Any) -> None:
-        """Add a figure to the metric; a mode is a number for each mode, 1 for this one."""
+        """Add a figure; a mode becomes one sample for each mode, 1 for the present one, else 0."""
         name, labels = PREFIX + self.name, {**labels, **self.labels}
         if isinstance(value, str):
             for mode in map(str, Mode):
@@ -68,12 +61,14 @@ class Metric(NamedTuple):
 
 
 def _table(text: str) -> tuple[Metric, ...]:
-    """Metrics of a table with two lines each: figure and name, below them the help."""
+    """Metrics of a table of two lines each: figure, name and labels; below them the help."""
     lines = iter(text.strip().splitlines())
     metrics = []
-    for head, told in zip(lines, lines, strict=True):
+    for head, description in zip(lines, lines, strict=True):
         figure, name, *fixed = head.split()
-        metrics.append(Metric(figure, name, dict(each.split("=") for each in fixed), told.strip()))
+        metrics.append(
+            Metric(figure, name, dict(each.split("=") for each in fixed), description.strip())
+        )
     return tuple(metrics)
 
 
@@ -83,7 +78,7 @@ vehicles server_vehicles
 degraded server_degraded
     Whether the server misses more ticks than allowed: 1 or 0.
 missed server_missed_ticks_total
-    Ticks that were missed because the process ran too late.
+    Ticks that were missed because the process was late.
 observations server_observations_total
     Observations that were accepted as plausible.
 ticks_within_ms/{le} server_tick_seconds
@@ -91,39 +86,39 @@ ticks_within_ms/{le} server_tick_seconds
 spent_ns/{part} server_spent_seconds_total
     Time spent on each part of the work.
 counts/steps server_steps_total
-    Steps of vehicles at which the server decided whether to send.
+    Steps of vehicles for which the server decided whether to send.
 counts/events server_events_total
-    Steps of vehicles at which the server sent a horizon.
+    Steps of vehicles for which the server sent a horizon.
 counts/unsolved server_unsolved_total
-    Steps for which no plan was found.
+    Steps of vehicles for which no plan was found.
 counts/horizons_lost server_lost_horizons_total
     Horizons that were sent but did not come into force in time.
 counts/scheme_errors server_scheme_errors_total
-    Steps of vehicles at which a plug-in's scheme failed.
+    Steps of vehicles for which a plug-in's scheme failed.
 dropped/{reason} server_dropped_datagrams_total
-    Datagrams that came from no vehicle or could not be read, by reason.
+    Datagrams that were dropped because they came from no vehicle or could not be read, by reason.
 refused/{reason} server_refused_vehicles_total
     Requests for a session (HELLO) that were refused, by reason.
 by_vehicle/{vehicle}/step server_vehicle_step
     Newest step of the vehicle for which the server made a decision.
 by_vehicle/{vehicle}/clock_bound_ms server_vehicle_clock_bound_seconds
-    Half of the time that the vehicle's clock may lie apart, as far as the server knows.
+    Uncertainty of the offset between the server's and the vehicle's clock, plus or minus.
 by_vehicle/{vehicle}/clock_m server_vehicle_clock_metres
-    Distance by which the vehicle may be elsewhere on its motion, for want of its clock.
+    Uncertainty of the vehicle's position along its motion that follows from its clock's offset.
 """)
 _NETEM = _table("""
 flows netem_flows
     Clients whose packets are forwarded.
 refused netem_refused_packets_total
-    Packets of clients without a flow, or of strangers at the socket of a flow.
+    Packets that were refused: of clients without a flow, or from an unknown address.
 {direction}/packets netem_packets_total
-    Packets that entered.
+    Packets received by netem.
 {direction}/bytes netem_bytes_total
-    UDP payload of the packets that entered.
+    UDP payload of the packets received.
 {direction}/forwarded netem_forwarded_packets_total
-    Packets that left.
+    Packets that were sent on.
 {direction}/undelivered netem_undelivered_packets_total
-    Packets that could not be sent on, or were refused on their way.
+    Packets that could not be sent on, or were reported undeliverable by ICMP.
 {direction}/lost netem_lost_packets_total
     Packets that the scenario's loss model dropped.
 {direction}/reordered netem_reordered_packets_total
@@ -135,19 +130,19 @@ refused netem_refused_packets_total
 {direction}/dropped netem_dropped_packets_total
     Packets that the queue of a limited rate dropped.
 {direction}/duplicated netem_duplicated_packets_total
-    Duplicates of packets that were made.
+    Duplicates of packets that the network model made.
 {direction}/corrupted netem_corrupted_packets_total
     Packets in which a bit was flipped.
 {direction}/queue netem_queued_packets
-    Packets that are delayed now and have not left.
+    Packets that are being delayed.
 {direction}/delays_within_ms/{le} netem_delay_seconds
-    Delays that the network model drew for packets that left.
+    Delays that the network model drew for packets sent on.
 {direction}/error_ms_p50 netem_lateness_seconds quantile=0.5
-    Time by which packets left later than the network model demanded.
+    Time by which packets were sent later than the network model demanded.
 {direction}/error_ms_p99 netem_lateness_seconds quantile=0.99
-    Time by which packets left later than the network model demanded.
+    Time by which packets were sent later than the network model demanded.
 {direction}/error_ms_max netem_lateness_seconds quantile=1
-    Time by which packets left later than the network model demanded.
+    Time by which packets were sent later than the network model demanded.
 {direction}/queueing_ms_p50 netem_queueing_seconds quantile=0.5
     Time that packets waited for a limited rate.
 {direction}/queueing_ms_p99 netem_queueing_seconds quantile=0.99
@@ -155,23 +150,23 @@ refused netem_refused_packets_total
 """)
 _CLIENT = _table("""
 missed client_missed_steps_total
-    Steps that were missed because the process ran too late.
+    Steps that were missed because the process was late.
 by_vehicle/{vehicle}/mode client_mode
     Mode of the vehicle, see docs/failsafe.md: 1 for the present mode, 0 for the others.
 by_vehicle/{vehicle}/step client_step
     Number of the vehicle's next step.
 by_vehicle/{vehicle}/steps client_steps
-    Number of steps of the whole flight.
+    Steps of the whole flight.
 by_vehicle/{vehicle}/age_ms client_age_seconds
     Age of the observation from which the input in force was planned.
 by_vehicle/{vehicle}/plan_age_ms client_plan_age_seconds
-    Time since the step that the horizon in force was made for.
+    Time since the first step of the horizon in force.
 by_vehicle/{vehicle}/horizons client_horizons_total
     Horizons received.
 by_vehicle/{vehicle}/dropped/{reason} client_dropped_datagrams_total
-    Datagrams that were not the server's, came too late or could not be read, by reason.
+    Datagrams that were dropped: not the server's, too late or unreadable, by reason.
 others_dropped/{reason} client_dropped_datagrams_total vehicle=others
-    Datagrams that were not the server's, came too late or could not be read, by reason.
+    Datagrams that were dropped: not the server's, too late or unreadable, by reason.
 by_vehicle/{vehicle}/autopilot/armed autopilot_armed
     Whether the autopilot is armed: 1 or 0.
 by_vehicle/{vehicle}/autopilot/mode_number autopilot_mode
@@ -183,7 +178,7 @@ by_vehicle/{vehicle}/autopilot/voltage_v autopilot_battery_volts
 by_vehicle/{vehicle}/autopilot/home/{coordinate} autopilot_home
     Autopilot's home: latitude and longitude in degrees, altitude above the sea in metres.
 by_vehicle/{vehicle}/autopilot/fence/{parameter} autopilot_fence
-    Values of the autopilot's own fence parameters.
+    Values of the autopilot's fence parameters.
 by_vehicle/{vehicle}/autopilot/measurements autopilot_measurements_total
     Positions from the autopilot that were accepted.
 by_vehicle/{vehicle}/autopilot/heard autopilot_messages_total
@@ -191,7 +186,7 @@ by_vehicle/{vehicle}/autopilot/heard autopilot_messages_total
 by_vehicle/{vehicle}/autopilot/setpoints autopilot_setpoints_total
     Velocity set-points sent to the autopilot.
 by_vehicle/{vehicle}/autopilot/dropped/{reason} autopilot_dropped_messages_total
-    Messages on the autopilot's line from others, for others, or with an impossible time.
+    Messages that were dropped: from or for other systems, or with an impossible time, by reason.
 by_vehicle/{vehicle}/autopilot/garbage_bytes autopilot_garbage_bytes_total
     Bytes on the autopilot's line that belong to no valid message.
 by_vehicle/{vehicle}/autopilot/round_trip_ms autopilot_round_trip_seconds
@@ -201,7 +196,7 @@ by_vehicle/{vehicle}/autopilot/drift_ppm autopilot_clock_drift_ppm
 """)
 _PROCESS = _table("""
 cpu_s cpu_seconds_total
-    CPU time used.
+    CPU time of the process.
 kernel_drops kernel_dropped_datagrams_total
     Datagrams that the kernel dropped at the process's sockets.
 send_errors send_errors_total
@@ -214,25 +209,27 @@ feed/refused feed_refused_readers_total
     Readers of the feed that were refused because the feed was full.
 """)
 TABLES = {"server": _PROCESS + _SERVER, "netem": _PROCESS + _NETEM, "client": _PROCESS + _CLIENT}
-"""Metrics of each kind of process."""
 OWN = _table("""
 - info
-    Labels that name the process and what it flies; the value is always 1.
+    Name of the process and of its scenario, as labels; the value is always 1.
 - step_seconds
     Length of a step, the deadline of a tick.
 - snapshot_age_seconds
     Time since the other metrics were updated.
 - unmapped_figures
-    Figures of the process that no metric exports; more than 0 is a mistake in Skytether.
+    Figures of the process that no metric exports; more than 0 is a bug in Skytether.
 """)
-"""Metrics of the process itself and of the exporter, which export no figure."""
+"""Metrics of the exporter itself, which export no figure."""
 LEFT_OUT = {
-    "server": ("tick_ms_p50", "tick_ms_p99"),  # since the start; the histogram has any period
+    "server": (
+        "tick_ms_p50",
+        "tick_ms_p99",
+    ),  # cumulative since the start; the histogram serves any period
     "netem": (
         "{direction}/delay_ms_p50",
         "{direction}/delay_ms_p99",
         "{direction}/delays_ms/{ms}",  # up to 500 numbers
-        "{direction}/queue_max",  # since the start; Prometheus has the largest over any period
+        "{direction}/queue_max",  # cumulative; Prometheus computes the maximum over any period
     ),
     "client": (
         "vehicles",  # constant
@@ -245,56 +242,52 @@ LEFT_OUT = {
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:
-    """Metrics of some figures, and the paths of figures that are in no table.
+    """Metrics of figures, and the paths of figures that are in no table.
 
     Args:
-        process: server, netem or client; another process has no table, and figures of its own that
-            are not exported.
+        process: server, netem or client; other processes have only the common metrics.
         figures: from `Endpoint.figures`, and those that the process adds.
     """
-    found: dict[str, Exposed] = {}
+    metrics: dict[str, Exposed] = {}
     unknown = []
     for path, value in flat(figures):
         for metric in TABLES.get(process, _PROCESS):
             labels = matched(metric.figure, path)
             if labels is not None:
-                if metric.name not in found:
-                    found[metric.name] = metric.exposed()
-                metric.add(found[metric.name], labels, value)
+                if metric.name not in metrics:
+                    metrics[metric.name] = metric.exposed()
+                metric.add(metrics[metric.name], labels, value)
                 break
         else:
             left_out = LEFT_OUT.get(process, ())
             if process in TABLES and all(matched(each, path) is None for each in left_out):
                 unknown.append("/".join(path))
-    return list(found.values()), unknown
+    return list(metrics.values()), unknown
 
 
 def trouble(process: str, figures: Mapping[str, Any]) -> str:
-    """Reason why a process is unhealthy, as its figures show; empty for a healthy one.
+    """Reason why a process is unhealthy, by its figures; empty for a healthy one.
 
-    A server is unhealthy if it misses ticks, and a client if one of its vehicles neither flies nor
-    is ready to.
-
-    Args:
-        process, figures: see `families`.
+    A server is unhealthy if it misses too many ticks, a client if a vehicle neither flies nor is
+    ready.
     """
     if process == "server" and figures.get("degraded"):
         return "it misses more ticks than allowed"
     if process == "client":
-        for vehicle, told in figures["by_vehicle"].items():
-            if told["mode"] not in HEALTHY:
-                return f"vehicle {vehicle} is in mode {told['mode']}"
+        for vehicle, state in figures["by_vehicle"].items():
+            if state["mode"] not in HEALTHY:
+                return f"vehicle {vehicle} is in mode {state['mode']}"
     return ""
 
 
 HEALTHY = {str(mode) for mode in (Mode.READY, Mode.TRACK, Mode.COAST)}
-"""Names of the modes of a vehicle that has a session and flies, or is ready to."""
+"""Modes of a vehicle that has a session and flies, or is ready to."""
 
 
 def flat(
     figures: Mapping[str, Any], groups: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Figures by their paths: the names of their groups, and their own."""
+    """Figures by path: the names of their groups, and their own."""
     for name, value in figures.items():
         if isinstance(value, Mapping):
             yield from flat(value, (*groups, name))
@@ -304,11 +297,11 @@ def flat(
 
 def matched(figure: str, path: tuple[str, ...]) -> dict[str, str] | None:
     """Labels of a figure with this path; None where the metric's path does not match."""
-    meant = figure.split("/")
-    if len(meant) != len(path):
+    pattern = figure.split("/")
+    if len(pattern) != len(path):
         return None
     labels = {}
-    for part, name in zip(meant, path, strict=True):
+    for part, name in zip(pattern, path, strict=True):
         if part.startswith("{"):
             labels[part[1:-1]] = name
         elif part != name:
@@ -317,7 +310,6 @@ def matched(figure: str, path: tuple[str, ...]) -> dict[str, str] | None:
 
 
 def names() -> frozenset[str]:
-    """Names of all metrics that any process may serve."""
     return frozenset(
         PREFIX + metric.name + suffix
         for table in (*TABLES.values(), OWN)

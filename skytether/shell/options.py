@@ -1,9 +1,9 @@
-"""Options of a command on its command line: a dataclass, and a scenario whose keys are flags.
+"""Command-line options: a dataclass, and a scenario whose keys are flags.
 
-Flags of keys, as in `--control.trigger always`, are read here and checked with the scenario. tyro
-reads the options, shows the help and reports wrong flags. But to import it takes 0.2 s and 9 MB at
-each start of a process. So simple flags, as commands use to start processes, are read here as well,
-and tyro is given a scenario's keys for `--help-keys` alone.
+Flags of keys, as in `--control.trigger always`, are parsed here and checked with the scenario. tyro
+parses the other options, shows the help and reports wrong flags. Importing tyro takes 0.2 s and 9
+MB at each start of a process; so simple flags, which commands pass to processes, are parsed here,
+and tyro gets a scenario's keys only for `--help-keys`.
 """
 
 import dataclasses
@@ -27,7 +27,6 @@ from skytether.shell import plugins
 T = TypeVar("T")
 
 HELP_KEYS = "--help-keys"
-"""Flag that shows the help with every key of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,24 +34,21 @@ class Argument:
     """Annotation of a field: its form on the command line."""
 
     name: str | None = None
-    """Name of the flag, if different from the field's; empty: each of the field's own fields is a
-    flag."""
+    """Name of the flag, if different from the field's; "": its value's fields are flags."""
     metavar: str | None = None
-    """Placeholder for the value in the help."""
     help: str | None = None
     """Text of the help, if different from the field's docstring."""
     positional: bool = False
-    """Whether the argument is positional, without a flag."""
     append: bool = False
-    """Whether the flag may come several times, with a value each."""
+    """Whether the flag may be repeated, with a value each."""
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, laid over defaults; `help_` says what the command does.
+    """Options of a command line, laid over defaults; `help_` describes the command.
 
     Raises:
         ConfigError: a plug-in cannot be imported.
-        SystemExit: tyro has shown the help, or what is wrong with a flag.
+        SystemExit: tyro has shown the help, or an error in a flag.
     """
     plugins.load(plugins.named(argv))
     options = plain(default, argv)
@@ -74,14 +70,14 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
-    """Command line without flags of a scenario's keys, and the plain values of these.
+    """Command line without flags of a scenario's keys, and the values of those keys.
 
-    A key takes one word, a list all words up to the next flag, and a boolean none: it is written
+    A key takes one word, a list all words up to the next flag. A boolean takes none: it is written
     `--control.feedback` or `--control.no-feedback`.
 
     Args:
         argv: the command line.
-        options: the command's options, whose flags are no keys.
+        options: the command's options; their flags are not keys.
 
     Raises:
         ConfigError: a key has no value.
@@ -109,8 +105,7 @@ def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str,
 
 
 def _slipped(flag: str) -> bool:
-    """Whether an unknown flag resembles a top-level key of the scenario."""
-    import difflib  # for mistakes alone
+    import difflib  # slow to import, and needed only after a typing error
 
     keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
     return bool(difflib.get_close_matches(flag, keys, 1, 0.8))
@@ -127,7 +122,7 @@ def _key_value(key: str, words: Sequence[str]) -> Any:
 
 
 def _number_or_other(word: str) -> Any:
-    """Value of a text as TOML, or as Python writes a number: `1.`, `.5`."""
+    """Value of a text as TOML, or as a number in Python's notation: `1.`, `.5`."""
     value = toml_value(word)
     with suppress(ValueError):
         return float(word) if isinstance(value, str) else value
@@ -136,7 +131,7 @@ def _number_or_other(word: str) -> Any:
 
 @cache
 def _kinds(key: str) -> frozenset[Any]:
-    """Types of a key's values, without their arguments; none if there is no such key."""
+    """Types of a key's values, without their arguments; empty if there is no such key."""
     kind: Any = Scenario
     for name in key.split("."):
         kind = get_type_hints(kind).get(name) if hasattr(kind, "__struct_fields__") else None
@@ -148,7 +143,7 @@ def _kinds(key: str) -> frozenset[Any]:
 
 
 def toml_value(text: str) -> Any:
-    """Value of a text as TOML if JSON can express it too; any other text is a string itself."""
+    """Value of a text as TOML if JSON can express it too; else the text itself."""
     try:
         table = toml.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
@@ -190,7 +185,6 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 
 
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
-    """Fields of options by flag, and the positional ones."""
     flags, positional = {}, []
     for name, hint in _hints(options).items():
         argument = _argument(hint) or Argument()
@@ -202,7 +196,6 @@ def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
 
 
 def _argument(hint: Any) -> Argument | None:
-    """Form of a field on the command line, where its annotation has one."""
     return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, Argument)), None)
 
 
@@ -224,24 +217,24 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
 
 
 def _tell_tyro(options: type, undo: ExitStack, *, keys: bool) -> None:
-    """Add tyro's annotations to options, from their own; with a scenario's keys or without.
+    """Replace annotations of options by tyro's, with a scenario's keys or without.
 
     Args:
         undo: restores the options' own annotations.
     """
     from tyro import conf
 
-    said = meanings(options)
+    help_texts = meanings(options)
 
-    def told(name: str, hint: Any) -> Any:
+    def annotated(name: str, hint: Any) -> Any:
         argument = _argument(hint) or Argument()
         if argument.name == "" and not keys:
             return Annotated[hint, conf.Fixed, conf.Suppress]
         within = hint if isinstance(hint, type) else get_args(hint)[0]
         if dataclasses.is_dataclass(within) or hasattr(within, "__struct_fields__"):
             _tell_tyro(within, undo, keys=keys)
-        # In one line: tyro would keep the breaks of the source, and wrap what is between them.
-        text = argument.help or said.get(name)
+        # As one line: tyro would keep the source's line breaks, and wrap between them.
+        text = argument.help or help_texts.get(name)
         words = [conf.arg(name=argument.name, metavar=argument.metavar, help=text)]
         words += [conf.FlagCreatePairsOff] * (hint is bool)  # no --no-no-page
         words += [conf.Positional] * argument.positional
@@ -249,10 +242,11 @@ def _tell_tyro(options: type, undo: ExitStack, *, keys: bool) -> None:
         return Annotated[(hint, *words)]
 
     undo.callback(setattr, options, "__annotations__", options.__annotations__)
-    options.__annotations__ = {name: told(name, hint) for name, hint in _hints(options).items()}
+    options.__annotations__ = {
+        name: annotated(name, hint) for name, hint in _hints(options).items()
+    }
 
 
 @cache
 def _hints(options: type) -> Mapping[str, Any]:
-    """Annotations of options, with their extras."""
     return get_type_hints(options, include_extras=True)

@@ -1,8 +1,8 @@
 """Plug-ins: users' Python code that adds names for scenarios (`shared.scenario.registry`).
 
-A plug-in is a file (`--plugin FILE`), or an installed package that declares entry points. All are
-imported before a scenario is read; processes that a command starts get the same files. A plug-in
-runs with all rights of the user.
+A plug-in is a file (`--plugin FILE`), or an installed package that declares entry points. Plug-ins
+are imported before a scenario is read; processes that a command starts get the same files. A
+plug-in runs with all rights of the user.
 """
 
 import hashlib
@@ -30,7 +30,6 @@ from skytether.shared.scenario.registry import (
 
 FLAG = "--plugin"
 FILE_BYTES_MAX = 1_000_000
-"""Largest size of a plug-in's file [B]."""
 GROUPS = {
     "skytether.schemes": SCHEMES,
     "skytether.triggers": TRIGGERS,
@@ -38,16 +37,13 @@ GROUPS = {
     "skytether.vehicles": VEHICLES,
     "skytether.impairments": IMPAIRMENTS,
 }
-"""Groups of entry points, and the tables that they extend."""
+"""Tables that plug-ins extend, by group of entry points."""
 
 
 class Plugin(NamedTuple):
-    """Plug-in that is a file."""
-
     path: str
     """Absolute path, which is also the name of its module."""
     code: bytes
-    """Content of the file."""
 
 
 _loaded: dict[str, Plugin] = {}
@@ -59,9 +55,7 @@ def named(argv: Sequence[str]) -> list[str]:
 
 
 def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
-    """Values of a flag on a command line, and the line without them; a flag without its value
-    stays there.
-    """
+    """Values of a flag on a command line, and the line without them; a flag without value stays."""
     words, values, rest = deque(argv), list[str](), list[str]()
     while words:
         word = words.popleft()
@@ -75,7 +69,7 @@ def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
 
 
 def load(paths: Iterable[str] = ()) -> None:
-    """Import plug-ins: those of installed packages, once per process, and files.
+    """Import plug-ins: those of installed packages (once per process) and files.
 
     Raises:
         ConfigError: a plug-in cannot be read or imported, adds nothing, or adds an existing name.
@@ -92,21 +86,16 @@ def load(paths: Iterable[str] = ()) -> None:
 
 
 def loaded() -> tuple[Plugin, ...]:
-    """Files that this process has imported, to be passed to `use` elsewhere."""
+    """Files that this process has imported, as arguments for `use` in another process."""
     return tuple(_loaded.values())
 
 
 def flags() -> list[str]:
-    """Command-line arguments with which a child process loads the same plug-ins."""
     return [word for path in _loaded for word in (FLAG, path)]
 
 
 def use(plugins: Iterable[Plugin]) -> None:
-    """Import plug-ins that were read already, maybe by another process, and installed ones.
-
-    Raises:
-        ConfigError: see `load`.
-    """
+    """Import installed plug-ins, and files read already, perhaps by another process."""
     _load_installed()
     for plugin in plugins:
         if _loaded.get(plugin.path) != plugin:
@@ -124,31 +113,26 @@ def _import(plugin: Plugin) -> None:
         exec(compile(code, path, "exec"), module.__dict__)
 
     with _tables(f"{FLAG}: {path}"):
-        for table in TABLES:  # compiled from an older version of the file
+        for table in TABLES:  # remove entries of an older version of the file
             for name in [name for name, entry in table.items() if entry.source == path]:
                 del table[name]
         _guarded(run, f"{FLAG}: {path}", path)
-        version, found = hashlib.blake2b(code, digest_size=8).hexdigest(), 0
+        version, added = hashlib.blake2b(code, digest_size=8).hexdigest(), 0
         for table in TABLES:
             for name, entry in table.items():
                 if entry.source == path:
-                    table[name], found = replace(entry, version=version), found + 1
-        if not found:
+                    table[name], added = replace(entry, version=version), added + 1
+        if not added:
             kinds = "@trigger, @scheme, @reference, @vehicle or @impairment"
-            expected = f"{kinds} on something, see docs"
+            expected = f"{kinds} on a function or class, see docs"
             raise ConfigError(f"{FLAG}: {path}: adds nothing, expected {expected}")
 
 
 @cache
 def _load_installed() -> None:
-    """Import the plug-ins of installed packages, found by their entry points.
-
-    Raises:
-        ConfigError: see `load`.
-    """
     if not any(_mention_groups(Path(folder)) for folder in sys.path):
         return
-    from importlib import metadata  # takes 0.1 s, with all that it reads
+    from importlib import metadata  # takes 0.1 s to import
 
     for group, table in GROUPS.items():
         for point in sorted(metadata.entry_points(group=group)):
@@ -156,15 +140,14 @@ def _load_installed() -> None:
             version = f"{dist.name} {dist.version}" if dist else ""
             where = f"entry point {point.name} = {point.value} of {version}"
             with _tables(where):
-                made = _guarded(point.load, where)
-                there = table.get(point.name)
-                if there is None or there.make is not made:
-                    table.add(made, point.name)
+                function = _guarded(point.load, where)
+                present = table.get(point.name)
+                if present is None or present.make is not function:
+                    table.add(function, point.name)
                 table[point.name] = replace(table[point.name], version=version)
 
 
 def _mention_groups(folder: Path) -> bool:
-    """Whether any package in a folder of packages has entry points of ours."""
     words = [f"[{group}]".encode() for group in GROUPS]
     for points in folder.glob("*-info/entry_points.txt"):
         with suppress(OSError):
@@ -176,7 +159,7 @@ def _mention_groups(folder: Path) -> bool:
 
 @contextmanager
 def _tables(where: str) -> Iterator[None]:
-    """Restore all tables where the block fails, and say which plug-in failed."""
+    """Restore all tables if the block fails, and name the plug-in in the error."""
     before = [dict(table) for table in TABLES]
     try:
         yield
@@ -190,14 +173,7 @@ def _tables(where: str) -> Iterator[None]:
 
 
 def _guarded(run: Callable[[], Any], where: str, path: str = "") -> Any:
-    """Run a plug-in's code, with one line for any exception.
-
-    Args:
-        path: its file, for the line number.
-
-    Raises:
-        ConfigError: the code raised an exception.
-    """
+    """Run a plug-in's code; any exception becomes a ConfigError of one line."""
     try:
         return run()
     except ConfigError:

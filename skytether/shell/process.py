@@ -49,40 +49,36 @@ from skytether.shell.recording import RecordFile
 from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
 
-# for type checking alone: they are slow to import, and a process that flies does without
+# for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
     from skytether.shell.exporter import Metrics
 
 
 @dataclass(frozen=True)
 class ProcessOptions(ScenarioOptions):
-    """Options of every process."""
-
     log: LogFormat = "text"
     """Format in which each event is printed: a sentence, or a line of JSON for a program."""
     record: Path | None = None
-    """File for the process's part of the record; one that ends in .mcap becomes a recording with
-    all that it says, see `skytether join`."""
+    """File for the process's part of the record; a name that ends in .mcap makes a recording with
+    its rows and events, see `skytether join`.
+    """
     json: Path | None = None
     """File for the process's counters and its CPU time, as JSON."""
     control: Path | None = None
-    """Unix socket to make, through which keys change in flight, see `skytether set`."""
+    """Unix socket to create, through which keys change in flight, see `skytether set`."""
     new_flight: bool = False
-    """Begin a new flight: discard what was set in flight in an earlier run, and is kept beside the
-    socket of --control. For a person to say; never put it into the command of a service."""
+    """Begin a new flight: discard values that were set in an earlier run, which are kept beside the
+    socket of --control. To be given by a person; never put it into the command of a service.
+    """
     feed: Path | None = None
-    """Unix socket to make, at which other programs read the rows and events of this process."""
+    """Unix socket to create, at which other programs read the rows and events of this process."""
     metrics: str | None = None
-    """HTTP address to serve metrics at, HOST:PORT, for Prometheus, and /healthz."""
+    """HTTP address for Prometheus metrics and /healthz, HOST:PORT."""
 
 
 @contextmanager
 def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a file; if the disk fails in flight, the flight goes on and the command fails.
-
-    Raises:
-        CommandError: the file cannot be opened; at the end, it does not hold all rows.
-    """
+    """Record into a file; if the disk fails in flight, the flight goes on and the command fails."""
     try:
         growing = files.Growing(path, buffering=0)
     except OSError as error:
@@ -96,11 +92,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; if none can be made, nothing is recorded.
-
-    Raises:
-        CommandError: at the end, the file does not hold all rows.
-    """
+    """Record into a temporary file; if none can be created, nothing is recorded."""
     file: BinaryIO | OSError
     try:
         temporary = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - the recording closes it
@@ -120,28 +112,21 @@ def _until_the_end(recording: RecordFile) -> Iterator[RecordFile]:
 
 @dataclass(slots=True)
 class Process:
-    """One endpoint as a process, made by `begin`."""
-
     name: str
-    """Name in its log."""
     options: ProcessOptions
     secure: bool | None
-    """Whether it has keys; None for one that only forwards datagrams."""
+    """Whether the endpoint has keys; None for netem, which only forwards datagrams."""
     scenario: Scenario
-    """The scenario, with what was set in an earlier run."""
     journal: Journal | None
-    """Journal of what is set in flight."""
     warnings: list[Event]
-    """Warnings and news for the operator, said at the start."""
     recording: RecordFile | None
-    """File of its rows; the process waits at the end until they are written."""
+    """File of the endpoint's rows; the process waits at the end until they are written."""
     feed: Feed | None
-    """Feed of its rows and events."""
     recorder: Recorder | None
-    """Recorder of its rows, for a file, a feed or both; None for neither."""
+    """Recorder of the endpoint's rows, for a file, a feed or both; None for neither."""
 
     def fed(self, part: str, columns: np.dtype[np.void]) -> Recorder | None:
-        """Recorder of a further part of the record, for the feed alone; None without one."""
+        """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
     def drive(
@@ -159,17 +144,13 @@ class Process:
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,
     ) -> None:
-        """Run an endpoint until it has finished or is told to stop.
+        """Run an endpoint until it has finished or is stopped.
 
         Args:
-            endpoint: what to run.
             bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
-            waiting_for: the peer whose datagrams it waits for, named to the operator.
-            insecure: whether it may run without keys even where other machines can reach it.
+            waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
+            insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
-
-        Raises:
-            CommandError: it cannot start, lacks the keys it needs, or a file cannot be written.
         """
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
@@ -263,17 +244,16 @@ def begin(
     warnings: Sequence[Event] = (),
     keeps_rows: bool = False,
 ) -> Iterator[Process]:
-    """Take up what was set in an earlier run, and open record and feed for as long as the block
-    takes.
+    """Restore values set in an earlier run, and open record and feed during the block.
 
     Args:
         name, options, secure, warnings: see `Process`.
         columns: columns of its rows.
-        number: number of a worker, which stands behind its name; 0 for a process alone.
-        keeps_rows: whether its rows are kept in a temporary file where no record is asked for.
+        number: number of a worker, which is added to its name; 0 for a single process.
+        keeps_rows: whether rows go to a temporary file if no record is asked for.
 
     Raises:
-        CommandError: a file or a socket cannot be made; at the end, the record is incomplete.
+        CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
     """
     taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
     part = None if options.record and options.record.suffix == RECORDING else options.record
@@ -308,11 +288,7 @@ def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.vo
 
 @contextmanager
 def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]:
-    """Serve metrics over HTTP for as long as the block takes; none without an address.
-
-    Raises:
-        CommandError: the address cannot be listened at.
-    """
+    """Serve metrics over HTTP during the block; None without an address."""
     if options.metrics is None:
         yield None
         return
@@ -330,7 +306,6 @@ def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]
 
 
 def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
-    """Function that makes the first frame of a feed."""
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
     return lambda: Opened(
         process=process,
@@ -344,11 +319,9 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
 
 @contextmanager
 def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Feed | None]:
-    """Open a feed for the duration of the block; None if neither a feed nor a recording is
-    requested. A recording (.mcap) is written from the feed by another process.
+    """Open a feed during the block; None if neither a feed nor a recording is requested.
 
-    Raises:
-        CommandError: the socket cannot be made, or the recording is incomplete at the end.
+    A recording (.mcap) is written from the feed by another process.
     """
     record = options.record if options.record and options.record.suffix == RECORDING else None
     if not (options.feed or record):
@@ -362,8 +335,8 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
             raise CommandError(f"--feed: {error}", CONFIGURATION) from None
         try:
             if record:
-                told = record, at, process, options.scenario, options.config
-                stack.enter_context(recorder_process.recorder(*told, secure=secure))
+                arguments = record, at, process, options.scenario, options.config
+                stack.enter_context(recorder_process.recorder(*arguments, secure=secure))
             stack.enter_context(closing(feed))
             yield feed
             stack.close()
@@ -373,9 +346,7 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
 
 @contextmanager
 def _told_once() -> Iterator[Callable[[], None]]:
-    """Handle SIGINT and SIGTERM once: after the yielded function was called, later ones are
-    ignored.
-    """
+    """Handle SIGINT and SIGTERM until the yielded function is called; then ignore them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def ignore() -> None:

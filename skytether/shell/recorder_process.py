@@ -17,35 +17,28 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins, temporary
 
 PATIENCE_S = 30.0
-"""Longest time that a recorder may take to end its file [s]."""
+"""Longest time for a recorder to complete its file."""
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """Order to a recorder: all that it needs before the first frame."""
+    """Order to a recorder, sent as one line of JSON on its standard input."""
 
     path: str
-    """File of the recording."""
     feed: str
-    """Socket of the feed."""
     process: str
-    """Name of the process."""
     name: str
-    """Name of the scenario."""
     scenario: str
-    """The scenario, as TOML."""
     secure: bool
-    """Whether the link is sealed."""
     plugins: list[str]
-    """Python files with triggers and references."""
 
 
 class RecorderError(Exception):
-    """Error: the recording is incomplete; the message is one line about what is missing."""
+    """The recording is incomplete; the message is one line with the reason."""
 
 
 @contextmanager
 def socket_of(feed: Path | None) -> Iterator[Path]:
-    """Socket of a feed: the path that was asked for, else one in a private temporary folder."""
+    """Socket of a feed: the given path, else one in a private temporary folder."""
     if feed:
         yield feed
         return
@@ -57,13 +50,12 @@ def socket_of(feed: Path | None) -> Iterator[Path]:
 def recorder(
     path: Path, feed: Path, process: str, name: str, scenario: Scenario, *, secure: bool
 ) -> Iterator[None]:
-    """Record a feed in another process for as long as the block takes; the feed ends with the
-    block.
+    """Record a feed in another process during the block; the feed must end with the block.
 
     Raises:
         RecorderError: the recording is incomplete.
     """
-    told = RecorderOrder(
+    order = RecorderOrder(
         path=str(path),
         feed=str(feed),
         process=process,
@@ -77,25 +69,25 @@ def recorder(
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        # Ctrl-C is for the process that flies; it ends the recorder in order.
+        # Ctrl-C is for the flying process, which then ends the recorder.
         start_new_session=True,
     )
     assert child.stdin is not None
     assert child.stdout is not None
     try:
-        child.stdin.write(msgspec.json.encode(told) + b"\n")
+        child.stdin.write(msgspec.json.encode(order) + b"\n")
         child.stdin.flush()
-        child.stdout.readline()  # the recorder reads the feed from here on, or has ended
+        child.stdout.readline()  # the recorder reads the feed from this line on, or has ended
         yield
     except BrokenPipeError:
         pass
     finally:
         try:
-            _, said = child.communicate(timeout=PATIENCE_S)
+            _, errors = child.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             child.kill()
-            _, said = child.communicate()
-            said = said or b"its recorder did not end"
+            _, errors = child.communicate()
+            errors = errors or b"its recorder did not end"
     if child.returncode:
-        lines = said.decode(errors="replace").splitlines()
+        lines = errors.decode(errors="replace").splitlines()
         raise RecorderError(lines[-1] if lines else f"{path}: its recorder was killed")

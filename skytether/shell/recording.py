@@ -10,26 +10,26 @@ from skytether.shared.telemetry.record import Recorder, Rows, parse
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
-"""Most bytes of rows that wait for the disk: those of 1000 vehicles at 20 Hz in 8 s; rows as short
-as netem's take three times as much in memory."""
+"""Most bytes of rows that wait for the disk: 8 s of 1000 vehicles at 20 Hz; rows as short as
+netem's take three times as much memory.
+"""
 TOGETHER_BYTES = 256 * 1024
 """Most bytes of rows in one write."""
 PAUSE_S = 0.02
-"""Time for which rows gather before a write [s]; a killed process loses at most this much."""
+"""Time for which rows are collected before a write [s], and lost if the process is killed."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end until all rows are written [s]."""
+"""Longest time to wait at the end until all rows are written."""
 
 SLOW = "the disk is too slow"
 
 
 class RecordFile:
-    """Recorder and its file; rows that the file does not take are lost and counted.
+    """Recorder and its file; rows that cannot be written are lost and counted.
 
     Args:
         name: name of the file, for messages.
-        columns: columns of its rows.
-        file: the file, open for reading and writing without a buffer; or the error for which there
-            is none.
+        file: the file, open for reading and writing without a buffer; or the error that opening it
+            raised.
     """
 
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
@@ -37,13 +37,12 @@ class RecordFile:
         self._file = file
         self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
-        """Recorder that takes the rows; it never blocks and never raises."""
         self._header_bytes = self._writer.offered
         self._ended = False
         self._told = False
 
     def news(self) -> RecordIncomplete | None:
-        """Event to report about the record: once, after the first row was lost."""
+        """Event about lost rows: once, after the first was lost; else None."""
         reason = self._reason()
         if reason is None or self._told:
             return None
@@ -51,33 +50,28 @@ class RecordFile:
         return RecordIncomplete(file=self._name, reason=reason)
 
     def end(self) -> None:
-        """Wait until the last row is written, for a bounded time."""
+        """Wait at most PATIENCE_S until the last row is written."""
         self._writer.close(PATIENCE_S)
         self._ended = True
 
     def fault(self) -> str | None:
-        """Sentence on what is missing in the record, or None; valid after `end`."""
+        """Sentence about missing rows, or None; valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
         writer, row_bytes = self._writer, self.recorder.columns.itemsize
-        kept, rows = (
+        recorded, rows = (
             max(count - self._header_bytes, 0) // row_bytes
             for count in (writer.written, writer.offered)
         )
-        return f"{self._name}: {reason}: {kept} of {rows} rows are recorded"
+        return f"{self._name}: {reason}: {recorded} of {rows} rows are recorded"
 
     @property
     def is_empty(self) -> bool:
-        """Whether no row has been written."""
         return self._writer.written <= self._header_bytes
 
     def rows(self) -> Rows:
-        """Whole rows in the file; valid after `end`.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
+        """Whole rows in the file; valid after `end`."""
         part = bytearray()
         while not isinstance(self._file, OSError) and len(part) < self._writer.written:
             # Not `read`, which would move the position of a late write.
@@ -91,7 +85,7 @@ class RecordFile:
         return parse(bytes(part))
 
     def close(self) -> None:
-        """Close the file, unless something is still being written to it."""
+        """Close the file, unless the thread still writes to it."""
         done = self._writer.close(0.0 if self._ended else PATIENCE_S)
         if done and not isinstance(self._file, OSError):
             self._file.close()

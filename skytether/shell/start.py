@@ -1,7 +1,7 @@
 """Start of every command, before the imports that take seconds.
 
-A process may be started without standard streams, or with a terminal that cannot print Greek
-letters, and may get SIGTERM or SIGUSR1 during its imports. All of these are handled here, once.
+Handles, in one place, missing standard streams, terminals that cannot print Greek letters, and
+SIGTERM or SIGUSR1 during the imports.
 """
 
 import contextlib
@@ -14,12 +14,12 @@ from importlib import import_module
 
 
 def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
-    """Run a command from the first moment of its process; returns its exit code.
+    """Run a command from the start of its process; returns its exit code.
 
     Args:
-        command: its function as "module:name", which is imported here.
-        prog: its name, for the one line of an error.
-        argv: its arguments; those of the process unless given.
+        command: the command's function as "module:name", imported here.
+        prog: name of the command, for errors.
+        argv: arguments; those of the process if None.
     """
     begin()
     module, _, name = command.partition(":")
@@ -33,16 +33,16 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
         with _mortal():
             from skytether.shell.command import main
         return main(call, argv, prog)
-    except KeyboardInterrupt:  # Ctrl-C between two of these lines
+    except KeyboardInterrupt:  # Ctrl-C outside `call`
         return 128 + signal.SIGINT
 
 
 def begin() -> None:
     """Open missing standard streams, and ignore SIGUSR1 until there are figures to print.
 
-    A closed stream becomes /dev/null, for the children as well: otherwise the next socket would
-    take its number, and be printed to. Characters that a stream cannot encode are written as
-    escapes. SIGUSR1 is ignored, also by children, until a handler is set.
+    A closed stream becomes /dev/null, for children as well: otherwise the next socket would get its
+    number, and be printed to. Characters that a stream cannot encode are written as escapes.
+    SIGUSR1 is ignored, also by children, until a handler is set.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -62,7 +62,7 @@ def begin() -> None:
 
 @contextlib.contextmanager
 def _mortal() -> Iterator[None]:
-    """Let Ctrl-C end the process at once: KeyboardInterrupt could be swallowed during an import."""
+    """Let Ctrl-C end the process at once: an import could swallow KeyboardInterrupt."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,7 +1,7 @@
 """Byte streams, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
 
 A stream that has ended, or cannot be opened yet, is opened again each second while its endpoint
-runs: after a cable is plugged in again, the autopilot is heard again.
+runs, so a cable may be plugged in again.
 """
 
 import asyncio
@@ -16,16 +16,14 @@ from skytether.shared.core.line import Line
 from skytether.shell.udp import AddressError
 
 AGAIN_S = 1.0
-"""Time after which a line that has ended is opened again [s]."""
+"""Time after which a stream that has ended is opened again [s]."""
 PIECE_BYTES = 4096
-"""Most bytes that are read at once."""
 
 
 class ByteStream:
     """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:
-        line: address of the stream.
         hear: called with each piece of bytes.
 
     Raises:
@@ -37,12 +35,9 @@ class ByteStream:
             raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
-        """File descriptor of our end; None while the stream is not open."""
 
     def send(self, payload: bytes) -> bool:
-        """Send bytes; False where they are lost: the stream is not open or cannot take all of
-        them.
-        """
+        """Send bytes; False if the stream is not open or cannot take all of them."""
         if self._end is None:
             return False
         try:
@@ -51,14 +46,12 @@ class ByteStream:
             return False
 
     async def run(self) -> None:
-        """Keep the stream open, until this task is cancelled."""
         while True:
             with contextlib.suppress(OSError, termios.error):
                 await self._carry(await self._open())
             await asyncio.sleep(AGAIN_S)
 
     async def _carry(self, end: int) -> None:
-        """Read from the stream until it ends."""
         loop = asyncio.get_running_loop()
         ended = loop.create_future()
 
@@ -97,8 +90,8 @@ class ByteStream:
                 prepare(end, self._line.number)
             else:
                 loop = asyncio.get_running_loop()
-                found = await loop.getaddrinfo(*self._line.address, type=socket.SOCK_STREAM)
-                family, _, _, _, address = found[0]
+                addresses = await loop.getaddrinfo(*self._line.address, type=socket.SOCK_STREAM)
+                family, _, _, _, address = addresses[0]
                 sock = failed.enter_context(socket.socket(family, socket.SOCK_STREAM))
                 sock.setblocking(False)
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -109,11 +102,7 @@ class ByteStream:
 
 
 def prepare(port: int, baud: int) -> None:
-    """Configure a serial port for raw bytes at a rate.
-
-    Args:
-        port: its file descriptor.
-        baud: rate [bit/s], one that the system knows.
+    """Configure a serial port, a file descriptor, for raw bytes at a rate that the system supports.
 
     Raises:
         termios.error: the file is no serial port.

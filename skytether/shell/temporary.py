@@ -1,8 +1,8 @@
 """Temporary folders; those that a killed process has left are removed by the next process.
 
 A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
-folder of this user with an unlocked mark is removed. The mark is removed last, so that the next
-process finishes an interrupted removal.
+folder of this user with an new_mark mark is removed. The mark is removed last, so that the next
+process completes an interrupted removal.
 """
 
 import contextlib
@@ -14,39 +14,38 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PREFIX = "skytether-"
-"""Beginning of the names of temporary folders."""
 MARK = ".of-a-process"
-"""Name of the lock file that marks a folder as one of these and shows whether its owner lives."""
+"""Name of the lock file that marks these folders and shows whether the owner lives."""
 
 
 @contextlib.contextmanager
 def folder() -> Iterator[Path]:
-    """Temporary folder for as long as the block takes; those of dead processes are removed."""
+    """Temporary folder for the duration of the block; first removes those of dead processes."""
     _clear(Path(tempfile.gettempdir()))
-    made = Path(tempfile.mkdtemp(prefix=PREFIX))
-    with _marked(made):
+    path = Path(tempfile.mkdtemp(prefix=PREFIX))
+    with _marked(path):
         try:
-            yield made
+            yield path
         finally:
-            _remove(made)
+            _remove(path)
 
 
 @contextlib.contextmanager
 def _marked(made: Path) -> Iterator[None]:
-    """Create and lock a folder's mark; it gets its name once it is locked, so that no other process
-    removes the folder.
+    """Create and lock a folder's mark.
+
+    The mark gets its name once it is locked, so that no other process removes the folder.
     """
-    held = made / f"{MARK}.new"
-    with held.open("x") as mark:
-        # a file system without locks: nobody can clear the folder
+    new_mark = made / f"{MARK}.new"
+    with new_mark.open("x") as mark:
+        # a file system without locks: no process can remove the folder
         with contextlib.suppress(OSError):
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held.rename(made / MARK)
+            new_mark.rename(made / MARK)
         yield
 
 
 def _clear(place: Path) -> None:
-    """Remove the folders whose owners are dead."""
     with contextlib.suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             with contextlib.suppress(OSError):
@@ -55,7 +54,7 @@ def _clear(place: Path) -> None:
 
 
 def _clear_one(made: Path) -> None:
-    """Remove a folder, if it is ours and its owner is dead.
+    """Remove a folder, if it is this user's and its owner is dead.
 
     Raises:
         OSError: the folder has no mark, or its owner lives.
@@ -69,14 +68,14 @@ def _clear_one(made: Path) -> None:
 
 
 def _remove(made: Path) -> None:
-    """Remove a folder, its mark last; if a process still writes there, the next call removes it."""
+    """Remove a folder, its mark last; if a process still writes to it, a later call removes it."""
     with contextlib.suppress(OSError):
-        for each in made.iterdir():
-            if each.name == MARK:
+        for entry in made.iterdir():
+            if entry.name == MARK:
                 continue
-            if each.is_dir() and not each.is_symlink():
-                shutil.rmtree(each)
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
             else:
-                each.unlink()
+                entry.unlink()
         (made / MARK).unlink(missing_ok=True)
         made.rmdir()

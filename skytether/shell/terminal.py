@@ -12,7 +12,7 @@ import msgspec
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell.command import write
 
-# for type checking alone: they are slow to import, and a process that flies does without
+# for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -20,18 +20,16 @@ if TYPE_CHECKING:
 
 
 class Bar(Protocol):
-    """A progress bar."""
-
     def __call__(self, done: float, text: str = "") -> None:
-        """Set how much is done, in the bar's unit, and a remark."""
+        """Set the progress, in the bar's unit, and a remark."""
 
 
 @contextmanager
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
-    """Progress bar on stderr: title, how much of the total is done, and the time remaining.
+    """Progress bar on stderr: title, progress and the time remaining.
 
     The bar vanishes at the end. It is not shown where stderr is no terminal, or a terminal that
-    cannot move its cursor. Lines printed on stderr meanwhile appear above the bar.
+    cannot move its cursor. Lines printed on stderr meanwhile appear above it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -45,7 +43,7 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
         TextColumn("{task.fields[text]}", markup=False),
         console=console,
         transient=True,
-        speed_estimate_period=600.0,  # one step may take minutes: the clock must go on meanwhile
+        speed_estimate_period=600.0,  # a step may take minutes
         disable=not console.is_interactive,
     ) as shown:
         row = shown.add_task(title, total=total, text="")
@@ -57,20 +55,20 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
 
 
 def prepare(kernels: Sequence["Missing"]) -> None:
-    """Compile the kernels that this machine has not compiled yet, with a note on stderr."""
+    """Compile the kernels that are not compiled on this machine yet, with a note on stderr."""
     if not kernels:
         return
     from skytether.shell.compiling import compile_kernels
 
-    said = "compiling control loops, which this machine then keeps: it takes up to a minute"
-    print(said, file=sys.stderr, flush=True)
+    message = "compiling control loops, once on this machine: takes up to a minute"
+    print(message, file=sys.stderr, flush=True)
     with progress("compiling", len(kernels), "kernels") as bar:
         done = count(1)
         compile_kernels(kernels, lambda: bar(next(done)))
 
 
 def show(table: "Table") -> None:
-    """Print a table in full width: a number cut off would be worse than a line too long."""
+    """Print a table in full width: a number cut off would be worse than a long line."""
     from rich.console import Console
 
     Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
@@ -82,7 +80,7 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     Raises:
         CommandError: the file cannot be written.
     """
-    # The file comes first: the table's reader may be gone, and printing then fails.
+    # The file is written first, because printing fails if the reader of stdout is gone.
     if json is not None:
         write(json, msgspec.json.encode(summary))
     from rich.console import Console
@@ -91,12 +89,11 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
 
     table = Table(title=title, title_justify="left", show_header=False)
     for row in summary_rows(summary):
-        table.add_row(*map(Text, row))  # Rendered as text: rich would take "[m]" for markup.
+        table.add_row(*map(Text, row))  # `Text`, because rich would take "[m]" for markup
     Console().print(table)
 
 
 def summary_rows(summary: Summary) -> list[tuple[str, str]]:
-    """Names and values of a summary's known figures, for a table."""
     s = summary
     ages = _values(".3f", s.aoi_s_mean, s.aoi_s_peak, s.plan_age_s_mean)
     rows = [
@@ -134,7 +131,6 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
 
 
 def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
-    """Rows of a summary about dropped packets, one for each end that dropped some."""
     return [
         (f"dropped by {end}", ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
         for end, reasons in by_end.items()
@@ -142,7 +138,6 @@ def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:
-    """Numbers of horizons and of other packets sent up, where both are known."""
     if s.uplink_horizons is None or s.uplink_packets is None:
         return ()
     return s.uplink_horizons, max(0, s.uplink_packets - s.uplink_horizons)

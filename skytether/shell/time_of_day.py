@@ -1,9 +1,9 @@
-"""Time of day of this host, to within the error that its kernel tells (`adjtimex`, Linux).
+"""Time of day of this host, with the error bound that its kernel reports (`adjtimex`, Linux).
 
-The time daemon sets that error. chrony and ntpd include half of the round trip to their source, so
-no delay of the network makes it false. systemd-timesyncd sets it to 0 and gives no estimate: such a
-clock counts as unknown. So does the clock of a chrony without `rtcsync`, which leaves it marked as
-not synchronised.
+The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
+source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is no
+estimate: such a clock counts as unknown. So does the clock under chrony without `rtcsync`, which
+leaves it marked as not synchronised.
 """
 
 import ctypes
@@ -16,7 +16,7 @@ from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import TimeUnknown
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
-"""Status bit, and answer of the kernel, of a clock that is not synchronised."""
+"""Status bit, and return value of `adjtimex`, of a clock that is not synchronised."""
 
 
 class _Timex(ctypes.Structure):
@@ -34,24 +34,21 @@ class _Timex(ctypes.Structure):
 
 
 class HostTime(NamedTuple):
-    """Time of day of the host."""
-
     utc_ns: int
     """Time since 1970 [ns]."""
     error_ns: int
-    """Largest error of that [ns]."""
+    """Largest error of `utc_ns` [ns]."""
     now_ns: int
     """CLOCK_MONOTONIC at the same moment [ns]."""
 
 
 @cache
 def _adjtimex() -> "ctypes._FuncPointer | None":
-    """Function of the C library; None where it has none."""
     return getattr(ctypes.CDLL(None), "adjtimex", None)
 
 
 def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
-    """Largest error of the host's clock by the kernel's answer [ns]; None if it is unknown."""
+    """Largest error of the host's clock by the answer of `adjtimex` [ns]; None if it is unknown."""
     if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
         return None
     return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None
@@ -59,11 +56,11 @@ def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int 
 
 def host_time() -> HostTime | None:
     """Time of day of this host; None if its error is unknown."""
-    call, told = _adjtimex(), _Timex()
+    call, timex = _adjtimex(), _Timex()
     if call is None:
         return None
-    answer = int(call(ctypes.byref(told)))
-    error_ns = stated(answer, told.status, told.maxerror, told.esterror)
+    answer = int(call(ctypes.byref(timex)))
+    error_ns = stated(answer, timex.status, timex.maxerror, timex.esterror)
     if error_ns is None:
         return None
     # The process may be preempted between two clocks: the monotonic one is read before and after,
@@ -73,14 +70,14 @@ def host_time() -> HostTime | None:
 
 
 class TimeTeller:
-    """Tells an endpoint the time of day of this host for as long as that is known."""
+    """Gives an endpoint the time of day of this host while its error is known."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self._is_known = True
 
     def news(self) -> TimeUnknown | None:
-        """Tell the endpoint the time of day now; event for the operator once it is unknown."""
+        """Give the endpoint the time of day; returns an event when the time has become unknown."""
         time_of_day, was_known = host_time(), self._is_known
         self._is_known = time_of_day is not None
         if time_of_day is None:

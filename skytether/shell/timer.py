@@ -23,8 +23,7 @@ class Timer(Protocol):
     def set(self, due_ns: int | None) -> None:
         """Arm for `due_ns` [ns; CLOCK_MONOTONIC], replacing an earlier time; None disarms."""
 
-    def close(self) -> None:
-        """Disarm for good."""
+    def close(self) -> None: ...
 
 
 class _Itimerspec(ctypes.Structure):
@@ -40,7 +39,7 @@ class KernelTimer:
     """A Linux timerfd. Python below 3.13 has no `os.timerfd_create`, so libc is called directly.
 
     Raises:
-        OSError: where there is no timerfd.
+        OSError: the system has no timerfd.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
@@ -65,15 +64,12 @@ class KernelTimer:
         self._callback()
 
     def set(self, due_ns: int | None) -> None:
-        """See `Timer`."""
-        # An absolute time of zero would disarm the timer; 1 ns is as far in the past as any other
-        # time.
+        # An absolute time of zero would disarm the timer; 1 ns is in the past as well.
         due_ns = 0 if due_ns is None else max(due_ns, 1)
         self._spec.value_s, self._spec.value_ns = divmod(due_ns, SECOND_NS)
         self._settime(self._fd, _TFD_TIMER_ABSTIME, ctypes.byref(self._spec), None)
 
     def close(self) -> None:
-        """See `Timer`."""
         self._loop.remove_reader(self._fd)
         os.close(self._fd)
 
@@ -87,21 +83,18 @@ class LoopTimer:
         self._handle: asyncio.TimerHandle | None = None
 
     def set(self, due_ns: int | None) -> None:
-        """See `Timer`."""
         self.close()
         if due_ns is not None:
             delay_s = max(0, due_ns - time.monotonic_ns()) / SECOND_NS
             self._handle = self._loop.call_later(delay_s, self._callback)
 
     def close(self) -> None:
-        """See `Timer`."""
         if self._handle is not None:
             self._handle.cancel()
             self._handle = None
 
 
 def make_timer(loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> Timer:
-    """Make the most exact timer that this system has."""
     try:
         return KernelTimer(loop, callback)
     except OSError:

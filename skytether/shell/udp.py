@@ -1,8 +1,7 @@
 """UDP sockets, and addresses of peers; all blocking calls about addresses are in this module.
 
-An address is `(host, port)` everywhere else. The kernel's own form for IPv6 has four values; the
-scope among them (the interface of a link-local address) is written into the host, as in
-`fe80::1%eth0`.
+An address is `(host, port)` everywhere else. The kernel's form for IPv6 has four values; the scope
+among them (the interface of a link-local address) is written into the host, as in `fe80::1%eth0`.
 """
 
 import contextlib
@@ -24,15 +23,13 @@ BUFFER_BYTES = 4 * 1024 * 1024
 """Size of a socket's buffers [B]: the default receive buffer holds 166 datagrams of 600 B."""
 
 FLOODED_BYTES = 16 * 1024 * 1024
-"""Size of the receive buffer of a socket that may be flooded [B]: at 50 000 packets a second that
-come through, what a process can read that waits for a core for half a second."""
+"""Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Most addresses whose other forms are kept, 360 B for each; with more peers they are worked out
-again. A flood of HELLOs from ever new ports fills this memory."""
+"""Most addresses whose other forms are cached, 360 B each: a flood of HELLOs may fill the cache."""
 
 SPARE_FILES = 48
-"""Number of open files that a process may need beside its sockets: readers of its feed, metrics."""
+"""Open files that a process may need beside its sockets: readers of its feed, metrics."""
 
 FIND_S = 2.0
 """Longest time for which the start of a patient process waits for a name's address [s]."""
@@ -41,16 +38,17 @@ _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 _IP_RECVERR, _IPV6_RECVERR, _MSG_ERRQUEUE, _FROM_THIS_MACHINE = 11, 25, 0x2000, 1
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
 _BYTE, _LENGTH, _IF_EQUAL, _IF_AT_LEAST, _RETURN = 0x30, 0x80, 0x15, 0x35, 0x06
-"""Instructions of a packet filter of Linux (classic BPF): load a byte, load the length, compare
-what was loaded, and let so many bytes pass."""
+"""Instructions of classic BPF, Linux's packet filter: load a byte, load the length, jump if equal,
+jump if at least, accept so many bytes.
+"""
 
 
 class AddressError(OSError):
-    """An address that the user gave is of no use; the message says which and why."""
+    """An address that the user gave cannot be used; the message says which and why."""
 
 
 def within_reach_of(peers: Iterable[Address]) -> Address:
-    """Address to bind a socket to that talks to these: a free port, on loopback if all are there.
+    """Address to bind a socket to: a free port, on loopback if all peers are.
 
     Args:
         peers: numeric addresses of one family; without any, IPv4 is assumed.
@@ -62,12 +60,11 @@ def within_reach_of(peers: Iterable[Address]) -> Address:
 
 
 def is_loopback(address: Address) -> bool:
-    """Whether an address can be reached from this machine alone."""
     return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
 def leads_back(address: Address, bound: Address) -> bool:
-    """Whether datagrams to an address of this machine arrive at a certain socket; blocks.
+    """Whether datagrams to an address of this machine arrive at a given socket; blocks.
 
     Args:
         address: name or number that datagrams are sent to.
@@ -79,7 +76,7 @@ def leads_back(address: Address, bound: Address) -> bool:
     (host, port), (bound_host, bound_port) = look_up(address), look_up(bound)
     if port != bound_port or (":" in host) != (":" in bound_host):
         return False
-    if _is_unspecified(host):  # packets to it go to loopback
+    if _is_unspecified(host):  # packets to a wildcard address go to loopback
         host = "::1" if ":" in host else "127.0.0.1"
     return host == bound_host or (_is_unspecified(bound_host) and _is_own(host))
 
@@ -89,7 +86,7 @@ def _is_unspecified(host: str) -> bool:
 
 
 def _is_own(host: str) -> bool:
-    """Whether a numeric address belongs to this machine, that is, a socket can be bound to it."""
+    """Whether a numeric address belongs to this machine: a socket can be bound to it."""
     try:
         open_socket((host, 0)).close()
     except AddressError:
@@ -102,7 +99,8 @@ def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
 
     Args:
         address: a name or a number, of either family.
-        shared: several sockets may have this address; the kernel deals out peers among them.
+        shared: whether several sockets may have this address; the kernel then distributes the
+            peers.
 
     Raises:
         AddressError: the address cannot be bound.
@@ -136,12 +134,12 @@ def _prepare(sock: socket.socket, *, shared: bool) -> None:
 
 def _make_room(sock: socket.socket, plain: int, forced: int, size: int) -> None:
     sock.setsockopt(socket.SOL_SOCKET, plain, size)
-    with contextlib.suppress(OSError):  # over the system's limit, for those who may
+    with contextlib.suppress(OSError):  # over the system's limit, for processes with CAP_NET_ADMIN
         sock.setsockopt(socket.SOL_SOCKET, forced, size)
 
 
 def from_kernel(address: tuple[Any, ...]) -> Address:
-    """Address as the kernel gives it, without its IPv6 flow, and with a scope in the host."""
+    """Address from the kernel's form: without the IPv6 flow, with the scope in the host."""
     if len(address) == 2:
         return address
     host, port, _, scope = address
@@ -149,28 +147,26 @@ def from_kernel(address: tuple[Any, ...]) -> Address:
 
 
 def to_kernel(address: Address) -> tuple[Any, ...]:
-    """Numeric address as the kernel takes it.
+    """Numeric address in the kernel's form.
 
     Raises:
-        OSError: there is no such interface as its scope.
+        OSError: the interface of its scope does not exist.
     """
     host, percent, scope = address[0].partition("%")
     return (host, address[1], 0, socket.if_nametoindex(scope)) if percent else address
 
 
 def files_max() -> int:
-    """Largest number of files that this process may open, if it asks for it."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     return sys.maxsize if hard == resource.RLIM_INFINITY else hard
 
 
 def sockets_max() -> int:
-    """Largest number of sockets that this process may have beside its other files."""
     return files_max() - SPARE_FILES
 
 
 def allow_sockets(count: int) -> None:
-    """Let this process have so many sockets open, as far as the system does."""
+    """Raise this process's limit of open files for so many sockets, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = min(count + SPARE_FILES, files_max())
     if soft != resource.RLIM_INFINITY and wanted > soft:
@@ -180,8 +176,8 @@ def allow_sockets(count: int) -> None:
 def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
     """Let the kernel drop datagrams of other forms than these; on Linux only.
 
-    A dropped datagram takes no room in the receive buffer and no time of the process. The receive
-    buffer is made larger as well.
+    A dropped datagram takes no space in the receive buffer and no time of the process. The receive
+    buffer is enlarged as well.
 
     Args:
         sock: a UDP socket.
@@ -204,7 +200,7 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
         program += instruction.pack(_IF_AT_LEAST, 1, 0, most + _UDP_HEADER_BYTES + 1)
         program += instruction.pack(_RETURN, 0, 0, 2**32 - 1)
     program += instruction.pack(_RETURN, 0, 0, 0)
-    import ctypes  # a server's alone
+    import ctypes  # needed by a server only
 
     code = ctypes.create_string_buffer(program, len(program))
     filter_ = struct.pack("@HP", len(program) // instruction.size, ctypes.addressof(code))
@@ -220,14 +216,14 @@ def heed_refusals(sock: socket.socket) -> None:
 
 
 def refusals(sock: socket.socket) -> Iterator[str]:
-    """Reasons for which datagrams from a socket were refused on their way, a reason for each."""
+    """Reasons from ICMP errors about datagrams from a socket, one for each error."""
     while True:
         try:
             _, news, _, _ = sock.recvmsg(0, 512, _MSG_ERRQUEUE)
-        except OSError:  # there are no more
+        except OSError:  # no more errors
             return
         for _, kind, error in news:
-            # Errors of this machine were raised when the datagram was sent.
+            # Local errors were raised when the datagram was sent.
             if kind in (_IP_RECVERR, _IPV6_RECVERR) and error[4] != _FROM_THIS_MACHINE:
                 yield os.strerror(int.from_bytes(error[:4], sys.byteorder))
 
@@ -249,8 +245,8 @@ class Names:
 
     Args:
         peers: names or numbers.
-        is_patient: whether a name that cannot be resolved now may be resolved by `look_up` later.
-            Until then nothing can be sent there.
+        is_patient: whether a name that cannot be resolved now may be resolved by `look_up` later;
+            until then nothing can be sent there.
 
     Raises:
         AddressError: a name cannot be resolved, and `is_patient` is false.
@@ -258,7 +254,6 @@ class Names:
 
     def __init__(self, peers: Iterable[Address], *, is_patient: bool = False) -> None:
         self.missing: dict[Address, str] = {}
-        """Peers that have not been found yet, and the reasons."""
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
         self._names: list[Address] = []
@@ -274,20 +269,20 @@ class Names:
         """Add a peer whose name need not be resolvable yet; blocks for at most FIND_S."""
         self._names.append(peer)
         self.missing[peer] = "no answer yet"
-        found: dict[Address, Address] = {}
+        addresses: dict[Address, Address] = {}
 
         def find() -> None:
             try:
-                found[peer] = look_up(peer)
+                addresses[peer] = look_up(peer)
             except OSError as error:
                 self.missing[peer] = error.strerror or str(error)
 
-        # A thread: where the network is down, a look-up may take 20 s, and a vehicle may be in the
+        # A thread: where the network is down, a lookup may take 20 s, and the vehicle may be in the
         # air.
         thread = threading.Thread(target=find, daemon=True)
         thread.start()
         thread.join(FIND_S)
-        self.learn(dict(found))
+        self.learn(dict(addresses))
 
     def add(self, peer: Address) -> None:
         """Add a peer; blocks.
@@ -304,15 +299,12 @@ class Names:
 
     @property
     def may_change(self) -> bool:
-        """Whether some peers were given by name, whose numeric address may change."""
         return bool(self._names)
 
     def numbers(self) -> list[Address]:
-        """Numeric addresses of all peers."""
         return list(self._numbers.values())
 
     def number(self, peer: Address) -> Address:
-        """Numeric address of a peer."""
         return self._numbers.get(peer, peer)
 
     def name(self, number: Address) -> Address:
@@ -320,10 +312,10 @@ class Names:
         return self._by_number.get(number, number)
 
     def heard(self, raw: RawAddress) -> Address:
-        """Peer with an address in the kernel's own form, as the user has written it.
+        """Peer with an address in the kernel's form, as the user has written it.
 
         Raises:
-            OSError: there is no such interface as its scope.
+            OSError: the interface of its scope does not exist.
         """
         peer = self._heard.get(raw)
         if peer is None:
@@ -337,29 +329,25 @@ class Names:
         return peer
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
-        """Peers, as by `heard`.
-
-        Raises:
-            OSError: there is no such interface as the scope of one.
-        """
-        known = list(map(self._heard.get, raws))
-        if None not in known:
-            return cast("list[Address]", known)
+        """Peers, as by `heard`; raises the same."""
+        peers = list(map(self._heard.get, raws))
+        if None not in peers:
+            return cast("list[Address]", peers)
         return list(map(self.heard, raws))
 
     def kernel(self, peer: Address) -> tuple[Any, ...]:
-        """Numeric address of a peer, as a socket takes it.
+        """Numeric address of a peer, in the form that `sendto` takes.
 
         Raises:
-            OSError: there is no such interface as its scope, or it has not been found yet.
+            OSError: the interface of its scope does not exist, or its name is not resolved yet.
         """
         return self._reach(peer)[0]
 
     def raw(self, peer: Address) -> RawAddress:
-        """Numeric address of a peer in the kernel's own form; empty where it has none.
+        """Numeric address of a peer as `struct sockaddr`; empty if it cannot be packed.
 
         Raises:
-            OSError: there is no such interface as its scope, or it has not been found yet.
+            OSError: the interface of its scope does not exist, or its name is not resolved yet.
         """
         return self._reach(peer)[1]
 
@@ -369,7 +357,7 @@ class Names:
             if peer in self.missing:
                 raise OSError(f"cannot find {peer[0]}")
             address, raw = to_kernel(self.number(peer)), b""
-            # The socket's plain call says what is wrong with an address that cannot be packed.
+            # For an address that cannot be packed, the socket's plain call raises the error.
             with contextlib.suppress(OSError, OverflowError):
                 raw = pack_address(address)
             reached = address, raw
@@ -381,14 +369,13 @@ class Names:
 
     def look_up(self) -> dict[Address, Address]:
         """Numeric addresses of all names that can be resolved now; blocks."""
-        found = {}
+        addresses = {}
         for name in self._names:
             with contextlib.suppress(OSError):
-                found[name] = look_up(name)
-        return found
+                addresses[name] = look_up(name)
+        return addresses
 
     def learn(self, found: dict[Address, Address]) -> None:
-        """Use these numeric addresses for these peers from now on."""
         for peer in found:
             self.missing.pop(peer, None)
         self._numbers |= found
@@ -403,9 +390,9 @@ def look_up(peer: Address) -> Address:
     Raises:
         OSError: it cannot be resolved.
     """
-    found = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
-    four = [entry for entry in found if entry[0] == socket.AF_INET]
-    return from_kernel((four or found)[0][4])
+    entries = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
+    four = [entry for entry in entries if entry[0] == socket.AF_INET]
+    return from_kernel((four or entries)[0][4])
 
 
 def _is_numeric(host: str) -> bool:

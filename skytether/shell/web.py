@@ -1,8 +1,8 @@
-"""Rules for what is served over HTTP: the page and the metrics.
+"""Rules for HTTP servers: the page and the metrics.
 
-Any website in a browser on this machine can make that browser connect here: in an invisible frame,
-or by pointing a domain of its own at this machine (DNS rebinding). So no answer may be shown in a
-frame, and the Host header is checked.
+Any website can make a browser on this machine connect here: in an invisible frame, or by pointing a
+domain of its own at this machine (DNS rebinding). So no answer may be shown in a frame, and the
+Host header is checked.
 """
 
 import ipaddress
@@ -12,11 +12,11 @@ HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
 }
-"""Headers of every answer: no website may show it in a frame, and catch clicks in it."""
+"""Headers of every answer: no website may show it in a frame and catch clicks."""
 
 
 def host_name(host: str) -> str:
-    """Name or number of this machine in a Host header, without its port; empty if there is none."""
+    """Host in a Host header, without its port; empty if there is none."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
@@ -24,7 +24,7 @@ def host_name(host: str) -> str:
 
 
 def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """IP address in a host name, with or without brackets and scope; None if it is none."""
+    """IP address in a host name, with or without brackets and scope; None for other names."""
     try:
         return ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
@@ -32,5 +32,5 @@ def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a host is a number or localhost, which no website's owner can point here."""
+    """Whether a host is a number or localhost, so no website's owner can point it here."""
     return name == "localhost" or numeric(name) is not None

@@ -28,7 +28,6 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     """Run `count` processes until the first of them ends; returns the worst exit code.
 
     Args:
-        count: number of processes.
         bind: address of all of them; port 0 takes a free one.
         work: called in each process with its number, from 1, and its socket.
 
@@ -42,22 +41,22 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
     ]
-    # Until they set handlers of their own, children would treat a signal as their parent does.
+    # Blocked until children have set handlers of their own; else they would inherit this process's.
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     for child in children:
         child.start()
     for sock in sockets:
         sock.close()
 
-    ending, told = False, set()
+    ending, terminated = False, set()
 
     def pass_on(number: int, _: object) -> None:
         nonlocal ending
         if number != signal.SIGUSR1:
-            if ending:  # a worker that gets SIGTERM twice would not end in order
+            if ending:  # a second SIGTERM would interrupt a worker's orderly end
                 return
             number, ending = signal.SIGTERM, True
-        told.add(-number)
+        terminated.add(-number)
         for child in children:
             if child.is_alive() and child.pid:
                 os.kill(child.pid, number)
@@ -70,14 +69,16 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     for child in children:
         child.join()
     # A worker that got SIGTERM before it could end in order has not failed.
-    return max(0 if child.exitcode in told else abs(child.exitcode or 0) for child in children)
+    return max(
+        0 if child.exitcode in terminated else abs(child.exitcode or 0) for child in children
+    )
 
 
 def _work(
     work: Callable[[int, socket], None], number: int, sockets: list[socket], parent: int
 ) -> None:
     die_with_parent()
-    if os.getppid() != parent:  # it had ended before
+    if os.getppid() != parent:  # the parent ended before `die_with_parent`
         return
     for other, sock in enumerate(sockets, start=1):
         if other != number:
@@ -91,7 +92,7 @@ def _work(
         try:
             work(number, sock)
         finally:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is ending already
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the worker is ending already
 
 
 def die_with_parent() -> None:

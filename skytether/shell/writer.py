@@ -1,4 +1,4 @@
-"""Background writer: the process never waits for a full pipe, a slow disk or a dead reader."""
+"""Background writer to a file, so that a process never waits for a full pipe or a slow disk."""
 
 import contextlib
 import os
@@ -16,10 +16,10 @@ class Writer:
     last pause.
 
     Args:
-        file: unbuffered file to write to; or the error because of which there is none.
-        room: largest number of bytes that wait to be written.
+        file: unbuffered file to write to; or the error that opening it raised.
+        room: most bytes that wait to be written.
         together: most bytes of several pieces in one write; a piece is never split.
-        pause_s: time for which pieces gather before they are written [s].
+        pause_s: time for which pieces are collected before they are written [s].
     """
 
     def __init__(
@@ -29,15 +29,12 @@ class Writer:
         self._room = room
         self._together = together
         self._pause_s = pause_s
-        # Each number is changed by one thread alone: the first two by the caller's.
+        # Each counter is changed by one thread only: `offered` and `refused` by the caller's.
         self.offered = 0
-        """Number of bytes that `write` was called with."""
         self.refused = 0
-        """Number of bytes among them for which there was no room."""
+        """Bytes that were dropped because too many were waiting."""
         self.written = 0
-        """Number of bytes that were written to the file."""
         self._handled = 0
-        """Number of bytes that are no longer waiting, written or not."""
         self._pieces: SimpleQueue[bytes] = SimpleQueue()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -45,11 +42,10 @@ class Writer:
 
     @property
     def failure(self) -> OSError | None:
-        """Error after which nothing more is written."""
         return self._file if isinstance(self._file, OSError) else None
 
     def write(self, piece: bytes) -> bool:
-        """Queue a piece for writing; returns whether there was room. Never blocks, never raises."""
+        """Queue a piece for writing; False if it was dropped. Never blocks, never raises."""
         self.offered += len(piece)
         if self.offered - self.refused - self._handled > self._room:
             self.refused += len(piece)
@@ -58,7 +54,7 @@ class Writer:
         return True
 
     def close(self, patience_s: float) -> bool:
-        """Wait until all is written, for a bounded time; returns whether the thread has ended.
+        """Wait at most `patience_s` until all is written; returns whether the thread has ended.
 
         The file may be closed only if this returns True.
         """
@@ -90,9 +86,9 @@ class Writer:
             try:
                 count = os.write(self._file.fileno(), rest)
             except BlockingIOError:  # another process has made the pipe non-blocking
-                room = select.poll()
-                room.register(self._file, select.POLLOUT)
-                room.poll()
+                poll = select.poll()
+                poll.register(self._file, select.POLLOUT)
+                poll.poll()
             except OSError as error:
                 self._file = error
             else:

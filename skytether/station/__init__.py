@@ -1,5 +1,5 @@
-"""Ground station that flies a vehicle as is usual without Skytether: by set-points alone.
+"""Ground station that flies a vehicle by set-points only, as autopilots are usually flown.
 
-The station sends an autopilot MAVLink set-points at every step, through whatever network lies
-between. It is here only as a baseline for comparison.
+The station sends an autopilot MAVLink set-points at every step, over any network in between. It is
+a baseline for comparison.
 """

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # first, before the imports below, which take a while
+if __name__ == "__main__":  # called before the imports below, which take a while
     sys.exit(run("skytether.station.__main__:fly", "station"))
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ from skytether.station.laws import LawOptions
 
 @dataclass(frozen=True)
 class StationOptions(LawOptions, ProcessOptions):
-    """Options of `skytether station`."""
-
     scenario: ScenarioName = "autopilot"
     """A scenario's name (see `skytether scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:14550"
-    """HOST:PORT to receive MAVLink at; the first autopilot that is heard there is flown."""
+    """HOST:PORT to receive MAVLink at; the first autopilot that sends a heartbeat there is
+    flown.
+    """
     insecure: bool = False
     """Listen even where other machines can reach it: MAVLink has no keys."""
 
@@ -43,8 +43,8 @@ def fly(argv: Sequence[str]) -> None:
     law = laws.make(options.law, options.lead, options.gain)
     bind = command.address("--bind", options.bind)
     if not (options.insecure or is_loopback(look_up(bind))):
-        said = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
-        raise CommandError(f"--bind: {said}: expected an address of 127.0.0.1, or --insecure", 2)
+        message = f"got {options.bind}, where other machines can reach it, and MAVLink has no keys"
+        raise CommandError(f"--bind: {message}: expected an address of 127.0.0.1, or --insecure", 2)
     columns = station_columns(scenario.model.axes)
     with process.begin("station", options, columns, secure=None) as running:
         station = Station(running.scenario, law, running.recorder)

@@ -1,11 +1,11 @@
 """Ground station as an endpoint: from the first heartbeat of an autopilot to its landing.
 
-    heard → streams asked for, clock known → armed, climbed (`client.mavlink.launch`)
-          → a set-point at every step of the flight → landed
+    heartbeat → streams requested, clock offset known → armed, climbed (`client.mavlink.launch`)
+              → a set-point at every step of the flight → landed
 
-All messages cross a bad network, so every request is repeated until it is confirmed. While a pilot
-or the autopilot itself flies the vehicle, the station sends nothing, and it does not take control
-back afterwards.
+Every request is repeated until it is confirmed, because the network may lose it. While a pilot or
+the autopilot itself flies the vehicle, the station sends nothing, and it does not take control back
+afterwards.
 """
 
 from collections import Counter
@@ -34,21 +34,20 @@ from skytether.shared.telemetry.record import Recorder
 from skytether.station.laws import Heard, Law, Setpoint, setpoint
 
 SYSTEM, COMPONENT = 255, int(dialect.MAV_COMP_ID_MISSIONPLANNER)
-"""System and component id of the ground station; ArduPilot obeys this system id."""
+"""System and component id of the ground station; ArduPilot accepts commands of this system id."""
 VEHICLE = 1
-"""Number of the vehicle in records and events."""
 TICK_NS = 100 * MILLISECOND_NS
-"""Time between two checks for requests that are due besides set-points [ns]."""
+"""Interval at which requests other than set-points are checked [ns]."""
 HEARTBEAT_NS = SECOND_NS
-"""Time between two heartbeats of the station [ns]."""
 CLOCK_BEGIN_NS, CLOCK_NS = 200 * MILLISECOND_NS, 5 * SECOND_NS
-"""Time between two requests for the autopilot's clock [ns]: before the flight, and during it."""
+"""Intervals of requests for the autopilot's clock, before the flight and during it [ns]."""
 STREAM_NS = 500 * MILLISECOND_NS
-"""Time between two stream requests [ns], one stream after the other, until the flight begins,
-because the network loses some requests. A stream starts again when it is requested again, so each
-must be requested less often than its messages come."""
+"""Interval of stream requests [ns], one stream after the other, until the flight begins, because
+the network loses some. A stream starts again when it is requested again, so its interval of
+requests must be longer than that of its messages.
+"""
 AGE_MAX_NS = 10 * SECOND_NS
-"""Largest usable age of a position, and longest usable round trip [ns]."""
+"""Largest usable age of a position, and longest usable round-trip time [ns]."""
 CLOSES = 3
 """Number of land commands sent to a flying vehicle when the station ends."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
@@ -69,12 +68,11 @@ class Station(Endpoint):
     """Ground station that flies one vehicle.
 
     Args:
-        scenario: what is flown.
         law: law that chooses set-points.
         recorder: takes one row per step, see `station.joined`.
 
     Raises:
-        ConfigError: the flight begins on the ground.
+        ConfigError: the scenario's flight begins on the ground.
     """
 
     def __init__(self, scenario: Scenario, law: Law, recorder: Recorder | None = None) -> None:
@@ -93,35 +91,27 @@ class Station(Endpoint):
         self._texts = Texts()
         self._peer: Address | None = None
         self._target = (0, 0)
-        """System and component id of the autopilot."""
         self._flavour: Flavour | None = None
         self._launch: Launch | None = None
         self._failure: NotTakenOff | None = None
         self._counts: Counter[str] = Counter()
         self._since_ns: int | None = None
-        """Start of the wait for the autopilot: first for a heartbeat, then for its time."""
+        """Start of the wait for the autopilot [ns]: first for a heartbeat, then for its time."""
         self._tick_ns = self._beat_ns = self._clock_ns = self._stream_ns = 0
-        """Times of the next tick, heartbeat, clock request and stream request."""
+        """Times of the next tick, heartbeat, clock request and stream request [ns]."""
         self._asked = 0
-        """Number of streams requested so far."""
         self._epoch_ns: int | None = None
-        """Time of step 0."""
         self._step_ns = 0
-        """Time of the next set-point."""
         self._step = 0
-        """Next step."""
         self._missed = 0
-        """Number of steps missed by waking too late."""
         self._newest: Measurement | None = None
 
     @property
     def failure(self) -> NotTakenOff | None:
-        """Event after which the vehicle could not be flown."""
         return self._failure or (self._launch.failure if self._launch else None)
 
     @property
     def finished(self) -> bool:
-        """See `Endpoint`; the vehicle has landed, or cannot be flown."""
         if not (self._is_over or self.failure):
             return False
         now_ns = self._tick_ns - TICK_NS
@@ -131,10 +121,9 @@ class Station(Endpoint):
     def _is_over(self) -> bool:
         return self._step >= self._steps
 
-    # -- what comes --------------------------------------------------------------------------
+    # -- incoming ----------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         for message in self._codec.decode(datagram.payload):
             sender = message.get_srcSystem(), message.get_srcComponent()
             if self._peer is None and message.get_type() == "HEARTBEAT":
@@ -177,36 +166,31 @@ class Station(Endpoint):
             case "COMMAND_ACK":
                 launch.hear(message)
             case "STATUSTEXT" if text := self._texts.take(message):
-                shown = "".join(each if each.isprintable() else "?" for each in text)
+                printable_text = "".join(each if each.isprintable() else "?" for each in text)
                 if message.severity <= dialect.MAV_SEVERITY_WARNING:
-                    launch.hear_text(shown)
+                    launch.hear_text(printable_text)
                 self._events.append(
-                    AutopilotText(vehicle=VEHICLE, text=shown, severity=message.severity)
+                    AutopilotText(vehicle=VEHICLE, text=printable_text, severity=message.severity)
                 )
 
     def _fail(self, doing: str, why: str) -> None:
         self._failure = NotTakenOff(vehicle=VEHICLE, doing=doing, why=why)
         self._events.append(self._failure)
 
-    # -- what goes ---------------------------------------------------------------------------
+    # -- outgoing ---------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         if self.finished:
             return None
         return min(self._tick_ns, self._step_ns) if self._streams else self._tick_ns
 
     @property
     def _streams(self) -> bool:
-        """Whether set-points are due.
-
-        They are due in flight, and as zeros before a mode that requires a stream of them.
-        """
+        """Whether set-points are due: in flight, and as zeros before a mode that needs them."""
         flies = self._epoch_ns is not None and not self._is_over
         return flies or (self._launch is not None and self._launch.streams_zeros)
 
     def wake(self, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         if now_ns >= self._tick_ns:
             self._tick_ns = now_ns + TICK_NS
             self._tick(now_ns)
@@ -219,7 +203,6 @@ class Station(Endpoint):
                 self._fly(self._epoch_ns, now_ns)
 
     def _tick(self, now_ns: int) -> None:
-        """Send the requests that are due besides set-points."""
         launch = self._launch
         self._wait(now_ns)
         if launch is None or self._failure:
@@ -239,7 +222,7 @@ class Station(Endpoint):
             self._say(message)
 
     def _wait(self, now_ns: int) -> None:
-        """Wait for the autopilot, up to a time limit."""
+        """Fail if the autopilot has not answered within a time limit."""
         self._since_ns = now_ns if self._since_ns is None else self._since_ns
         if self._clock.is_known or self._failure or now_ns - self._since_ns <= self._patience_ns:
             return
@@ -250,7 +233,7 @@ class Station(Endpoint):
             self._fail(f"no time told {waited}", "TIMESYNC is not answered")
 
     def _begin(self, launch: Launch, now_ns: int) -> None:
-        """Request the next stream, go on with the take-off, and begin to fly after that."""
+        """Request the next stream and continue the take-off; once it is done, start the flight."""
         if now_ns >= self._stream_ns:
             self._stream_ns = now_ns + STREAM_NS
             self._ask_stream()
@@ -271,7 +254,7 @@ class Station(Endpoint):
         )
 
     def _fly(self, epoch_ns: int, now_ns: int) -> None:
-        """Send the set-point of the present step, unless somebody else flies the vehicle."""
+        """Send the set-point of the present step, unless a pilot or the autopilot flies."""
         launch = self._launch
         assert launch is not None
         step = min((now_ns - epoch_ns) // self._dt_ns, self._steps - 1)
@@ -296,7 +279,7 @@ class Station(Endpoint):
 
     @property
     def _obeys(self) -> bool:
-        """Whether the vehicle was armed and in the mode that follows set-points when last heard."""
+        """Whether the vehicle was armed and in the mode for set-points, by its newest message."""
         assert self._flavour is not None
         return self._condition.armed and self._condition.mode == self._flavour.guided
 
@@ -331,13 +314,12 @@ class Station(Endpoint):
         self.send(self._codec.encode(message), self._peer)
 
     def close(self, *, now_ns: int) -> None:
-        """See `Endpoint`; a vehicle that the station flies is told to land."""
+        """Send land commands to a vehicle that the station flies."""
         if self._launch is not None:
             for message in self._launch.close(now_ns=now_ns) * CLOSES:
                 self._say(message)
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {
             "heard": self._counts["heard"],
             "foreign": self._counts["foreign"],

@@ -1,8 +1,8 @@
 """Record of a ground station's flight, joined from the parts of its three processes.
 
-    station    what was heard and sent at each step
-    autopilot  where the vehicle truly was, at each of its ticks (`record.TRUTH_COLUMNS`)
-    netem      the fate of every packet
+    station    data received and sent at each step
+    autopilot  true state of the vehicle, at each of its ticks (`record.TRUTH_COLUMNS`)
+    netem      fate of every packet
 
 The result has the form of any flight's record: its client rows have the vehicle's true state, and
 its server rows the steps at which the station has sent.
@@ -30,14 +30,14 @@ def station_columns(axes: int) -> np.dtype[np.void]:
     """Columns of the ground station's part: one row per step."""
     return np.dtype(
         [
-            ("time_ns", "<i8"),  # [the station's clock]
+            ("time_ns", "<i8"),  # clock of the station
             ("step", "<i8"),
             ("input", "<f8", (axes,)),  # velocity of the set-point [m/s]
             ("measured", "<f8", (axes,)),  # newest position received [m]; NaN for none
-            ("age_ns", "<i8"),  # its age; -1 for none
+            ("age_ns", "<i8"),  # age of that position; -1 for none
             # whether the station was in control of the autopilot, and so sent a set-point
             ("obeyed", "?"),
-            ("late", "<i8"),  # number of positions so far that came after newer ones
+            ("late", "<i8"),  # number of positions so far that arrived after newer ones
             ("missed", "<i8"),  # number of steps so far that were missed by waking too late
         ]
     )
@@ -55,12 +55,10 @@ def joined(
     """Record of a flight; packets are counted from its first step to its last.
 
     Args:
-        scenario: scenario that was flown.
         station: rows of `station_columns`.
-        truth: rows of `record.TRUTH_COLUMNS`, on the same clock.
-        netem: rows of netem's part, on the same clock.
+        truth: rows of `record.TRUTH_COLUMNS`, on the station's clock.
+        netem: rows of netem's part, on the station's clock.
         failure: event after which the vehicle could not be flown.
-        events: events of the flight.
     """
     axes = scenario.model.axes
     client = np.zeros(len(station), client_columns(axes))

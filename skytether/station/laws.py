@@ -1,4 +1,4 @@
-"""Laws to fly an autopilot over a network by set-points alone: the set-point of each step.
+"""Laws for flying an autopilot over a network by set-points only: the set-point of each step.
 
 With the desired trajectory r, the newest received position y, and its time of measurement t_m:
 
@@ -6,7 +6,7 @@ With the desired trajectory r, the newest received position y, and its time of m
     targets    p(t) = r(t + T), u(t) = r'(t + T): the autopilot regulates
     led        u(t) = r'(t + T) + k (r(t_m) - y(t_m))
 
-T is the time by which set-points lead: delay, dead time and lag together, estimated by hand.
+T is the lead time of set-points: delay, dead time and lag together, estimated by hand.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,19 @@ from skytether.shared.scenario.reference import Reference
 
 LawName = Literal["velocity", "targets", "led"]
 LEAD_MAX_S, GAIN_MAX = 10.0, 10.0
-"""Largest lead [s] and gain [1/s]."""
 
 
 @dataclass(frozen=True)
 class LawOptions:
-    """Options that choose a law."""
-
     law: LawName = "led"
-    """Law that chooses set-points. velocity: desired velocity plus a share of the distance from the
+    """Law that chooses set-points. velocity: desired velocity, plus gain times the error of the
     newest position; targets: desired position and velocity, which the autopilot regulates; led:
-    desired velocity some time ahead, plus a share of the distance at the time of measurement."""
+    desired velocity some time ahead, plus gain times the error at the time of measurement.
+    """
     lead: float | None = None
-    """Time by which set-points lead [s], for targets and led; 0 and 1.1 unless given."""
+    """Lead time of set-points [s], for targets and led; by default 0 and 1.1."""
     gain: float | None = None
-    """Gain from distance to velocity [1/s], for velocity and led; 0.3 and 0.5 unless given."""
+    """Gain from position error to velocity [1/s], for velocity and led; by default 0.3 and 0.5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +41,9 @@ class Law:
 
     name: LawName
     lead_s: float | None
-    """Time by which set-points lead, T [s]."""
+    """Lead time of set-points, T [s]."""
     gain: float | None
-    """Gain from the distance to the desired trajectory to velocity, k [1/s]."""
+    """Gain from position error to velocity, k [1/s]."""
 
 
 LAWS: dict[LawName, Law] = {
@@ -53,8 +51,9 @@ LAWS: dict[LawName, Law] = {
     "targets": Law("targets", 0.0, None),
     "led": Law("led", 1.1, 0.5),
 }
-"""Laws by name, with the numbers that were fitted by hand to ArduCopter over the paper's network:
-`targets` was best with a lead of 0.55 s."""
+"""Laws by name, with numbers fitted by hand to ArduCopter over the paper's network; `targets` was
+best with a lead of 0.55 s.
+"""
 
 
 def make(name: LawName, lead_s: float | None = None, gain: float | None = None) -> Law:
@@ -84,37 +83,31 @@ def _number(
 
 
 def flags(law: Law) -> list[str]:
-    """Arguments of `skytether station` that choose a law."""
     numbers = {"--lead": law.lead_s, "--gain": law.gain}
-    given = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
-    return [f"--law={law.name}", *given]
+    arguments = [f"{flag}={number}" for flag, number in numbers.items() if number is not None]
+    return [f"--law={law.name}", *arguments]
 
 
 class Heard(NamedTuple):
-    """Position received from the vehicle."""
-
     time_s: float
-    """Time of flight at which it was measured [s]."""
+    """Time of flight at the measurement [s]."""
     position: Array
-    """Position [m]; shape (axes,)."""
+    """Shape (axes,) [m]."""
 
 
 class Setpoint(NamedTuple):
-    """Set-point sent to the autopilot."""
-
     velocity: Array
-    """Velocity [m/s]; shape (axes,)."""
+    """Shape (axes,) [m/s]."""
     position: Array | None
-    """Position [m], shape (axes,); None: only the velocity is set."""
+    """Shape (axes,) [m]; None if only the velocity is set."""
 
 
 def setpoint(law: Law, reference: Reference, time_s: float, heard: Heard | None) -> Setpoint:
     """Set-point of a step.
 
     Args:
-        law: law that chooses it.
         reference: desired trajectory r.
-        time_s: time of flight t [s].
+        time_s: time of flight t.
         heard: newest position; None before the first.
     """
     ahead = reference(np.array(time_s + (law.lead_s or 0.0)))

@@ -1,5 +1,4 @@
-"""Live page, recordings, and the data and pictures that both are made of.
+"""Live page, recordings, and the data and pictures of both.
 
-Everything here is made of frames (`shared.telemetry.feed`), from a feed, a recording or a flight in
-virtual time.
+The input is frames (`shared.telemetry.feed`), from a feed, a recording or a flight in virtual time.
 """

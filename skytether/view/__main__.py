@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # first, before the imports below, which take a while
+if __name__ == "__main__":  # called before the imports below, which take a while
     sys.exit(run("skytether.view.__main__:show", "page"))
 
 import os
@@ -29,13 +29,12 @@ NICE = 5
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Options of `skytether page`."""
-
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folders of flights, each with the feeds and control sockets of its processes."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; if the port is taken, the next free one. Visitors from other
-    machines may only look, unless they know the printed token."""
+    machines may only look, unless they have the printed token.
+    """
     log: LogFormat = "text"
     """Form of printed events: sentences, or lines of JSON for a program."""
     plugin: command.Plugins = ()
@@ -44,9 +43,9 @@ class PageOptions:
 def show(argv: Sequence[str]) -> None:
     """Show flights in a browser while they fly, until SIGINT or SIGTERM.
 
-    A flight's folder is one that `fly --control` was given, or one in which server, netem and
-    client have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on.
-    Flights may begin, or begin again, later.
+    A flight's folder is the one given to `fly --control`, or one in which server, netem and client
+    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on. Flights may
+    begin, or begin again, later.
     """
     options = read(PageOptions(tyro.MISSING), argv, "skytether page", show.__doc__)
     if not options.folders:

@@ -1,9 +1,9 @@
 """Safe reading of MCAP files: sizes that a file claims are checked before memory is allocated.
 
-A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` believes that. So the
-library is given a stream that ends where the file does, and chunks whose size is known before they
-are decompressed. The file is read once, from its beginning on, so that one without an index, whose
-writer was killed, is read as any other.
+A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` allocates them. So the
+library gets a stream that ends where the file does, and chunks whose size is known before they are
+decompressed. The file is read once, from its beginning, so that one without an index, whose writer
+was killed, can be read as well.
 """
 
 import os
@@ -24,17 +24,17 @@ from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.telemetry.record import RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Bytes that an MCAP file begins and ends with."""
 ENCODING = "msgpack"
 """Encoding of the messages that are read back; others are written for other programs."""
 
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
-"""Largest size of a decompressed chunk [B]; this program ends chunks at 256 KiB and a message."""
+"""Largest size of a decompressed chunk [B]; Skytether writes 256 KiB and a message."""
 SPARE_BYTES = 16 * 1024 * 1024
 """Total decompressed size of chunks that any file may have, however small it is [B]."""
 RATIO_MAX = 50
-"""Largest total decompressed size of the chunks over the file's size; flights have 3 to 5, as the
-index of their messages is not compressed."""
+"""Largest total decompressed size of the chunks over the file's size; flights have 3 to 5, because
+the index of messages is not compressed.
+"""
 SPARE_MESSAGES = 10_000
 """Number of messages that any file may have: those of a chunk whose index was not written yet."""
 INDEXED_BYTES = 16
@@ -57,12 +57,12 @@ BROKEN = (
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn any exception from a damaged file into one error."""
+    """Turn any exception from a damaged file into a RecordingError."""
     try:
         yield
     except RecordingError:
         raise
-    except ConfigError as error:  # of another version, or its trajectory's file is elsewhere
+    except ConfigError as error:  # of another version, or its trajectory's file is missing here
         raise RecordingError(f"{path}: {error}") from None
     except BROKEN as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
@@ -70,13 +70,10 @@ def reading(path: Path) -> Iterator[None]:
 
 
 class Container:
-    """MCAP file that is read once; no more memory is reserved for a record than the file's size.
-
-    Args:
-        path: the file.
+    """MCAP file that is read once; a record is never given more memory than the file's size.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
         RecordingError: it is no MCAP file.
     """
 
@@ -89,8 +86,7 @@ class Container:
         self._file = os.fdopen(descriptor, "rb")
         self._size = status.st_size
         self.lost_bytes = 0
-        """Size of what could not be read at the end of a file without an end [B]; valid after
-        `messages`."""
+        """Bytes lost at the end of a file that was not completed; valid after `messages`."""
         try:
             files.note(path, self._file)
             if self._file.read(len(MAGIC)) != MAGIC:
@@ -98,31 +94,30 @@ class Container:
                 raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})")
             self._file.seek(max(self._size - len(MAGIC), len(MAGIC)))
             self.is_whole = self._file.read() == MAGIC
-            """Whether it has an end; the files of killed flights have none."""
+            """Whether the file was completed; those of killed flights are not."""
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def read(self, size: int) -> bytes:
-        """Next bytes, as many as there are; all that the library calls."""
+        """Next bytes, at most `size`; the only method of a file that the library calls."""
         return self._file.read(min(size, self._size - self._file.tell()))
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Topics and contents of messages in the encoding that is read back, in file order.
 
-        A file without an end is read up to the first record that is not whole.
+        A file that was not completed is read up to the first record that is not whole.
 
         Raises:
-            BROKEN: the file has an end, and is damaged.
+            BROKEN: a completed file is damaged.
         """
         self._file.seek(0)
         whole_bytes = len(MAGIC)
         topics: dict[int, str] = {}
-        left = SPARE_MESSAGES + self._size // INDEXED_BYTES
+        messages_left = SPARE_MESSAGES + self._size // INDEXED_BYTES
         try:
             for record in self._unpacked():
                 match record:
@@ -133,8 +128,8 @@ class Container:
                     case Message(channel_id=number) if number not in topics:
                         raise ValueError(f"a message before its channel {number}")
                     case Message(channel_id=number) if topic := topics[number]:
-                        left -= 1
-                        if left < 0:
+                        messages_left -= 1
+                        if messages_left < 0:
                             raise ValueError("it has more messages than fit into its size")
                         yield topic, record.data
                 whole_bytes = self._file.tell()
@@ -144,7 +139,6 @@ class Container:
             self.lost_bytes = self._size - whole_bytes
 
     def _unpacked(self) -> Iterator[McapRecord]:
-        """Records, those within chunks as well."""
         left_bytes = SPARE_BYTES + RATIO_MAX * self._size
         stream: Any = self
         for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
@@ -158,8 +152,8 @@ class Container:
             if left_bytes < 0:
                 raise ValueError("its chunks are larger than any flight's, for a file of its size")
             if record.compression not in {"", "zstd"}:
-                found = record.compression[:20]
-                raise ValueError(f"a chunk is compressed with {found!r}, expected zstd")
+                compression = record.compression[:20]
+                raise ValueError(f"a chunk is compressed with {compression!r}, expected zstd")
             packed = zstandard.frame_content_size if record.compression else len
             if packed(record.data) not in {-1, size}:
                 raise ValueError("a chunk's content has another size than it says")

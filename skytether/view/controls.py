@@ -1,6 +1,6 @@
-"""Numbers that may be changed in flight, described as the sliders of a page.
+"""Numbers that may be changed in flight, described as sliders of a page.
 
-Each has a name, a range, and functions to read it from, and write it to, the keys that a process
+Each has a name, a range, and functions that read it from, and write it to, the keys that a process
 lets change (docs/operating.md). Nothing is checked here: the processes check changes as they check
 a scenario.
 """
@@ -14,20 +14,19 @@ from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.schemes import properties
 
 Values = Mapping[str, Any]
-"""Values by key."""
 Read = Callable[[Values], float | None]
 Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
-"""Both directions of the network."""
+"""Keys of both network directions."""
 ALL_LOST = " & loss(1)"
 """Text appended to a direction's impairments to lose every packet."""
 LOST = ("loss(1)", "loss(1.0)")
-"""Ends of texts of directions that lose every packet."""
+"""Suffixes of impairments that lose every packet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """Number that can be changed."""
+    """Slider for a number that can be changed in flight."""
 
     label: str
     hint: str
@@ -38,18 +37,16 @@ class Knob:
     """Upper end of the slider; raised if the present value is higher."""
     step: float
     read: Read
-    """Function that reads the number from the process's values; None: there is none."""
+    """Function that reads the number from the process's values; None if there is no such number."""
     write: Write
     """Function that returns the changed keys and values, given the present values."""
 
 
 def texts(values: Values) -> dict[str, str]:
-    """Network directions as texts, by key; empty where they may not change."""
     return {way: values[way] for way in WAYS if way in values}
 
 
 def cut(values: Values) -> dict[str, Any]:
-    """Changes that lose every packet from now on."""
     return {way: f"{text}{ALL_LOST}" if text else LOST[0] for way, text in texts(values).items()}
 
 
@@ -59,7 +56,6 @@ def is_cut(values: Values) -> bool:
 
 
 def healed(values: Values) -> dict[str, Any]:
-    """Changes that undo `cut`."""
     changed = {way: text.removesuffix(ALL_LOST) for way, text in texts(values).items()}
     return {
         way: _with(way, text, "loss", 0.0) if text.endswith(LOST) else text
@@ -68,12 +64,10 @@ def healed(values: Values) -> dict[str, Any]:
 
 
 def _with(key: str, text: str, at: str, number: float) -> str:
-    """The text of a key with another argument."""
     return dotted.TEXTS[key].with_argument(text, at, number)
 
 
 def _number(values: Values, key: str, at: str) -> float | None:
-    """An argument in the text of a key; None where there is none."""
     try:
         return float(dotted.TEXTS[key].argument(values[key], at))
     except (KeyError, GrammarError):
@@ -88,8 +82,8 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
     """Slider for the first argument of an impairment in both directions, in another unit.
 
     Args:
-        names: impairments; that which a direction has is changed.
-        scale: what the argument is multiplied by.
+        names: impairments; the one that a direction has is changed.
+        scale: factor from the argument to the slider's number.
     """
 
     def known(values: Values) -> dict[str, tuple[str, float]]:
@@ -122,7 +116,6 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
 
 
 def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
-    """Slider for an argument of a policy in the trigger."""
     key = "control.trigger"
 
     def write(values: Values, number: float) -> dict[str, Any]:
@@ -132,12 +125,11 @@ def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
 
 
 def knobs(axes: int) -> tuple[Knob, ...]:
-    """Sliders for vehicles with so many axes that do not depend on the trigger."""
     wind, steady = "vehicle.wind", "vehicle.steady_wind_mps"
     lossy = "Share of packets that are lost, both ways"
     least = "Smallest delay of a packet, each way"
     white = "Strength of white acceleration"
-    along = "Velocity that steady wind adds in the long run"
+    along = "Velocity of the steady wind"
     return (
         Knob("Loss [%]", lossy, "netem", 0.0, 100.0, 1.0, *_ways(("loss",), 100.0)),
         Knob("Delay [ms]", least, "netem", 0.0, 1500.0, 10.0, *_ways(("paper", "constant"), 1e3)),
@@ -190,7 +182,7 @@ THRESHOLDS = (
         },
     ),
 )
-"""Sliders for the thresholds of triggers, each offered where the present trigger compares it."""
+"""Sliders for the thresholds of triggers, each shown if the present trigger compares it."""
 
 TRIGGERS = (
     "always",
@@ -200,7 +192,7 @@ TRIGGERS = (
     "deviation | silence(1)",
     "state_gap",
 )
-"""Triggers offered to the user, where the scheme computes what they compare."""
+"""Triggers offered to the user, if the scheme computes the figures that they compare."""
 
 
 def triggers(scheme: str, present: str) -> tuple[str, ...]:

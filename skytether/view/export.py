@@ -1,9 +1,9 @@
 """Recordings as tables: one for each part of the record, and one of the events.
 
-A column is a number with its unit in its name, as in `position_x_m`; a plan has one for each of its
-inputs (`input_x_mps_0`). Codes of the record become words: `mode`, `reason`, `direction`,
-`compared`. Durations are in ms, as in a summary, and `error_m` is the distance of a vehicle from
-its desired position.
+A column is a number with its unit in its name, as in `position_x_m`; a plan has a column for each
+of its inputs (`input_x_mps_0`). The codes in `mode`, `reason`, `direction` and `compared` become
+words. Durations are in ms, as in a summary, and `error_m` is the distance of a vehicle from its
+desired position.
 """
 
 import io
@@ -31,14 +31,14 @@ STEPS = ("in_force", "observed_step")
 def tables(recorded: Recorded) -> dict[str, Columns]:
     """Tables of a recording, by name; `time_s` counts from the first message."""
     parts = recorded.parts
-    made = {
+    result = {
         part: {"time_s": recorded.times_ns[part] / SECOND_NS}
         | dict(_in_ms(name, column) for name, column in readable(rows).items())
         for part, rows in parts.items()
     }
     if "client" in parts:
         client, server = parts["client"], parts.get("server")
-        made["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
+        result["client"]["error_m"] = _errors_m(recorded.scenario, client, server)
     events = [
         (time_ns / SECOND_NS, process, type(event).__name__, str(event))
         for time_ns, process, event in recorded.events()
@@ -46,8 +46,8 @@ def tables(recorded: Recorded) -> dict[str, Columns]:
     if events:
         names = ("time_s", "process", "type", "text")
         columns = zip(*events, strict=True)
-        made["events"] = dict(zip(names, map(np.array, columns), strict=True))
-    return made
+        result["events"] = dict(zip(names, map(np.array, columns), strict=True))
+    return result
 
 
 def _in_ms(name: str, column: NDArray[Any]) -> tuple[str, NDArray[Any]]:
@@ -67,13 +67,12 @@ def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
 
 
 def csv(columns: Columns) -> str:
-    """Table as CSV text; unknown values are empty."""
     values = [_known(name, column) for name, column in columns.items()]
     return to_csv(list(columns), zip(*values, strict=True))
 
 
 def parquet() -> Callable[[Columns], bytes]:
-    """Writer of a table as Parquet.
+    """Function that writes a table as Parquet.
 
     Raises:
         ImportError: pyarrow is not installed.

@@ -1,7 +1,7 @@
-"""Messages that Foxglove and Lichtblick draw, and their JSON schemas, by the names they document.
+"""Messages that Foxglove and Lichtblick draw, and their JSON schemas, by their documented names.
 
 All positions are in the frame WORLD: metres, third axis up. The schemas use only objects, lists and
-single types, and no list within a list: both programs understand no more.
+single types, and no list within a list, because both programs understand no more.
 """
 
 import math
@@ -12,9 +12,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
 
 WORLD = "world"
-"""Name of the frame of all positions."""
 INFO, WARNING = 2, 3
-"""Levels of a log message."""
 
 Json = dict[str, Any]
 
@@ -84,7 +82,6 @@ SCHEMAS: Mapping[str, Json] = {
         timestamp=_TIME, level=_WHOLE, message=_TEXT, name=_TEXT, file=_TEXT, line=_WHOLE
     ),
 }
-"""JSON schema of each kind of message, by its name."""
 
 VEHICLE_M, POINT_M, LINE_M = 0.12, 0.09, 0.015
 """Sizes of a vehicle, of a point, and of a line's thickness [m]."""
@@ -96,7 +93,6 @@ BLUE, RED, GREY, GREEN = (
 
 
 def log(time_ns: int, process: str, message: str, level: int) -> Json:
-    """Message foxglove.Log: a sentence of a process."""
     return {
         "timestamp": _time(time_ns),
         "level": level,
@@ -117,9 +113,7 @@ def pose_in_frame(time_ns: int, state: Array) -> Json:
 
 
 def transform(time_ns: int, vehicle: str, state: Array) -> Json:
-    """Message foxglove.FrameTransform: a vehicle's own frame, so that a view may follow the
-    vehicle.
-    """
+    """Message foxglove.FrameTransform: the frame of a vehicle, which a view may follow."""
     pose = _pose(state)
     return {
         "timestamp": _time(time_ns),
@@ -131,9 +125,7 @@ def transform(time_ns: int, vehicle: str, state: Array) -> Json:
 
 
 def vehicle(time_ns: int, name: str, state: Array) -> Json:
-    """Message foxglove.SceneUpdate: a vehicle as a sphere, with an arrow as long as it flies in 1
-    s.
-    """
+    """Message foxglove.SceneUpdate: a vehicle as a sphere, with an arrow of its motion in 1 s."""
     pose, speed = _pose(state), float(math.hypot(*state[:2, 1]))
     arrow = {
         "pose": pose,
@@ -147,16 +139,10 @@ def vehicle(time_ns: int, name: str, state: Array) -> Json:
 
 
 def point(time_ns: int, name: str, state: Array) -> Json:
-    """Message foxglove.SceneUpdate: a vehicle's desired position."""
     return _scene(time_ns, name, spheres=[_sphere(_pose(state), POINT_M, RED)])
 
 
 def line(time_ns: int, name: str, positions: Array, color: Json) -> Json:
-    """Message foxglove.SceneUpdate: a path.
-
-    Args:
-        positions: its points [m]; shape (n, axes).
-    """
     drawn = {
         "type": 0,
         "pose": {"position": _vector(()), "orientation": _facing(0.0)},

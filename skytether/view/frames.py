@@ -14,7 +14,7 @@ from skytether.shared.telemetry.feed import Rows as RowsFrame
 from skytether.shared.telemetry.record import Record, Rows
 
 Timed = tuple[int, str, Frame]
-"""Time of a frame [ns], the process that it comes from, and the frame."""
+"""Time of a frame [ns], its process, and the frame."""
 PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": "netem"}
 """Process that makes each part of the record."""
 
@@ -23,8 +23,7 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
     """Frames of a flight in virtual time, in order of time; time begins at 0.
 
     Args:
-        scenario: what was flown.
-        name: of the scenario.
+        name: name of the scenario.
     """
     begins = _begins(flight)
     parts: dict[str, Rows] = {part: getattr(flight, part) for part in PROCESSES}
@@ -33,15 +32,17 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
     ]
     toml = to_toml(scenario).decode()
     for process in dict.fromkeys(PROCESSES.values()):
-        own = described({p: rows.dtype for p, rows in parts.items() if PROCESSES[p] == process})
-        opened = Opened(process=process, name=name, scenario=toml, parts=own, wall_ns=0, time_ns=0)
+        columns = described({p: rows.dtype for p, rows in parts.items() if PROCESSES[p] == process})
+        opened = Opened(
+            process=process, name=name, scenario=toml, parts=columns, wall_ns=0, time_ns=0
+        )
         yield 0, process, opened
-    said = (
+    events = (
         (each.time_ns, each.process, Said(time_ns=each.time_ns, event=each.event))
         for each in flight.events
     )
     end_ns = 0
-    for timed in merge(said, *streams, key=lambda each: each[0]):
+    for timed in merge(events, *streams, key=lambda each: each[0]):
         end_ns = timed[0]
         yield timed
     for process, figures in flight.figures.items():
@@ -49,13 +50,12 @@ def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
 
 
 def _begins(flight: Record) -> Indices:
-    """Time of step 0 of each vehicle [ns], by its number."""
-    known = {
+    begins = {
         event.vehicle: time_ns
         for time_ns, _, event in reversed(flight.events)
         if isinstance(event, Flying)
     }
-    return np.array([known.get(n, 0) for n in range(max(known, default=0) + 1)], dtype=np.int64)
+    return np.array([begins.get(n, 0) for n in range(max(begins, default=0) + 1)], dtype=np.int64)
 
 
 def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Indices:
@@ -69,7 +69,7 @@ def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Ind
 
 
 def _rows(part: str, rows: Rows, times_ns: Indices) -> Iterator[Timed]:
-    """Frames of a part: one for all rows of an instant."""
+    """Frames of a part, one for all rows with the same time."""
     starts = np.flatnonzero(np.diff(times_ns, prepend=-1))
     ends = np.append(starts[1:], len(rows))[: len(starts)]
     for begin, end in zip(starts, ends, strict=True):

@@ -3,7 +3,7 @@
     frames of each, by the time of day → one file → summary of the first client's flight
 
 Each process has recorded its own part, with its own scenario. A key's value is taken from the
-process that owns the key; keys that both ends predict with must be equal. Times are converted to
+process that owns the key; keys with which both ends predict must be equal. Times are converted to
 the clock of the first client, by the difference of the times of day.
 """
 
@@ -27,8 +27,7 @@ from skytether.view.recorded import Recorded, summary_of
 from skytether.view.recording import Recording
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
-"""Owner of the keys whose values a process's recording has, by the part of the record that it
-holds."""
+"""Owner of keys by part of the record: a key's value is taken from the recording with that part."""
 
 
 def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
@@ -49,15 +48,14 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
-    """Scenario of a flight, each value from the process that owns the key."""
     table = to_table(first.scenario)
-    for each in recordings:
-        terms = first.scenario.terms(), each.scenario.terms()
+    for recorded in recordings:
+        terms = first.scenario.terms(), recorded.scenario.terms()
         if different := catalogue.differences(*terms):
-            said = f"it is of another flight than {first.path}: {different[0]}"
-            raise RecordingError(f"{each.path}: {said}")
-        owners = {OWNERS.get(part) for part in each.parts}
-        values = flat(to_table(each.scenario))
+            message = f"it is of another flight than {first.path}: {different[0]}"
+            raise RecordingError(f"{recorded.path}: {message}")
+        owners = {OWNERS.get(part) for part in recorded.parts}
+        values = flat(to_table(recorded.scenario))
         set_keys({key: value for key, value in values if KEYS[key].owner in owners}, table)
     return check(table, "the scenarios together")
 
@@ -75,10 +73,9 @@ def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
 
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
-    """Rows of each part, from all recordings."""
     pieces: dict[str, list[Table]] = {}
-    for each in recordings:
-        for part, rows in each.parts.items():
+    for recorded in recordings:
+        for part, rows in recorded.parts.items():
             pieces.setdefault(part, []).append(rows)
     for part, tables in pieces.items():
         if len({table.dtype for table in tables}) > 1:

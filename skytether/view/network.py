@@ -1,4 +1,4 @@
-"""Last minute of a network, in bins of 0.25 s, made of netem's rows."""
+"""Last minute of a network, in bins of 0.25 s, from netem's rows."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,14 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.record import Rows as Table
 
 SPAN_S = 60.0
-"""Time that is kept [s]."""
+"""Time that is kept."""
 BIN_NS = 250 * MILLISECOND_NS
-"""Width of a bin of the network's ring [ns]."""
 BINS = int(SPAN_S * SECOND_NS) // BIN_NS
-"""Number of bins of the network's ring."""
 DELAY_BIN_NS = 20 * MILLISECOND_NS
-"""Width of a bin of a histogram of delays [ns]."""
 DELAY_BINS = 100
-"""Number of bins of a histogram of delays; the last one holds all longer delays."""
+"""Number of bins of the delay histogram; the last bin contains all longer delays."""
 DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
-"""Names of the directions: up to the vehicle, down from it."""
+"""Names of the directions: up to the vehicle, down from the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +28,8 @@ class Traffic:
     packets_per_s: float
     bytes_per_s: float
     loss: float
-    """Share of its packets that were lost; NaN without packets."""
+    """Share of packets that were lost; NaN without packets."""
     delay_ms_p50: float
-    """Median delay of its packets that arrived [ms]; NaN without packets."""
     delay_ms_p99: float
 
 
@@ -41,7 +37,7 @@ class Network:
     """Last minute of the network, in bins of 0.25 s.
 
     Args:
-        horizon_bytes: least size of an uplink packet that carries a horizon [B].
+        horizon_bytes: smallest size of an uplink packet that carries a horizon [B].
     """
 
     def __init__(self, horizon_bytes: int) -> None:
@@ -55,14 +51,13 @@ class Network:
         """Sum of the delays of packets that arrived [ns]."""
         self._delays = np.zeros((*shape, DELAY_BINS), np.int64)
         self._waiting = np.zeros(shape)
-        """Packets under way at the end of each bin, as netem counted them."""
+        """Packets that netem was delaying at the end of each bin."""
         self._horizons = np.zeros((BINS, 2), np.int64)
-        """Number of uplink packets that carry a horizon, and their bytes."""
+        """Uplink packets that carry a horizon: their number, and their bytes."""
         self.heard_ns: dict[int, int] = {}
         """Time at which a packet last arrived, by direction [ns]."""
 
     def take(self, rows: Table, *, time_ns: int) -> None:
-        """Take rows of netem's part."""
         at = self._at(time_ns)
         if at is None:
             return
@@ -71,23 +66,22 @@ class Network:
         np.add.at(self._bytes[at], direction, size)
         np.add.at(self._lost[at], direction, lost)
         through = ~lost
-        there, delay_ns = direction[through], rows["delay_ns"][through]
-        np.add.at(self._delay_ns[at], there, delay_ns)
+        directions, delay_ns = direction[through], rows["delay_ns"][through]
+        np.add.at(self._delay_ns[at], directions, delay_ns)
         bins = np.minimum(delay_ns // DELAY_BIN_NS, DELAY_BINS - 1)
-        np.add.at(self._delays[at], (there, bins), 1)
+        np.add.at(self._delays[at], (directions, bins), 1)
         planned = (direction == UPLINK) & (size >= self._horizon_bytes)
         self._horizons[at] += (int(planned.sum()), int(size[planned].sum()))
-        for each in np.unique(there):
+        for each in np.unique(directions):
             self.heard_ns[int(each)] = time_ns
 
     def wait(self, waiting: Array, *, time_ns: int) -> None:
-        """Take the number of packets under way in each direction; shape (2,)."""
         at = self._at(time_ns)
         if at is not None:
             self._waiting[at] = waiting
 
     def _at(self, time_ns: int) -> int | None:
-        """Index of the bin of a time, emptied if it is new; None for a time that is too old."""
+        """Index of the bin of a time, cleared if it is new; None for a time that is too old."""
         number = time_ns // BIN_NS
         at = number % BINS
         if self._bin[at] > number:
@@ -108,7 +102,6 @@ class Network:
         return recent & (self._bin >= 0)
 
     def traffic(self, direction: int, seconds: float, now_ns: int) -> Traffic:
-        """Traffic of one direction in the last seconds."""
         recent = self._since(seconds, now_ns)
         packets = int(self._packets[recent, direction].sum())
         lost = int(self._lost[recent, direction].sum())
@@ -128,7 +121,7 @@ class Network:
         return (index + 0.5) * DELAY_BIN_NS / MILLISECOND_NS
 
     def histogram(self, direction: int, now_ns: int) -> Array:
-        """Number of packets of the last minute by their delay; shape (DELAY_BINS,)."""
+        """Number of packets of the last minute by delay; shape (DELAY_BINS,)."""
         recent = self._since(SPAN_S, now_ns)
         return self._delays[recent, direction].sum(axis=0).astype(np.float64)
 
@@ -141,7 +134,7 @@ class Network:
         return self._by_second(self._bytes[:, direction], now_ns)
 
     def losses(self, direction: int, now_ns: int) -> Array:
-        """Share of packets lost in each of the last SPAN_S seconds; NaN without packets; shape
+        """Share of packets lost in each of the last SPAN_S seconds; NaN if none; shape
         (SPAN_S,).
         """
         packets = self._by_second(self._packets[:, direction], now_ns)
@@ -149,13 +142,11 @@ class Network:
         return np.where(packets > 0, lost / np.maximum(packets, 1), np.nan)
 
     def waiting(self, direction: int, now_ns: int) -> Array:
-        """Packets under way in each of the last SPAN_S seconds, oldest first; shape (SPAN_S,)."""
+        """Packets in netem in each of the last SPAN_S seconds, oldest first; shape (SPAN_S,)."""
         return self._by_second(self._waiting[:, direction], now_ns)
 
     def delays_s(self, direction: int, now_ns: int) -> Array:
-        """Mean delay in each of the last SPAN_S seconds [s]; NaN without packets; shape
-        (SPAN_S,).
-        """
+        """Mean delay in each of the last SPAN_S seconds [s]; NaN without any; shape (SPAN_S,)."""
         through = self._packets[:, direction] - self._lost[:, direction]
         total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
         count = self._by_second(through, now_ns)

@@ -18,31 +18,27 @@ from skytether.view.scene import FLIGHT_RGB
 from skytether.view.state import Curves, State
 
 POINTS = 400
-"""Number of points of a line."""
 SEEN = 4.0
 """Upper limit of the trigger's plot, in thresholds."""
 SPARE = 6
 """Number of zeros left at the end of a cropped plot."""
 HEIGHT = 150
-"""Height of a plot [pixels]."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
-"""Colours of the two directions, in plots of one flight or of what all flights share."""
+"""Colours of the two directions, in plots of one flight or of data that all flights share."""
 TIME = "time of flight [s]"
-"""Label of most plots' horizontal axis."""
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
-"""Series of a plot that only widens its range: another range would make the browser begin anew."""
+"""Invisible series that widens a plot's range: changing the range itself would redraw all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """View of a flight that the plots show."""
+    """Data of a flight for the plots."""
 
     state: State
     curves: Curves
     now_ns: int
     vehicle: int = 0
-    """Number of the vehicle."""
 
 
 Values = Callable[[Look], Array]
@@ -55,7 +51,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; that of the flight unless given, and where each of several flights has this line."""
+    """Colour; the flight's if empty, or if several flights have this line."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False
@@ -64,18 +60,15 @@ class PlotLine:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One plot."""
-
     title: str
     lines: tuple[PlotLine, ...]
     grid: Values = lambda look: look.curves.time_s
     across: str = TIME
-    """Label of the horizontal axis."""
     log: bool = False
     crop: bool = False
     """Whether trailing zeros are cropped."""
     equal: bool = False
-    """Whether its range is as wide as that of the others with this flag."""
+    """Whether the vertical range is as wide as in all other plots with `equal`."""
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:
@@ -95,7 +88,7 @@ def _seconds(look: Look) -> Array:
 
 def _rates(direction: int) -> Values:
     def values(look: Look) -> Array:
-        """Packets in each second, from the last one before the flight on; NaN before."""
+        """Packets in each second, from the last second before the flight; NaN before."""
         rates = look.state.network.rates(direction, look.now_ns)
         return np.where(_seconds(look) > -1.0, rates, np.nan)
 
@@ -137,7 +130,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """Compared figure, cut off where it would hide its threshold."""
+    """Compared figure, limited to SEEN thresholds so that the threshold stays visible."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 
@@ -152,14 +145,13 @@ BY_DELAY = Plot(
     across="delay [ms]",
     crop=True,
 )
-"""Histogram plot of packets by their delay."""
 
 
 APART = Plot(
     "Nearest other vehicle [m]",
     (
         PlotLine(
-            "asked for",
+            "required",
             lambda look: np.full(POINTS, look.state.scenario.mission.separation_m),
             GREY,
             dash=(4, 4),
@@ -168,11 +160,9 @@ APART = Plot(
         PlotLine("nearest", lambda look: look.state.nearest_m(look.vehicle, POINTS)),
     ),
 )
-"""Plot of the distance to the nearest other vehicle of a mission."""
 
 
 def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
-    """Plots of a vehicle with so many axes, alone or on a mission."""
     return (
         *((APART,) if mission else ()),
         *(Plot(f"{name} [m]", _axis(axis), equal=True) for axis, name in enumerate("xyz"[:axes])),
@@ -186,7 +176,7 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
             grid=_seconds,
         ),
         Plot(
-            "What the trigger compares",
+            "Trigger: figure and threshold",
             (
                 PlotLine("threshold", lambda look: look.curves.threshold, GREY, dash=(4, 4)),
                 PlotLine("compared", _compared),
@@ -196,10 +186,9 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
 
 
 def of_network(*, solves: bool) -> tuple[Plot, ...]:
-    """Plots of the network, and of the cost of plans where inputs are planned."""
     packets = (
         Plot(
-            "Age of what is flown by, and delays [s]",
+            "Age of the observation flown by, and delays [s]",
             (
                 PlotLine("age", lambda look: look.curves.age_s),
                 PlotLine("delay up", _delays(UPLINK), UP, once=True, width=1.0),
@@ -209,7 +198,7 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
         BY_DELAY,
     )
     solving = Plot(
-        "Solving, against the deadline [ms]",
+        "Computing time, and its deadline [ms]",
         (
             PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
             PlotLine("solving", lambda look: look.curves.solve_ms),
@@ -220,7 +209,6 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
 
 
 def of_link() -> tuple[Plot, ...]:
-    """Plots of both directions of a network, for any protocol."""
     return (
         _ways("Packets in a second", Network.rates),
         _ways("Payload in a second [kB]", Network.loads, 1e-3),
@@ -245,9 +233,7 @@ class Plots:
     """Plots of one browser.
 
     Args:
-        gui: viser's interface that they are added to.
-        titles: what the flights are called; empty for a flight that is alone.
-        plots: the plots.
+        titles: titles of the flights; empty for a single flight.
     """
 
     def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
@@ -261,8 +247,8 @@ class Plots:
             for line in plot.lines:
                 if line.once and place:
                     continue
-                own = css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
-                rgb = line.rgb if line.rgb and (line.once or len(titles) == 1) else own
+                colour = css(FLIGHT_RGB[place % len(FLIGHT_RGB)])
+                rgb = line.rgb if line.rgb and (line.once or len(titles) == 1) else colour
                 label = " ".join(filter(None, ("" if line.once else title, line.label)))
                 shown: uplot.Series = {
                     "label": label or "flown",
@@ -299,7 +285,7 @@ class Plots:
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
-        """Redraw the flights; the first one determines the times."""
+        """The first flight determines the times."""
         drawn = []
         for plot in self._plots:
             data = [plot.grid(looks[0])]
@@ -325,7 +311,6 @@ def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
 
 
 def cropped(data: Sequence[Array]) -> list[Array]:
-    """Data without the trailing zeros, except for a few."""
     used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
     return [values[: max(used) + SPARE] for values in data]
 
@@ -333,7 +318,7 @@ def cropped(data: Sequence[Array]) -> list[Array]:
 def begun(data: Sequence[Array]) -> list[Array]:
     """Data from the first known value on."""
     missing = [np.isnan(values) for values in data[1:]]
-    begin = [int(np.argmin(gone)) for gone in missing if gone.any() and not gone.all()]
+    begin = [int(np.argmin(unknown)) for unknown in missing if unknown.any() and not unknown.all()]
     first = min(min(begin, default=0), len(data[0]) - 2)
     return [values[first:] for values in data]
 
@@ -341,7 +326,7 @@ def begun(data: Sequence[Array]) -> list[Array]:
 def drawable(data: Sequence[Array]) -> list[Any]:
     """Data for uPlot: None in gaps, because uPlot draws no line that contains NaN.
 
-    A list, because viser converts all that is in a tuple to numbers.
+    A list, because viser converts everything in a tuple to numbers.
     """
     return [_with_gaps(values) if np.isnan(values).any() else values for values in data]
 

@@ -1,4 +1,4 @@
-"""Reader of recordings: a flight's frames, and the rows in them, bit for bit.
+"""Reader of recordings: a flight's frames, and their rows, bit for bit.
 
 A file is not trusted: `view.container` bounds time and memory, and frames that no flight of the
 scenario can have are refused.
@@ -31,38 +31,33 @@ from skytether.view.recording import BEGUN, FEED, About, Begun
 from skytether.view.rows import check_columns, check_values
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
-"""Longest time from the first frame of a recording to its last [ns]."""
+"""Longest time from the first frame of a recording to its last."""
 TIME_NS_MAX = 2**62
 """Largest time of a frame, and largest offset of a clock [ns]."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recording that was read."""
-
     path: Path
-    """File of the recording."""
     about: About
-    """Facts about it."""
+    """Name of the scenario, seed, version and clock."""
     scenario: Scenario
-    """Scenario at the beginning of the flight."""
     frames: Sequence[Timed]
-    """Frames in order of time, counted from the first one [ns]."""
+    """Frames in order of time; times count from the first frame [ns]."""
     parts: Mapping[str, Table]
     """Rows of each part of the record that has any, by its name, in the order of recording."""
     times_ns: Mapping[str, Indices]
-    """Time of each of these rows [ns], counted from the first frame."""
+    """Time of each row of `parts`, counted from the first frame [ns]."""
     lost_bytes: int | None
-    """Size of what could not be read of a file that has no end [B]; None for one that has."""
+    """Bytes lost at the end of a file that was not completed; None for a completed one."""
 
     @cached_property
     def summary(self) -> Summary | None:
-        """Summary of the flight; None where nothing was flown."""
+        """None if no step was flown."""
         return summary_of(self.scenario, self.about, self.parts, self.figures)
 
     @cached_property
     def figures(self) -> dict[str, dict[str, Any]]:
-        """Newest figures of each process, by its name."""
         return {
             process: frame.figures
             for _, process, frame in self.frames
@@ -75,7 +70,7 @@ class Recorded:
         return self.frames[0][2].time_ns if self.frames else 0
 
     def events(self) -> Iterator[tuple[int, str, Event]]:
-        """Events but for counted figures: time [ns], process and event."""
+        """Events except `Counted`: time [ns], process and event."""
         for time_ns, process, frame in self.frames:
             if isinstance(frame, Said) and not isinstance(frame.event, Counted):
                 yield time_ns, process, frame.event
@@ -87,7 +82,7 @@ def summary_of(
     parts: Mapping[str, Table],
     figures: Mapping[str, Mapping[str, Any]],
 ) -> Summary | None:
-    """Summary of the first vehicle's flight; None where nothing was flown."""
+    """Summary of the first vehicle's flight; None if no step was flown."""
     client = parts.get("client")
     if client is None or not len(client):
         return None
@@ -107,8 +102,8 @@ def read(path: Path) -> Recorded:
         messages = file.messages()
         topic, data = next(messages, ("", b""))
         if topic != BEGUN:
-            said = "it is no recording of Skytether, or nothing is whole of it"
-            raise RecordingError(f"{path}: {said}")
+            message = "it is no recording of Skytether, or its first message is damaged"
+            raise RecordingError(f"{path}: {message}")
         begun = msgspec.msgpack.decode(data, type=Begun)
         if abs(begun.about.offset_ns) > TIME_NS_MAX:
             raise ValueError(f"a clock that is {begun.about.offset_ns} ns off")
@@ -125,16 +120,14 @@ class _Frames:
     """Frames of a recording, each of which is checked.
 
     Args:
-        scenario: what is flown in it.
+        scenario: scenario of the flight.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._frames: list[tuple[str, Frame]] = []
         self._columns: dict[tuple[str, str], np.dtype[np.void]] = {}
-        """Columns by process and part."""
         self._begun_ns: dict[str, int] = {}
-        """Time of each process's beginning [ns]."""
         self._rows: dict[str, list[tuple[int, Table]]] = {}
         """Time [ns] and rows of each frame with rows of a part, by the part's name."""
 
@@ -194,10 +187,5 @@ def _columns(described: str) -> np.dtype[np.void]:
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Check the scenario of a process; equal ones, which may come thousands of times, only once.
-
-    Raises:
-        ConfigError: the scenario is invalid.
-        ValueError: the text is no TOML.
-    """
+    """Check the scenario of a process; equal texts, of which there may be many, only once."""
     check(toml.loads(scenario), "the scenario of a process", any_network=True)

@@ -1,24 +1,24 @@
-"""Recordings: a flight as an MCAP file, for this program and for others.
+"""Recordings: a flight as an MCAP file, for Skytether and for other programs.
 
 The frames of the flight's processes are written as they come from their feeds, encoded as msgpack
-(`shared.telemetry.feed`); they alone are read back, by `view.recorded`:
+(`shared.telemetry.feed`); only they are read back, by `view.recorded`:
 
-    /recording           what the recording is of, a `Begun`; the first message
+    /recording           facts about the recording, a `Begun`; the first message
     /feed/PROCESS        frames of a process
 
-All else is written for other programs, a channel of JSON for each topic:
+Other programs get a channel of JSON for each topic:
 
     /vehicle/N/flown     rows of the client's part, see `view.rows`
     /vehicle/N/decided   rows of the server's part
     /vehicle/N/plan      rows of its plans
     /netem/packets       rows of netem's part
     /said                events
-    /figures/PROCESS     numbers counted so far
+    /figures/PROCESS     counters so far
 
 Foxglove and Lichtblick draw /events, and for each of the first VEHICLES_MAX vehicles
-/vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, where it
-should be and its trajectory. The scenario and, at the end, the summary are attachments. A chunk is
-complete as soon as it is written.
+/vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, its
+desired position and its trajectory. The scenario and, at the end, the summary are attachments. A
+chunk is complete as soon as it is written.
 """
 
 from collections.abc import Mapping
@@ -47,19 +47,15 @@ from skytether.view import foxglove, rows
 from skytether.view.container import ENCODING
 
 BEGUN, FEED = "/recording", "/feed/"
-"""Topic of the first message, and the beginning of the topics of frames."""
+"""Topic of the first message, and the prefix of the topics of frames."""
 OURS = "skytether"
 """Name of the metadata, and of the writing library."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
-"""Names of the attachments."""
 VEHICLES_MAX = 64
-"""Most vehicles that are drawn; for larger numbers only rows are recorded."""
+"""Most vehicles that are drawn; of further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
-"""Size of messages after which a chunk is written [B]."""
 POINTS_MAX = 400
-"""Most points of a drawn trajectory."""
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, *Failure.__args__
-"""Events that are shown as warnings."""
 
 _TOPICS = {"client": "flown", "server": "decided", "plan": "plan"}
 _SAID = {
@@ -75,35 +71,24 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     """Facts about a recording, also kept in its metadata."""
 
     scenario: str
-    """Name of the scenario."""
     seed: int
-    """Seed of the flight."""
     version: str
-    """Version of Skytether that flew it."""
     began: str
     """Time of day at the beginning, ISO 8601; empty in virtual time."""
     offset_ns: int
     """Time of a message minus time of its frame [ns]."""
     secure: bool
-    """Whether the link was encrypted."""
 
 
 class Begun(msgspec.Struct, frozen=True, kw_only=True):
     """First message of a recording."""
 
     about: About
-    """Facts about it."""
     scenario: str
-    """Scenario at the beginning, as TOML."""
 
 
 class Recording:
     """Recording that is being written as an MCAP file.
-
-    Args:
-        file: file opened for writing.
-        scenario: what is flown.
-        about: facts for its metadata.
 
     Raises:
         OSError: the file cannot be written; any method may raise this.
@@ -115,11 +100,9 @@ class Recording:
         self._scenario = scenario
         self._offset_ns = about.offset_ns
         self._tables: dict[tuple[str, str], rows.RowTable] = {}
-        """Columns of each part, by process and part."""
         self._channels: dict[str, int] = {}
         self._schemas: dict[bytes, int] = {}
         self._shown: set[int] = set()
-        """Vehicles whose trajectory has been drawn."""
         self._now_ns = 0
         toml = to_toml(scenario)
         begun = Begun(about=about, scenario=toml.decode())
@@ -156,7 +139,7 @@ class Recording:
                 self._put_rows(frame.part, table, made)
 
     def flush(self) -> None:
-        """Write all that was added; after this, a kill does not lose it."""
+        """Write everything added so far, which then survives a kill of the process."""
         self._writer.flush()
 
     def finish(self, summary: Summary | None) -> None:
@@ -170,7 +153,7 @@ class Recording:
         self._writer.add_attachment(0, self._now_ns, name, kind, content)
 
     def _add_frame(self, process: str, frame: Frame) -> None:
-        """Add a frame as it is, for this program."""
+        """Add a frame unchanged, to be read back by Skytether."""
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _say(self, process: str, event: Event) -> None:
@@ -179,7 +162,7 @@ class Recording:
         self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
 
     def _put_rows(self, part: str, table: rows.RowTable, made: Table) -> None:
-        """Add rows for other programs, a message for each, and what is drawn of them."""
+        """Add rows for other programs, a message for each, and their drawn messages."""
         for row, message in zip(made, table.messages(made), strict=True):
             number = int(row["vehicle"]) if "vehicle" in table.names else 0
             at = f"/vehicle/{number}/{_TOPICS.get(part, part)}" if number else f"/{part}/packets"
@@ -188,7 +171,6 @@ class Recording:
                 self._draw_row(part, number, row)
 
     def _draw_row(self, part: str, number: int, row: np.void) -> None:
-        """Add the drawn messages of a row."""
         at, name, now_ns = f"/vehicle/{number}", f"vehicle {number}", self._now_ns
         match part:
             case "client":
@@ -220,20 +202,19 @@ class Recording:
         self._put(topic, name, foxglove.SCHEMAS[name], message)
 
     def _put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
-        """Add a message of JSON, for other programs."""
         known = 0
         if topic not in self._channels:
-            written = msgspec.json.encode({"title": name, **schema})
-            if written not in self._schemas:
-                self._schemas[written] = self._writer.register_schema(name, "jsonschema", written)
-            known = self._schemas[written]
+            encoded = msgspec.json.encode({"title": name, **schema})
+            if encoded not in self._schemas:
+                self._schemas[encoded] = self._writer.register_schema(name, "jsonschema", encoded)
+            known = self._schemas[encoded]
         self._add(topic, "json", known, msgspec.json.encode(message))
 
     def _add(self, topic: str, encoding: str, schema: int, content: bytes) -> None:
         """Add a message; its channel is written before the first message of a topic."""
         if topic not in self._channels:
-            made = self._writer.register_channel(topic, encoding, schema)
-            self._channels[topic] = made
+            channel = self._writer.register_channel(topic, encoding, schema)
+            self._channels[topic] = channel
         self._writer.add_message(self._channels[topic], self._now_ns, content, self._now_ns)
 
 
@@ -250,7 +231,6 @@ def trajectory(scenario: Scenario) -> Array:
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
-    """JSON schema of figures; groups that are still empty are left out."""
     kinds = {bool: "boolean", int: "integer", float: "number", str: "string"}
     properties = {
         key: _schema_of(each) if isinstance(each, Mapping) else {"type": kinds[type(each)]}

@@ -25,11 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVENTS_MAX = 400
-"""Most events on a page."""
 WIDTH = 9.0
-"""Width of a figure [inch]."""
 LETTERS = 9
-"""Size of letters in every figure [points]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,28 +34,22 @@ class ReportedFlight:
     """Data for the figures: one vehicle's flight, and the network."""
 
     scenario: Scenario
-    """Scenario that was flown."""
     client: Rows
-    """Rows of the vehicle."""
     server: Rows
-    """Rows of the server about the vehicle."""
     netem: Rows
-    """Rows of the network."""
     epoch_ns: int
     """Time of step 0 [ns; netem's clock]."""
 
     @property
     def time_s(self) -> Array:
-        """Time of each of the vehicle's rows [s]."""
         return self.time_of(self.client)
 
     def time_of(self, rows: Rows) -> Array:
-        """Time of rows that have a step [s]."""
         time_s: Array = rows["step"] * self.scenario.control.dt
         return time_s
 
     def spans(self) -> Iterator[tuple[Mode, slice]]:
-        """Modes in succession, each with its first row and the first row after it."""
+        """Modes in succession, each with the slice of its rows and the first row after it."""
         modes = self.client["mode"]
         begins = np.flatnonzero(np.diff(modes, prepend=-1))
         for begin, end in zip(begins, [*begins[1:], len(modes)], strict=True):
@@ -66,13 +57,13 @@ class ReportedFlight:
 
 
 def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
-    """The page of a recording, as HTML.
+    """Page of a recording, as HTML.
 
     Args:
         figures: names and values of its summary.
 
     Raises:
-        RecordingError: nothing was flown in it.
+        RecordingError: no vehicle has flown a step.
     """
     parts, scenario, about = recorded.parts, recorded.scenario, recorded.about
     client = parts.get("client")
@@ -95,14 +86,16 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     began = f"{about.began[:10]} {about.began[11:16]} UTC"
     where = f"over UDP, {began}" if about.began else "in virtual time"
     fleet = len(np.unique(client["vehicle"]))
-    others = f" Drawn is vehicle {number} of {fleet}." if fleet > 1 else ""
+    others = f" The figures show vehicle {number} of {fleet}." if fleet > 1 else ""
     summary = recorded.summary
     sent = "–" if summary.event_ratio is None else f"{summary.event_ratio:.1%}"
     rmse = summary.rmse_xy
     off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
     rows = [list(row) for row in figures]
-    table = Table("summary", "Summary", "What came of the flight.", "", ("figure", "value"), rows)
-    made = {
+    table = Table(
+        "summary", "Summary", "Figures of the whole flight.", "", ("figure", "value"), rows
+    )
+    facts = {
         "scenario": about.scenario,
         "seed": str(scenario.seed),
         "flown": where,
@@ -117,7 +110,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         "pictures": [path(flown), timeline(flown)],
         "events": events[:EVENTS_MAX],
         "untold": max(0, len(events) - EVENTS_MAX),
-        "made": made,
+        "made": facts,
         "toml": to_toml(scenario).decode(),
     }
     return rendered("view/report.html.jinja", drawn=drawn)
@@ -128,7 +121,6 @@ def _colour(mode: Mode) -> str:
 
 
 def path(flown: ReportedFlight) -> Picture:
-    """Path from above, coloured by mode."""
     with lettered(WIDTH, 6.0, LETTERS) as figure:
         plane = figure.subplots()
         draw_reference(plane, flown.scenario, flown.client, flown.server)
@@ -142,12 +134,11 @@ def path(flown: ReportedFlight) -> Picture:
         plane.set_ylabel("y [m]")
         plane.legend(loc="upper right")
         _name_modes(figure, flown)
-        says = "Red and dashed where the vehicle should be, in colour where it was."
+        says = "Dashed red: desired positions. Coloured: the vehicle's positions, by mode."
         return Picture("path", "Path from above", says, as_png(figure, 140))
 
 
 def timeline(flown: ReportedFlight) -> Picture:
-    """Figures over time, with the modes as background."""
     with lettered(WIDTH, 10.5, LETTERS) as figure:
         axes = figure.subplots(5, 1, sharex=True)
         for draw, below in zip((_positions, _error, _trigger, _ages, _packets), axes, strict=True):
@@ -165,11 +156,11 @@ def timeline(flown: ReportedFlight) -> Picture:
         figure.align_ylabels(axes)
         _name_modes(figure, flown)
         says = (
-            "From above: position, with the desired one dashed; distance between them; what the "
-            "trigger compares with its threshold, linear up to there and logarithmic above, and "
-            "when a horizon was sent; how old the observation behind the input was, and the plan; "
-            "packets in each second, by when they entered the network, but for those still under "
-            "way at the end. The colour behind is what the vehicle did."
+            "From top to bottom: position, with the desired one dashed; distance between them; the "
+            "figure that the trigger compares with its threshold, linear up to it and logarithmic "
+            "above, and when a horizon was sent; age of the observation behind the input, and of "
+            "the plan; packets in each second, by their time of entry into the network, without "
+            "those still under way at the end. The background shows the vehicle's mode."
         )
         return Picture("timeline", "What happened", says, as_png(figure, 140))
 
@@ -183,7 +174,6 @@ def with_gaps(steps: NDArray[np.int64], values: Array) -> Array:
 def _over_time(
     below: "Axes", flown: ReportedFlight, rows: Rows, values: Array, *form: str, **style: Any
 ) -> None:
-    """Draw values of rows over time, with gaps where there are no rows."""
     time_s = with_gaps(rows["step"], flown.time_of(rows))
     below.plot(time_s, with_gaps(rows["step"], values), *form, **style)
 
@@ -244,7 +234,6 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
 
 
 def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
-    """Legend of the modes that occur."""
     from matplotlib.patches import Patch
 
     names: dict[str, list[str]] = {}

@@ -1,7 +1,7 @@
 """Rows of the record as plain columns: one number each, with axis and unit in its name.
 
-An exported table has plain columns, and a recording's messages for other programs have them as
-keys. An array of the library has all axes of one quantity.
+Exported tables have plain columns, and messages of recordings for other programs have them as keys.
+An array of the library has all axes of one quantity.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,6 @@ from skytether.shared.telemetry.record import (
 from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
-"""Names of the axes."""
 SHORT = {"inputs": "input"}
 """Column names of velocities that become other names here."""
 WORDS: Mapping[str, Mapping[int, str]] = {
@@ -37,13 +36,12 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "compared": {figure: str(figure) for figure in Compared},
     "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
 }
-"""Words for the codes of some columns."""
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest time of a step [s]: a scenario lasts for a day at most."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
 """Longest delay of a packet that is accepted [ns]."""
 NUMBER_MAX = 1e100
-"""Largest number accepted in a row: squares of measured numbers do not overflow."""
+"""Largest number accepted in a row, so that squares do not overflow."""
 
 Columns = dict[str, NDArray[Any]]
 """Columns of a table, all of one length, by name."""
@@ -53,11 +51,11 @@ def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
     """Plain columns of the record's row type, at the same offsets in memory.
 
     A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, prefixed by its
-    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) of the inputs of a
+    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) for the inputs of a
     plan, become `input_x_mps` and so on.
 
     Raises:
-        ValueError: a column is of another kind, and no number.
+        ValueError: a column is neither a number nor of these shapes.
     """
     fields: list[Any] = []
     for name in columns.names or ():
@@ -88,21 +86,15 @@ class RowTable:
 
     JSON has no numbers that are not finite; they are left out.
 
-    Args:
-        columns: columns of the rows.
-
     Raises:
         ValueError: see `plain`.
     """
 
     def __init__(self, columns: np.dtype[np.void]) -> None:
         self.columns = columns
-        """Columns of the rows."""
         self._plain = plain(columns)
         self.names: tuple[str, ...] = self._plain.names or ()
-        """Names of the plain columns."""
         self.schema = {"type": "object", "properties": dict(map(self._property, self.names))}
-        """JSON schema of a message."""
 
     def _property(self, name: str) -> tuple[str, dict[str, Any]]:
         column = self._plain[name]
@@ -110,7 +102,6 @@ class RowTable:
         return name, {"type": "array", "items": kind} if column.shape else kind
 
     def messages(self, rows: Rows) -> list[dict[str, Any]]:
-        """Messages, one per row."""
         flat = np.ascontiguousarray(rows).view(self._plain)
         values = zip(*(flat[name].tolist() for name in self.names), strict=True)
         return [
@@ -120,7 +111,6 @@ class RowTable:
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether a number is finite, or all numbers of a list are."""
     return all(map(isfinite, value)) if isinstance(value, list) else isfinite(value)
 
 
@@ -130,7 +120,7 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
     Additional columns are accepted. Plans may have any number of inputs.
 
     Raises:
-        ValueError: with the part and the column.
+        ValueError: names the part and the column.
     """
     axes = scenario.model.axes
     match part:
@@ -147,18 +137,18 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
     plain(columns)
     names = columns.names or ()
     for name in expected.names or ():
-        given = columns[name] if name in names else None
-        if name == "inputs" and given is not None and len(given.shape) == 2:
-            given = np.dtype((given.base, (given.shape[0], 1)))
-        if given != expected[name]:
-            raise ValueError(f"{part}: the column {name} is {given}, expected {expected[name]}")
+        kind = columns[name] if name in names else None
+        if name == "inputs" and kind is not None and len(kind.shape) == 2:
+            kind = np.dtype((kind.base, (kind.shape[0], 1)))
+        if kind != expected[name]:
+            raise ValueError(f"{part}: the column {name} is {kind}, expected {expected[name]}")
 
 
 def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
     """Refuse rows with impossible values for a flight of a scenario.
 
     Raises:
-        ValueError: with the part, the column, the value and what was expected.
+        ValueError: names the part, the column, the value and the range.
     """
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
@@ -180,25 +170,27 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
         else:
             continue
         if low < least.get(name, 0) or high > bound:
-            got = low if low < least.get(name, 0) else high
-            raise ValueError(f"{part}: {name}: got {got}, expected {least.get(name, 0)} to {bound}")
+            extreme = low if low < least.get(name, 0) else high
+            raise ValueError(
+                f"{part}: {name}: got {extreme}, expected {least.get(name, 0)} to {bound}"
+            )
 
 
 def readable(rows: Rows) -> Columns:
-    """Plain columns of rows, with words for modes, and one column per input of a plan."""
+    """Plain columns of rows, with words for codes, and one column per input of a plan."""
     flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
-    made: Columns = {}
+    result: Columns = {}
     for name in flat.dtype.names or ():
         if flat.dtype[name].shape:
-            made |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
+            result |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
         elif name in WORDS:
             words = WORDS[name]
-            made[name] = np.array(
+            result[name] = np.array(
                 [words.get(number, str(number)) for number in flat[name].tolist()], dtype=np.str_
             )
         else:
-            made[name] = flat[name]
-    return made
+            result[name] = flat[name]
+    return result
 
 
 def arrays(rows: Rows) -> Columns:
@@ -224,7 +216,6 @@ def planned(scenario: Scenario, row: np.void) -> Array:
     """Positions along a plan [m], from its initial state on; shape (steps + 1, axes).
 
     Args:
-        scenario: what is flown.
         row: row of the part "plan".
     """
     inputs = row["inputs"] + row["disturbance"][:, np.newaxis]

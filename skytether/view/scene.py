@@ -20,32 +20,27 @@ from skytether.view.state import State, VehicleTrack
 FLIGHT_RGB: tuple[Rgb, ...] = ((56, 132, 255), (255, 140, 40), (160, 90, 220), (20, 170, 150))
 """Colours of flights, by their place on the page."""
 GOAL_RGB = PALETTE[GREY]
-"""Colour of desired positions."""
 
 FENCE_RGB = PALETTE[RED]
-"""Colour of the fence."""
 GROUND_RGB: dict[bool, Rgb] = {False: (52, 55, 60), True: (222, 226, 230)}
 """Colour of the lines on the ground, by whether the page is light."""
 GRID_REACH = 3.0
-"""Size of the ground's grid over the extent of the flight."""
+"""Size of the ground's grid, relative to the extent of the flight."""
 BELOW = 1e-3
-"""Depth of the grid below everything else, over the extent of the flight."""
+"""Depth of the grid below everything else, relative to the extent of the flight."""
 TRAIL_S = 20.0
-"""Length of the drawn trail [s]."""
 GOAL_S = 1.0
-"""Age up to which a desired position is shown [s]; after it, no newer one is expected."""
+"""Age up to which a desired position is shown [s]; an older one is out of date."""
 TRAIL_POINTS = 240
 """Most points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
-"""Most points of all trails of a flight."""
 ROUND_S = 600.0
-"""Length of the drawn desired trajectory, at most [s]."""
+"""Longest part of the desired trajectory that is drawn."""
 SIZE = 0.05
-"""Size of a vehicle over the extent of the flight."""
+"""Size of a vehicle, relative to the extent of the flight."""
 WIDE, NARROW = 1.5, 0.65
 """Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
 FOV_RAD = 0.7
-"""Vertical field of view [rad]."""
 
 
 def in_space(points: Array) -> NDArray[np.float32]:
@@ -56,7 +51,7 @@ def in_space(points: Array) -> NDArray[np.float32]:
 
 
 def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
-    """Line through points, as its pieces; pieces with NaN are left out; shape (pieces, 2, 3)."""
+    """Line through points, as its segments; segments with NaN are left out; shape (n, 2, 3)."""
     placed = in_space(points)
     pieces = np.stack([placed[:-1], placed[1:]], axis=1)
     pieces = pieces[~np.isnan(pieces).any(axis=(1, 2))]
@@ -85,9 +80,7 @@ def extent(scenarios: Sequence[Scenario]) -> tuple[Array, float]:
 
 
 def _desired(scenario: Scenario) -> Array:
-    """Points of the desired trajectory, or corners of the box that contains it [m]; shape (n,
-    axes).
-    """
+    """Points of the desired trajectory, or corners of its bounding box [m]; shape (n, axes)."""
     shape, axes = scenario.reference.shape, scenario.model.axes
     if shape == "target":
         corner = np.zeros(axes)
@@ -122,10 +115,9 @@ def home(scenario: Scenario) -> Array:
 
 
 def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
-    """Lines of a scenario's fence, along the bounds it has; shape (pieces, 2, 3).
+    """Lines of a scenario's fence, along the bounds that it has; shape (n, 2, 3).
 
     Args:
-        scenario: scenario that is flown.
         reach_m: length to which an unbounded side is drawn [m].
     """
     fenced, begin = scenario.fence, in_space(home(scenario))[0]
@@ -137,12 +129,12 @@ def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
         low[: len(fenced.low_m)], high[: len(fenced.high_m)] = fenced.low_m, fenced.high_m
         corners = np.array([low, high])
         for x, y, z in np.ndindex(2, 2, 1 if scenario.model.axes == 2 else 2):
-            here = np.array([corners[x, 0], corners[y, 1], corners[z, 2]])
+            corner = np.array([corners[x, 0], corners[y, 1], corners[z, 2]])
             for axis, at in enumerate((x, y, z)):
                 if at == 0 and corners[0, axis] != corners[1, axis]:
-                    there = here.copy()
-                    there[axis] = corners[1, axis]
-                    pieces.append(np.array([[here, there]], np.float32))
+                    opposite = corner.copy()
+                    opposite[axis] = corners[1, axis]
+                    pieces.append(np.array([[corner, opposite]], np.float32))
     if fenced.radius_m:
         angle = np.linspace(0.0, 2 * np.pi, 97)
         around = begin[:2] + fenced.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -151,7 +143,7 @@ def fence(scenario: Scenario, reach_m: float) -> NDArray[np.float32]:
 
 
 def zones(kept: Zones, reach_m: float) -> NDArray[np.float32]:
-    """Outlines of a mission's zones; shape (pieces, 2, 3).
+    """Outlines of a mission's zones; shape (n, 2, 3).
 
     Args:
         kept: zones to avoid.
@@ -203,8 +195,6 @@ def quadrotor(size: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 class _Marker:
-    """Marker of one vehicle in the scene."""
-
     def __init__(self, scene: viser.SceneApi, name: str, size: float, rgb: Rgb) -> None:
         vertices, faces = quadrotor(size)
         self._frame = scene.add_frame(name, show_axes=False)
@@ -226,7 +216,6 @@ class _Marker:
         self._shown = ""
 
     def show(self, track: VehicleTrack, title: str) -> None:
-        """Move the marker to the vehicle, in the colour of its mode."""
         assert track.row is not None
         self._frame.position = in_space(track.row["state"][None, :, 0])[0]
         does = track.does
@@ -238,8 +227,6 @@ class _Marker:
 
 
 class _Flight:
-    """Flight in the scene."""
-
     def __init__(
         self, scene: viser.SceneApi, place: int, scenario: Scenario, reach_m: float, title: str
     ) -> None:
@@ -274,7 +261,6 @@ class _Flight:
         )
 
     def move(self, state: State) -> None:
-        """Update marker positions."""
         for number, track in list(state.vehicles.items()):
             if track.row is None:
                 continue
@@ -288,7 +274,6 @@ class _Flight:
             vehicle.show(track, title)
 
     def draw(self, state: State) -> None:
-        """Draw trails, plans, desired positions, fence and zones."""
         if state.zones != self._zoned:
             self._zoned = state.zones
             self._set(self._zones, [zones(state.kept, self._reach_m)])
@@ -318,7 +303,6 @@ class Scene:
     """Scene with the flights of a page.
 
     Args:
-        server: viser's server.
         states: states of flights, all with known scenarios.
         titles: titles of the flights; empty for a single flight.
     """
@@ -331,7 +315,6 @@ class Scene:
         scene = server.scene
         scene.set_up_direction("+z")
         self.ground = grid(self.middle, self.reach_m)
-        """Grid lines on the ground, see `grid`."""
         camera = server.initial_camera
         camera.fov = FOV_RAD
         camera.position, camera.look_at = self.camera(WIDE)
@@ -344,7 +327,7 @@ class Scene:
     def camera(self, aspect: float) -> tuple[Array, Array]:
         """Position and target of a camera that sees everything, in a window of this aspect ratio.
 
-        In a narrow window the flight is in the upper half, because words lie over the lower.
+        In a narrow window the flight is in the upper half, because words cover the lower half.
         """
         away_m = self.reach_m / np.tan(FOV_RAD / 2) / min(1.0, aspect)
         down_m = 0.5 * self.reach_m / aspect if aspect < NARROW else 0.0
@@ -354,12 +337,10 @@ class Scene:
         return target + np.array([-0.4, -0.55, 0.45]) * away_m, target
 
     def move(self, states: Sequence[State]) -> None:
-        """Update marker positions."""
         for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.move(state)
 
     def draw(self, states: Sequence[State]) -> None:
-        """Draw all lines."""
         for flight, state in zip(self._flights, filter(_flies, states), strict=True):
             flight.draw(state)
 

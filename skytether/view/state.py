@@ -1,4 +1,4 @@
-"""State of one flight on a page: its last minute, made from its processes' frames.
+"""State of one flight on a page: its last minute, from its processes' frames.
 
     (process, Frame) → `State.take` → `State.vehicles`, `State.network`, `State.said`
 
@@ -42,40 +42,35 @@ from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
-"""Most steps that are kept of a vehicle; with more per minute, only every second or third is."""
+"""Most steps that are kept of a vehicle; with more steps per minute, only every n-th is kept."""
 VEHICLES_MAX = 64
-"""Most vehicles of a flight that are shown."""
 ZONED, GUIDED = "mission.zones", "mission.goals"
 """Keys of a mission's zones, and of its goals changed in flight."""
 PLANS_MAX = 8
 """Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
-"""Most events that are kept."""
 LED = "reference.points_m"
-"""Key that changes many times a second while a target is dragged; these changes are not logged."""
+"""Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
-"""Time over which loss is measured [s]."""
+"""Time over which loss is measured."""
 LOSS_HIGH = 0.3
 """Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
-"""Size between those of a heartbeat and the shortest trajectory [B], without encryption."""
+"""Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
 
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
 """Columns of a vehicle's ring that are NaN where unknown."""
 ROUNDING = 1e-6
-"""Rounding tolerance of times, over the length of a slot."""
+"""Rounding tolerance of times, relative to the length of a slot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """Word with an explanation and a colour."""
+    """State of a vehicle or a link, for display."""
 
     word: str
-    """Single word, such as GOOD or BRAKE."""
     text: str
-    """Explanation, without a full stop."""
     colour: str
-    """Name of the colour: grey, green, amber, red or blue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +78,6 @@ class Curves:
     """Last minute of a vehicle on a time grid; NaN where unknown."""
 
     time_s: Array
-    """Time of flight [s]; shape (n,)."""
     position: Array
     """True position [m]; shape (n, axes)."""
     reference: Array
@@ -99,12 +93,7 @@ class Curves:
 
 
 class VehicleTrack:
-    """Last minute of one vehicle.
-
-    Args:
-        number: number of the vehicle.
-        scenario: scenario that it flies.
-    """
+    """Last minute of one vehicle."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number
@@ -134,31 +123,28 @@ class VehicleTrack:
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
         self.planned = 0
-        """Number of steps seen that the server has planned for."""
         self.sent = 0
-        """Number of those steps at which it sent a horizon."""
+        """Number of steps seen at which the server sent a horizon."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
         """Newest plans sent to the vehicle, the newest last."""
         self._seen: np.void | None = None
         """Newest row of the server's part; None without any."""
 
-    # -- what comes in -----------------------------------------------------------------------
+    # -- incoming frames ---------------------------------------------------------------------
 
     def fly(self, rows: Table) -> None:
-        """Take rows of the client's part."""
         at = self._at(rows["step"])
-        taken = at >= 0
-        ring, at = self._ring, at[taken]
-        ring["position"][at] = rows["state"][taken, :, 0]
-        age_ns = rows["age_ns"][taken]
+        is_kept = at >= 0
+        ring, at = self._ring, at[is_kept]
+        ring["position"][at] = rows["state"][is_kept, :, 0]
+        age_ns = rows["age_ns"][is_kept]
         ring["age_s"][at] = np.where(age_ns >= 0, age_ns / SECOND_NS, np.nan)
         self.row = rows[-1].copy()
 
     def plan(self, rows: Table) -> None:
-        """Take rows of the server's part."""
         at = self._at(rows["step"])
-        taken = at >= 0
-        ring, at, rows = self._ring, at[taken], rows[taken]
+        is_kept = at >= 0
+        ring, at, rows = self._ring, at[is_kept], rows[is_kept]
         ring["reference"][at] = rows["reference"][:, :, 0]
         ring["figure"][at] = compared(rows)
         ring["threshold"][at] = rows["threshold"]
@@ -171,37 +157,33 @@ class VehicleTrack:
             self._seen = rows[-1].copy()
 
     def lead(self, rows: Table) -> None:
-        """Take rows of the part "plan"; the newest plans are shown."""
         self._plans.extend(row.copy() for row in rows[-PLANS_MAX:])
 
     def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Ring index of each step, emptied if it is new; -1 for a step that is not kept."""
+        """Ring index of each step, cleared if it is new; -1 for a step that is not kept."""
         slots = steps // self._stride
         at = slots % self._slots
-        there = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
-        new = slots > there
+        newest = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
+        new = slots > newest
         self._ring[at[new]] = self._empty
         self._ring["slot"][at[new]] = slots[new]
         return np.where(slots == self._ring["slot"][at], at, -1)
 
-    # -- what is shown -----------------------------------------------------------------------
+    # -- display ----------------------------------------------------------------------------
 
     @property
     def time_s(self) -> float:
-        """Time of flight of the newest known step [s]; 0 before the first."""
         return max(0.0, float(self._ring["slot"].max()) * self._slot_s)
 
     @property
     def mode(self) -> Mode:
-        """Mode of the vehicle."""
         return Mode.INIT if self.row is None else Mode(self.row["mode"])
 
     @property
     def does(self) -> Word:
-        """Mode of the vehicle and its reason, in words."""
         mode = self.mode
         if self.row is None:
-            return Word("INIT", "nothing has been heard of it", GREY)
+            return Word("INIT", "no data yet", GREY)
         does, why = DOES[str(mode)], Reason(self.row["reason"])
         if mode is Mode.COAST and self.row["covered"]:
             does = "flies on along its plan"
@@ -235,7 +217,7 @@ class VehicleTrack:
         return reference
 
     def goal(self, seconds: float) -> Array | None:
-        """Newest desired position of the last seconds [m]; None where none is known."""
+        """Newest desired position of the last seconds [m]; None if there is none."""
         known = self.goals(seconds)
         known = known[~np.isnan(known[:, 0])]
         return known[-1] if len(known) else None
@@ -243,7 +225,7 @@ class VehicleTrack:
     def ahead(self) -> Array:
         """Positions along the newest plan from the present step on [m]; shape (n, axes).
 
-        There are none where no plan is flown.
+        Empty if no plan is flown.
         """
         axes = self._scenario.model.axes
         if not self._plans or (self.row is not None and not self.row["covered"]):
@@ -268,16 +250,16 @@ class VehicleTrack:
 
     def _along(self, plan: np.void) -> Array:
         positions = planned(self._scenario, plan)
-        flown = 0 if self.row is None else int(self.row["step"] - plan["begins"])
-        return positions[min(max(flown, 0), len(positions)) :]
+        steps_flown = 0 if self.row is None else int(self.row["step"] - plan["begins"])
+        return positions[min(max(steps_flown, 0), len(positions)) :]
 
     def path(self, points: int) -> Array:
         """Positions at evenly spaced times of the last minute [m]; shape (points, axes).
 
         The last one is the newest known position; unknown positions are NaN.
         """
-        flown = ~np.isnan(self._ring["position"][:, 0])
-        last = int(self._ring["slot"].max(where=flown, initial=-1))
+        is_known = ~np.isnan(self._ring["position"][:, 0])
+        last = int(self._ring["slot"].max(where=is_known, initial=-1))
         slots = last - np.arange(points)[::-1] * (self._slots / points)
         position: Array = self._at_slots(np.maximum(slots, -1).astype(np.int64))["position"]
         return position
@@ -287,7 +269,7 @@ class VehicleTrack:
 
         Args:
             points: number of times.
-            end_s: time of flight at which the minute ends [s]; that of the newest step if left out.
+            end_s: time of flight at which the minute ends [s]; by default that of the newest step.
         """
         end_s = self.time_s if end_s is None else end_s
         grid_s = end_s + np.linspace(-SPAN_S, 0.0, points)
@@ -296,8 +278,8 @@ class VehicleTrack:
 
     def error_m(self, seconds: float) -> float:
         """Root mean square distance to the reference in the last seconds [m]; NaN if unknown."""
-        kept = self._kept(seconds)
-        away = kept["position"] - kept["reference"]
+        slots = self._kept(seconds)
+        away = slots["position"] - slots["reference"]
         squares = (away**2).sum(axis=1)
         squares = squares[~np.isnan(squares)]
         return float(np.sqrt(squares.mean())) if len(squares) else np.nan
@@ -309,78 +291,68 @@ class VehicleTrack:
         return self._at_slots(np.arange(recent.min(), recent.max() + 1) if len(recent) else recent)
 
     def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
-        """Slots by number; an empty slot where nothing is known."""
-        found = self._ring[slots % self._slots]
-        found[(found["slot"] != slots) | (slots < 0)] = self._empty
-        return found
+        """Slots by number; an empty slot for one that is not kept."""
+        rows = self._ring[slots % self._slots]
+        rows[(rows["slot"] != slots) | (slots < 0)] = self._empty
+        return rows
 
 
 def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Group of figures within others; empty where it is missing."""
+    """Group of figures within others; empty if missing."""
     for name in names:
-        found = figures.get(name)
-        figures = found if isinstance(found, dict) else {}
+        value = figures.get(name)
+        figures = value if isinstance(value, dict) else {}
     return figures
 
 
 def told(figures: dict[str, Any], *names: str) -> float:
-    """Figure within nested groups; NaN where it is missing."""
+    """Figure within nested groups; NaN if missing."""
     value = group(figures, *names[:-1]).get(names[-1])
     return float(value) if isinstance(value, int | float) else np.nan
 
 
 @dataclass(slots=True)
 class _Process:
-    """Process that sends frames."""
-
     opened: Opened
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
-    """Time of its newest frame [ns]."""
     seen_ns: int = -1
     """Time up to which incoming frames are repetitions [ns]."""
     figures: dict[str, Any] = field(default_factory=dict)
 
 
 class State:
-    """State of one flight on a page."""
-
     def __init__(self) -> None:
         self._processes: dict[str, _Process] = {}
         self._lost: set[str] = set()
         self.flights = 0
-        """Number of flights that have begun."""
         self._begin()
 
     def _begin(self) -> None:
-        """Forget the previous flight."""
         self.name = ""
-        """Name of the scenario; empty before anything is known."""
         self.scenario = Scenario()
-        """Scenario, as the first process heard flies it."""
+        """Scenario of the first process that sent frames; the client's once it sends any."""
         self.duration_s = 0.0
-        """Length of the flight [s]: the client's, where a client is heard."""
+        """Length of the flight [s]: the client's, if a client sends frames."""
         self.vehicles: dict[int, VehicleTrack] = {}
-        """Vehicles by number."""
         self.omitted = 0
-        """Number of rows of vehicles beyond the VEHICLES_MAX that are shown."""
+        """Number of dropped rows, of vehicles beyond VEHICLES_MAX."""
         self._zones: str | None = None
         """Zones as changed in flight; None before a change."""
         self.network = Network(0)
         self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
         """Newest events, oldest first: time of flight [s] and sentence."""
         self.newest_ns = 0
-        """Time of the newest frame [ns]."""
         self.begin_ns: int | None = None
-        """Time at which the flight's step 0 began [ns]; None before anything has flown."""
+        """Start of the flight's step 0 [ns]; None before any step."""
 
-    # -- what comes in -----------------------------------------------------------------------
+    # -- incoming frames ---------------------------------------------------------------------
 
     def take(self, process: str, frame: Frame) -> None:
-        """Take a frame of a process; frames that belong to no flight are dropped.
+        """Apply a frame of a process; frames that belong to no flight are dropped.
 
         Raises:
-            ValueError: the frame makes no sense: it comes from another version or another program.
+            ValueError: the frame is invalid: it comes from another version or another program.
         """
         if isinstance(frame, Opened):
             self._open(process, frame)
@@ -401,7 +373,6 @@ class State:
                 self.network.wait(np.nan_to_num(waiting), time_ns=frame.time_ns)
 
     def lose(self, process: str) -> None:
-        """Note that a process's feed has ended."""
         self._lost.add(process)
 
     def _open(self, process: str, opened: Opened) -> None:
@@ -415,10 +386,10 @@ class State:
             scenario = msgspec.convert(toml.loads(opened.scenario), Scenario)
         except ValueError as error:
             raise FeedError(f"got no scenario: {error}") from None
-        with suppress(ConfigError):  # a file that it names is on another machine
+        with suppress(ConfigError):  # a file named in the scenario is on another machine
             scenario = reading.check(reading.to_table(scenario))
         if known and process == "client":
-            self._begin()  # another flight
+            self._begin()  # a new flight
         if process == "client" or not self.name:
             self.duration_s = scenario.duration
         if not self.name:
@@ -477,7 +448,7 @@ class State:
             return
         self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
 
-    # -- what is shown -----------------------------------------------------------------------
+    # -- display ----------------------------------------------------------------------------
 
     @property
     def flies(self) -> bool:
@@ -485,9 +456,7 @@ class State:
         return any(name != "netem" for name in self._processes)
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before the flight; of netem alone, its running
-        time.
-        """
+        """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -495,12 +464,11 @@ class State:
 
     @property
     def title(self) -> str:
-        """Title of the scenario, or else its name."""
         return self.scenario.title or self.name
 
     @property
     def zones(self) -> str:
-        """Zones of a mission, as TOML text."""
+        """Zones of a mission, in the form of the key `mission.zones`."""
         return self.scenario.mission.zones if self._zones is None else self._zones
 
     @property
@@ -510,7 +478,7 @@ class State:
 
     @property
     def kept(self) -> Zones:
-        """Zones of a mission; none where their file is on another machine."""
+        """Zones of a mission; none if their file is on another machine."""
         try:
             return zone_texts.parse(
                 self.zones, self.scenario.model.axes, reading.files_of("mission.zones", self.zones)
@@ -519,13 +487,14 @@ class State:
             return Zones()
 
     def waits(self, number: int) -> str:
-        """Reason why a vehicle of a mission waits; empty for none."""
-        said = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
-        return said if isinstance(said, str) else ""
+        """Reason why a vehicle of a mission waits; empty if it does not."""
+        reason = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
+        return reason if isinstance(reason, str) else ""
 
     def clock(self, number: int) -> tuple[float, float]:
-        """Uncertainty of the clock of a vehicle on a mission [ms], and the resulting uncertainty of
-        its place [m]; NaN if the server reports neither.
+        """Uncertainty of a mission vehicle's clock [ms], and of its position because of it [m].
+
+        NaN if the server reports neither.
         """
         figures = group(self.figures("server"), "by_vehicle", str(number))
         return told(figures, "clock_bound_ms"), told(figures, "clock_m")
@@ -534,11 +503,10 @@ class State:
         """Distance from a vehicle to the nearest other one in the last minute [m].
 
         Args:
-            number: number of the vehicle.
-            points: number of times, the last of them now.
+            points: number of times, of which the last is the present.
 
         Returns:
-            distances, NaN where nothing is known; shape (points,).
+            distances, NaN where unknown; shape (points,).
         """
         nearest = np.full(points, np.nan)
         own = self.vehicles[number].path(points) if number in self.vehicles else None
@@ -549,17 +517,15 @@ class State:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Names of the processes whose feeds have ended."""
         return tuple(sorted(self._lost))
 
     def figures(self, process: str) -> dict[str, Any]:
-        """Newest figures of a process; empty before there are any."""
         known = self._processes.get(process)
         return known.figures if known else {}
 
     @property
     def every_step(self) -> float:
-        """Packets per second of sending at every step, for all vehicles."""
+        """Packets per second if all vehicles got one at every step."""
         return max(1, len(self.vehicles)) / self.scenario.control.dt
 
     def link(self, number: int, now_ns: int) -> Word:
@@ -573,13 +539,13 @@ class State:
             heard_ns = self.network.heard_ns.get(direction)
             if heard_ns is not None and now_ns - heard_ns > longest_ns[direction]:
                 ago_s = (now_ns - heard_ns) / SECOND_NS
-                return Word("CUT", f"nothing gets through {name} for {ago_s:.0f} s", RED)
+                return Word("CUT", f"no packet has got through {name} for {ago_s:.0f} s", RED)
         if track.row["reason"] == Reason.LOST:
             return Word("CUT", str(Reason.LOST), RED)
         for direction, name in DIRECTIONS.items():
             traffic = self.network.traffic(direction, LOSS_S, now_ns)
             if traffic.loss > LOSS_HIGH:
-                return Word("DEGRADED", f"{traffic.loss:.0%} of what goes {name} is lost", AMBER)
+                return Word("DEGRADED", f"{traffic.loss:.0%} of the packets {name} are lost", AMBER)
         if track.age_s > link.age_max_s / 2:
-            return Word("DEGRADED", f"what is flown by is {track.age_s:.1f} s old", AMBER)
+            return Word("DEGRADED", f"the observation flown by is {track.age_s:.1f} s old", AMBER)
         return Word("GOOD", "packets come through both ways", GREEN)

@@ -23,27 +23,25 @@ _UDP = 17
 
 
 def traces(packets: Rows) -> Mapping[str, str]:
-    """Delay traces that the impairment `trace` replays, as CSV by name: one per direction and
-    flow.
-    """
-    found = {}
+    """Delay traces that the impairment `trace` replays, as CSV, by direction and flow."""
+    csv = {}
     for way, direction in WAYS.items():
         for flow in np.unique(packets["flow"]):
             rows = packets[(packets["direction"] == direction) & (packets["flow"] == flow)]
             rows = rows[np.argsort(rows["arrived_ns"], kind="stable")]
-            # a trace holds one packet per time
+            # a trace has one packet per time
             rows = rows[np.diff(rows["arrived_ns"], prepend=-1) > 0]
             if not len(rows):
                 continue
             time_s = (rows["arrived_ns"] - rows["arrived_ns"][0]) / SECOND_NS
             columns = time_s, rows["delay_ns"] / SECOND_NS, rows["lost"].astype(int)
             lines = zip(*(column.tolist() for column in columns), strict=True)
-            found[f"{way}-{flow}"] = to_csv(("time_s", "delay_s", "lost"), lines)
-    return found
+            csv[f"{way}-{flow}"] = to_csv(("time_s", "delay_s", "lost"), lines)
+    return csv
 
 
 def pcap(packets: Rows, began_ns: int = 0) -> bytes:
-    """Capture of the packets that left netem; lost ones are not in it.
+    """Capture of the packets that netem sent, without lost ones.
 
     Args:
         began_ns: zero of the packets' clock [ns since 1970].

@@ -1,4 +1,4 @@
-"""Words of a page about a flight, as HTML."""
+"""Status of a flight on a page, in words, as HTML."""
 
 from collections.abc import Sequence
 from html import escape
@@ -20,11 +20,9 @@ CSS = {
     "blue": "var(--mantine-color-blue-7)",
     "violet": "var(--mantine-color-violet-7)",
 }
-"""Colours of words, by name."""
 NEWEST = 3
 """Number of events shown beside a vehicle's state."""
 SAID_SHOWN = 50
-"""Most events that are shown."""
 
 FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
 """Counters of netem for a direction, and their titles."""
@@ -37,7 +35,6 @@ _DIM = "color:var(--mantine-color-dimmed)"
 
 
 def badge(word: Word) -> str:
-    """Word in its colour, with its explanation."""
     chip = (
         f"background:{CSS[word.colour]};color:#fff;border-radius:0.25em;padding:0.05em 0.5em;"
         "font-weight:600;margin-right:0.5em;display:inline-block"
@@ -46,24 +43,23 @@ def badge(word: Word) -> str:
 
 
 def number(value: float, form: str, unit: str = "") -> str:
-    """Number as text, or a dash for an unknown one."""
+    """Number as text, or a dash for NaN."""
     return "–" if np.isnan(value) else f"{value:{form}}{unit}"
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
-    """State of a vehicle and its link, in words and numbers."""
     if not state.name:
-        return f'<div style="{_BODY}">{escape(title)} Nothing has been heard of a flight yet.</div>'
+        return f'<div style="{_BODY}">{escape(title)} No flight yet.</div>'
     if not state.flies:
         return _carried(state, now_ns, title)
     track = state.vehicles.get(vehicle)
     head = f"<b>{escape(title or state.title)}</b>"
     if track is None:
-        return f'<div style="{_BODY}">{head}: no vehicle {vehicle} has been heard of yet.</div>'
+        return f'<div style="{_BODY}">{head}: no data of vehicle {vehicle} yet.</div>'
     rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
-    rows.append(("off the reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
-    rows.append(("age of what is flown by", number(track.age_s, ".2f", " s")))
-    rows.append(("age of what the server knows", number(track.known_s, ".2f", " s")))
+    rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
+    rows.append(("age of observation flown by", number(track.age_s, ".2f", " s")))
+    rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
     rows += _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms
@@ -99,7 +95,6 @@ def _carried(state: State, now_ns: int, title: str) -> str:
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:
-    """Table of names and values, one per line."""
     lines = "".join(
         f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
         f"<td>{escape(value)}</td></tr>"
@@ -109,16 +104,15 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _gone(state: State) -> str:
-    """Sentence on processes whose feeds have ended; empty for none."""
     names = ", ".join(state.lost)
     return f'<div style="color:{CSS["red"]}">no feed of {names}</div>' if names else ""
 
 
 def _newest(state: State) -> str:
-    """The last few events, newest first, in a line each: what stands below does not move."""
-    cut = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+    """The box has a fixed height, so that the page does not move."""
+    style = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
-        f'<div style="{cut}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
+        f'<div style="{style}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
         for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
     )
     return f'<div style="height:{1.45 * NEWEST}em">{lines}</div>'
@@ -130,24 +124,25 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of a vehicle on a mission; none without one."""
     if not state.scenario.is_mission:
         return []
-    asked = f"at least {state.scenario.mission.separation_m:g} m"
+    required = f"at least {state.scenario.mission.separation_m:g} m"
     nearest = number(float(state.nearest_m(vehicle)[-1]), ".2f", " m")
     bound_ms, clock_m = state.clock(vehicle)
     return [
         (
             "nearest other vehicle",
-            f"{nearest}, {asked}",
+            f"{nearest}, {required}",
         ),
         ("waits for", state.waits(vehicle) or "–"),
-        ("clock known to ±", f"{number(bound_ms, '.0f', ' ms')}, {number(clock_m, '.2f', ' m')}"),
+        (
+            "clock and position, known to ±",
+            f"{number(bound_ms, '.0f', ' ms')}, {number(clock_m, '.2f', ' m')}",
+        ),
     ]
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
-    """Table rows of the vehicle's autopilot; none without one."""
     says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
     if not says:
         return []
@@ -163,7 +158,6 @@ def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
-    """Table rows of the network."""
     rows = []
     for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
@@ -191,7 +185,6 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
 
 
 def said(states: Sequence[tuple[str, State]]) -> str:
-    """Newest events, newest first, one per line."""
     events = [
         (time_s, f"{title} {text}".strip())
         for title, state in states
@@ -206,12 +199,11 @@ def said(states: Sequence[tuple[str, State]]) -> str:
 
 
 def note(text: str) -> str:
-    """Remark in small print."""
     return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
 
 
 def answers(given: Sequence[tuple[str, bool]]) -> str:
-    """Answers to the newest request, in a box whose height does not depend on them.
+    """Answers to the newest request, in a box of fixed height.
 
     Args:
         given: answer of each flight, and whether it is a refusal.
@@ -224,12 +216,6 @@ def answers(given: Sequence[tuple[str, bool]]) -> str:
 
 
 def legend(titles: Sequence[str], *, has_zones: bool) -> str:
-    """Meaning of the lines on the map.
-
-    Args:
-        titles: titles of the flights, in the order of their colours.
-        has_zones: whether a fence or zones are drawn.
-    """
     marks = [("─", "reference", GOAL_RGB), ("+", "start", GOAL_RGB)]
     for title, rgb in zip(titles, cycle(FLIGHT_RGB), strict=False):
         marks += [("─", f"{title} flown".strip(), rgb), ("━", f"{title} plan".strip(), rgb)]

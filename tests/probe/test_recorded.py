@@ -230,8 +230,8 @@ def one_way(packets: Sequence[Packet]) -> bytes:
     [
         (pcap([]), pcap(flight()[1]), "no UDP packet is in both"),
         (pcap(flight()[0]), pcap(flight()[1])[:20], "no UDP packet is in both"),
-        (one_way(flight()[0]), pcap(flight()[1]), "of one direction alone"),
-        (pcap(2 * flight()[0]), pcap(flight()[1]), "0 have a payload of their own"),
+        (one_way(flight()[0]), pcap(flight()[1]), "of one direction only"),
+        (pcap(2 * flight()[0]), pcap(flight()[1]), "0 have a unique payload"),
     ],
 )
 def test_captures_that_share_too_little_are_refused(near: bytes, far: bytes, said: str) -> None:

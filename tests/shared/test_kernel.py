@@ -174,7 +174,7 @@ def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
 def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     """A line where there is no terminal; nothing where machine code is on disk."""
     put(tmp_path, caller=MODULE)
-    said = "compiling control loops, which this machine then keeps: it takes up to a minute\n"
+    said = "compiling control loops, once on this machine: takes up to a minute\n"
     assert quiet(tmp_path, PREPARED) == said
     assert quiet(tmp_path, PREPARED) == ""
 

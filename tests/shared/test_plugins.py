@@ -422,7 +422,10 @@ def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path
 
 
 IMPORTS = "from typing import Annotated\nfrom msgspec import Meta\n"
-ADDS = "expected @trigger, @scheme, @reference, @vehicle or @impairment on something, see docs"
+ADDS = (
+    "expected @trigger, @scheme, @reference, @vehicle or @impairment on a function or class, "
+    "see docs"
+)
 OURS = "skytether.shared.scenario.triggers"
 WRONG = {
     "a syntax error": ("def f(:\n", "line 3: SyntaxError: invalid syntax"),

@@ -198,7 +198,7 @@ def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
     with pytest.raises(LocalError) as refused:
         Control(path, running())
     assert str(refused.value) == (
-        f"{path}: no socket can be made: expected a new path, or a socket that an ended "
+        f"{path}: cannot create the socket: expected a new path, or a socket that an ended "
         "process left behind"
     )
     assert path.lstat() == before
@@ -211,7 +211,7 @@ def test_a_socket_at_which_somebody_listens_stays(kind: int, tmp_path: Path) -> 
         other.bind(str(path))
         if kind == socket.SOCK_STREAM:
             other.listen()
-        with pytest.raises(LocalError, match="somebody listens there"):
+        with pytest.raises(LocalError, match="another process listens there"):
             Control(path, running())
         assert path.is_socket()
 
@@ -233,7 +233,7 @@ def test_a_socket_that_cannot_be_made_is_said_before_anything_flies(
 
     path = tmp_path / ("n" * 200)
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--control", str(path)], "netem")
-    said = f"netem: --control: {path}: no socket can be made: AF_UNIX path too long\n"
+    said = f"netem: --control: {path}: cannot create the socket: AF_UNIX path too long\n"
     assert (code, capsys.readouterr().err) == (2, said)
 
 

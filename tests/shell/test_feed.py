@@ -451,7 +451,7 @@ def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
     path = tmp_path / "file" / "feed"
     path.parent.touch()
     code = command.main(emulate, ["--bind", "127.0.0.1:0", "--feed", str(path)], "netem")
-    said = f"netem: --feed: {path}: no socket can be made: File exists\n"
+    said = f"netem: --feed: {path}: cannot create the socket: File exists\n"
     assert (code, capsys.readouterr().err) == (command.CONFIGURATION, said)
 
 
@@ -460,7 +460,7 @@ def test_a_feed_takes_the_place_of_one_that_nobody_tells(tmp_path: Path) -> None
     path = tmp_path / "feed"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
         killed.bind(str(path))
-    with closing(Feed(path)), pytest.raises(LocalError, match="somebody listens there"):
+    with closing(Feed(path)), pytest.raises(LocalError, match="another process listens there"):
         Feed(path)
 
 

@@ -133,7 +133,7 @@ def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path:
         kept(tmp_path).write_bytes(held)
         with suppress(CommandError):
             assert begun(tmp_path, SWAP).scenario.mission.zones == BOX
-    with pytest.raises(CommandError, match=r"it is damaged; --new-flight begins without it"):
+    with pytest.raises(CommandError, match=r"it is damaged; --new-flight starts without them"):
         begun(tmp_path, SWAP)
 
 
@@ -167,7 +167,7 @@ def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
         tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}).refused
     )
     assert answers == [
-        "it is in force, and forgotten when the process restarts: No space left on device"
+        "it is in force, but will be lost when the process restarts: No space left on device"
     ]
     assert NotKept(reason="No space left on device") in events
 

@@ -421,7 +421,7 @@ def test_it_says_how_old_what_the_server_knows_is() -> None:
     assert track.known_s == pytest.approx(behind * shown.scenario.control.dt)
     assert 0.3 < track.known_s < 2.0
     said = words.status(shown.state, 1, shown.now_ns)
-    assert f"age of what the server knows</td><td>{track.known_s:.2f} s" in said
+    assert f"age of observation at server</td><td>{track.known_s:.2f} s" in said
     assert not np.isnan(track.trail(5.0)).any()
 
 

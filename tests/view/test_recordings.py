@@ -379,7 +379,7 @@ def test_a_torn_recording_is_read_and_commands_say_so(
     assert back.summary == summary_of(flown())
     assert command.main(export, [str(torn), "--csv", str(tmp_path)], "export") == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"{torn}: it has no end, as that of a killed flight: 0 bytes")
+    assert line.startswith(f"{torn}: the recording has no end, as after a killed flight: 0 bytes")
 
 
 def test_joined_alone_a_torn_recording_has_an_end_for_other_programs(

@@ -116,7 +116,7 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
     # -c, without -P: folders here come before those installed
     done = ran(python, "-c", example, cwd=beside)
     assert done.returncode == 0, done.stderr
-    compiled = "compiling control loops, which this machine then keeps: it takes up to a minute\n"
+    compiled = "compiling control loops, once on this machine: takes up to a minute\n"
     assert done.stderr in ("", compiled)
     flown, where = done.stdout.splitlines()
     assert 0 < float(flown.split()[0]) < 0.1

@@ -1,1 +1,1 @@
-"""Page server: sockets, threads and clocks are in this room, and the page's content is not."""
+"""Page server: its sockets, threads and clocks; `skytether.view` has the page's content."""

@@ -1,9 +1,9 @@
 """Access rules of a page: which visitors may look, and which may change the flight.
 
 Any website that the user's browser loads can make it connect to this machine. So a connection from
-this machine is not enough: the page must be ours (`Origin`), loaded under a name that nobody else
-can point at this machine (`Host`). Otherwise any website could read the flight, or fly it. A
-visitor with the token is checked for neither.
+this machine is not enough: the page must be ours (`Origin`), and loaded under a name that nobody
+else can point at this machine (`Host`); otherwise any website could read the flight, or fly it. A
+visitor with the token passes without these checks.
 """
 
 import hmac
@@ -15,19 +15,18 @@ from urllib.parse import parse_qs, urlsplit
 from skytether.shell.web import host_name, is_ours, numeric
 
 HOST_PORT = "127.0.0.1:8080"
-"""Default address of a page."""
 
 
 class TurnedAway(Enum):
     """Reason why a browser is refused, or why its message is dropped."""
 
-    ORIGIN = "a website of another origin wanted to connect"
-    HOST = "a browser came by a name; number, localhost or the address with the token is expected"
+    ORIGIN = "a website of another origin tried to connect"
+    HOST = "a browser used a name as address; expected a number, localhost, or the token"
     VERSION = "a browser has a page of another version open"
     FULL = "there are too many browsers"
-    MESSAGE = "a browser has sent what the page does not take"
-    ROOM = "a browser has sent more than there is room for"
-    PANEL = "what a browser has sent makes no sense"
+    MESSAGE = "a browser has sent a message that the page does not accept"
+    ROOM = "a browser has sent more than the page can queue"
+    PANEL = "a browser has sent an invalid value"
 
     def __str__(self) -> str:
         return self.value
@@ -35,12 +34,10 @@ class TurnedAway(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """Browser's connection, as far as access depends on it."""
+    """Fields of a browser's request on which its access depends."""
 
     host: str
-    """Address that the browser connects from."""
     path: str
-    """Path and query of the request."""
     headers: Mapping[str, str]
     """Headers of the request; names in any case."""
 
@@ -55,7 +52,7 @@ def is_loopback(host: str) -> bool:
 
 
 def knows(token: str, given: str) -> bool:
-    """Whether the visitor has given the token; False where there is none."""
+    """Whether a visitor's token is right; False if the page has none."""
     return bool(token) and hmac.compare_digest(token.encode(), given.encode())
 
 
@@ -64,14 +61,13 @@ def _has_token(visitor: Visitor, token: str) -> bool:
 
 
 def _named(visitor: Visitor) -> tuple[str, str, str]:
-    """Name of this machine in the request, the same with its port, and the website's origin."""
     headers = {name.lower(): value for name, value in visitor.headers.items()}
     host = headers.get("host", "")
     return host_name(host), host, headers.get("origin", "")
 
 
 def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
-    """Reason why a browser may not even look; None where it may.
+    """Reason why a browser may not even look; None if it may.
 
     A numeric address is accepted, because it cannot be rebound to this machine as a name can.
     """
@@ -84,8 +80,7 @@ def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
 
 
 def may_play(visitor: Visitor, token: str) -> bool:
-    """Whether a browser may change the flight."""
     if _has_token(visitor, token):
         return True
-    here = is_loopback(visitor.host) and is_loopback(_named(visitor)[0])
-    return here and refusal(visitor, token) is None
+    is_here = is_loopback(visitor.host) and is_loopback(_named(visitor)[0])
+    return is_here and refusal(visitor, token) is None

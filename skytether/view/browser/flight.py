@@ -18,27 +18,24 @@ class PageFlight:
     """Flight on a page.
 
     Args:
-        title: its title; empty for a single flight.
-        folder: folder of its control sockets; None where nothing can be changed.
+        title: empty for a single flight.
+        folder: folder of the control sockets; None if nothing can be changed.
     """
 
     def __init__(self, title: str = "", folder: Path | None = None) -> None:
         self.title = title
         self.state = State()
         self.lock = threading.Lock()
-        """Lock for use of the state."""
         self.values: dict[str, dict[str, Any]] = {}
         """Keys that may change and their known values, by process."""
         self.answer = ""
-        """Answer to the newest request; empty before any."""
         self.refused = False
-        """Whether the newest request was refused."""
         self._before: dict[str, Any] = {}
         """Values to restore when the link is healed."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
-        """Process a frame; a malformed one is dropped."""
+        """Apply a frame to the state; a malformed frame is dropped."""
         with self.lock, contextlib.suppress(ValueError):
             self.state.take(process, frame)
         changed = (
@@ -48,14 +45,12 @@ class PageFlight:
             self.ask(process, {})
 
     def lose(self, process: str) -> None:
-        """Note that a process's feed has ended."""
         with self.lock:
             self.state.lose(process)
 
     # -- changes -----------------------------------------------------------------------------
 
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
-        """Ask a process for other values."""
         if self.operator:
             self.operator.ask(process, values)
 
@@ -67,15 +62,13 @@ class PageFlight:
             self.answer = answer.refused or "; ".join(map(str, answer.changed))
         elif asked and not answer:
             self.refused = True
-            self.answer = f"{process} does not answer: the flight is over, or it takes no changes"
+            self.answer = f"{process} does not answer: the flight is over, or accepts no changes"
 
     @property
     def is_cut(self) -> bool:
-        """Whether every packet is lost."""
         return controls.is_cut(self.values.get("netem", {}))
 
     def cut(self) -> None:
-        """Lose every packet from now on."""
         values = self.values.get("netem")
         if values and not self.is_cut:
             changed = controls.cut(values)
@@ -83,11 +76,10 @@ class PageFlight:
             self.ask("netem", changed)
 
     def heal(self) -> None:
-        """Restore the loss from before the link was cut, or none where that is unknown."""
+        """Restore the loss from before the link was cut, or no loss if that is unknown."""
         if self.is_cut:
             self.ask("netem", self._before or controls.healed(self.values["netem"]))
 
     def close(self) -> None:
-        """Stop sending requests."""
         if self.operator:
             self.operator.close()

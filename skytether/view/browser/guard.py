@@ -4,11 +4,11 @@ viser itself accepts any connection and any message: uploads of any size, reques
 on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
 - no answer may be shown in a website's frame;
-- a websocket is opened only for browsers that may look (`access.refusal`), up to a number;
-- only messages that our page sends (`MESSAGES`) are taken, of at most 64 KiB in 64 pieces;
+- a websocket is opened only for browsers that may look (`access.refusal`), up to BROWSERS_MAX;
+- only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
-- nothing is drawn for a browser that does not read; it is disconnected after 40 s, because it
-  does not answer pings, or at once if it sends pings itself.
+- a browser that does not read gets nothing more; it is disconnected after 40 s, because it does not
+  answer pings, or at once if it sends pings itself.
 
 A misbehaving browser loses its own connection, and affects no other.
 """
@@ -35,20 +35,17 @@ from skytether.shell.web import HEADERS
 from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16
-"""Most browsers at once."""
 CONNECTIONS_MAX = 32
 """Most connections at once, including those that only load the page or have sent no request yet."""
 MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
-"""Most websocket frames of a message."""
 FRAMES_MAX = 1024
-"""Most websocket frames queued for parsing."""
 UNREAD_BYTES = 128 * 1024
 """Size of the kernel's send buffer for a browser that does not read [B]; the kernel doubles it."""
 RATE_HZ = 200.0
-"""Messages per second that are read of one browser; a slider that is dragged makes 60."""
+"""Messages per second that are read from one browser; dragging a slider sends 60."""
 BURST_S = 2.0
-"""Burst that an idle browser may send at once, in seconds of the full rate [s]."""
+"""Longest burst of an idle browser, in seconds at the full rate [s]."""
 MESSAGES = frozenset(
     {
         "GuiUpdateMessage",
@@ -61,16 +58,14 @@ MESSAGES = frozenset(
 )
 """Types of viser's messages that the page's elements send."""
 VALUE = "value"
-"""Only attribute of an element that a browser may set."""
+"""The only attribute of an element that a browser may set."""
 PROTOCOL = f"viser-v{viser.__version__}"
 
 _QUIET = logging.getLogger(__name__)
-_QUIET.disabled = True  # a stranger's bytes must not print a traceback
+_QUIET.disabled = True  # invalid bytes from the network must not print a traceback
 
 
 class _Outline(msgspec.Struct):
-    """Fields of a message that are checked."""
-
     type: str
     updates: dict[str, msgspec.Raw] = {}
 
@@ -79,7 +74,6 @@ _OUTLINE = msgspec.msgpack.Decoder(_Outline)
 
 
 def is_taken(message: bytes) -> bool:
-    """Whether a message is one that the page's elements send."""
     try:
         outline = _OUTLINE.decode(message)
     except (msgspec.MsgspecError, RecursionError, ValueError):
@@ -88,7 +82,7 @@ def is_taken(message: bytes) -> bool:
 
 
 class Guard:
-    """Gatekeeper that refuses browsers, and counts refusals.
+    """Check of connections and messages, with a count of refusals.
 
     Args:
         token: secret that exempts a visitor from the other checks; empty for none.
@@ -97,25 +91,20 @@ class Guard:
     def __init__(self, token: str) -> None:
         self._token = token
         self.counts: Counter[TurnedAway] = Counter()
-        """Number of refusals and of dropped messages, by reason."""
         self.connections = 0
-        """Number of connections."""
         self.browsers = 0
-        """Number of open websockets."""
         self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
-    # -- what is counted ---------------------------------------------------------------------
+    # -- counters ---------------------------------------------------------------------------
 
     def count(self, why: TurnedAway) -> None:
-        """Count a refusal, or a dropped message."""
         with self._lock:
             self.counts[why] += 1
             if str(self.counts[why]).strip("0") == "1":  # report the first, tenth, hundredth
                 self._news.add(why)
 
     def events(self) -> list[BrowserRefused]:
-        """Events since the last call."""
         with self._lock:
             news, self._news = self._news, set()
             return [BrowserRefused(why=str(why), count=self.counts[why]) for why in news]
@@ -175,7 +164,6 @@ class Guard:
         handle: Callable[[sockets.ServerConnection], Awaitable[None]],
         connection: sockets.ServerConnection,
     ) -> None:
-        """Run viser's handler for a browser."""
         if connection.subprotocol != PROTOCOL:
             self.count(TurnedAway.VERSION)
             await connection.close(CloseCode.PROTOCOL_ERROR, f"Version mismatch: {PROTOCOL}")
@@ -197,18 +185,15 @@ class Guard:
 
 
 class _Connection(sockets.ServerConnection):
-    """Connection of one browser."""
-
     def __init__(self, guard: Guard, *protocol: Any, **limits: Any) -> None:
         super().__init__(*protocol, **limits)
         self._guard = guard
         self._due_s = 0.0
         """Time at which the messages so far would have been sent at RATE_HZ [s]."""
         self._is_cut = False
-        """Whether it was ended by this guard."""
+        """Whether this guard has ended the connection."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.Protocol`."""
         super().connection_made(transport)
         # Otherwise the kernel would buffer 4 MB for a browser that does not read.
         transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_SNDBUF, UNREAD_BYTES)
@@ -217,18 +202,16 @@ class _Connection(sockets.ServerConnection):
             self._cut(TurnedAway.FULL)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """See `asyncio.Protocol`."""
         self._guard.connections -= 1
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """See `asyncio.Protocol`."""
         super().data_received(data)
         if len(self.recv_messages.frames) > FRAMES_MAX:
             self._cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
-        """See `websockets`: pings are answered even if the answers are not read."""
+        """End a connection that sends pings without reading the answers, which would queue up."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
             self._cut(TurnedAway.ROOM)
         super().process_event(event)
@@ -249,7 +232,7 @@ class _Connection(sockets.ServerConnection):
             if is_taken(message := b"".join(pieces)):
                 return message
             self._guard.count(TurnedAway.MESSAGE)
-        # What is left unread of a flood would take its turns for minutes, and a browser's place.
+        # Reading the rest of a flood would take minutes, and keep another browser out.
         await self.wait_closed()
         raise self.protocol.close_exc
 
@@ -269,7 +252,6 @@ class _Connection(sockets.ServerConnection):
 
 
 def _unframed(_: sockets.ServerConnection, __: Request, response: Response) -> None:
-    """Forbid that an answer is shown in a frame."""
     response.headers.update(HEADERS)
 
 

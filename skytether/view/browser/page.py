@@ -21,27 +21,26 @@ from skytether.view.browser.panel import More, Panel
 from skytether.view.scene import Scene
 
 MOVES_HZ = 25
-"""Rate at which vehicles' markers move [1/s]."""
 MOVES_TO_A_DRAWING = 5
 """Number of marker updates per redraw of lines, plots and words."""
 
 
 STOPPED_S = 30.0
-"""Time after which a server of viser that does not end is left alone [s]."""
+"""Time after which a viser server that does not end is abandoned [s]."""
 
-# A browser may leave while it is drawn for, which is no mistake.
+# viser warns if a browser leaves during a redraw.
 warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
-    """Keep viser's prints off standard output; it prints even when told not to."""
+    """Keep viser's prints off standard output; it prints even when asked not to."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def stop(server: viser.ViserServer) -> None:
-    """Stop a server of viser, and wait until its thread has printed its last line.
+    """Stop a viser server, and wait until its thread has printed its last line.
 
-    viser itself waits for a second, and would print when something else has the standard output.
+    viser itself waits only for a second, and could print into another output later.
     """
     thread = server._websock_server._server_thread
     with _silence():
@@ -55,8 +54,7 @@ class Page:
 
     Args:
         host, port: address that it listens at.
-        flights: flights that are shown.
-        now_ns: time of the frames [ns]; this machine's clock unless given.
+        now_ns: function that returns the time of the frames [ns]; by default this machine's clock.
         token: secret that lets a visitor look and change the flight from any machine; empty for
             none.
         more: adds further controls to a browser.
@@ -89,15 +87,12 @@ class Page:
 
     @property
     def port(self) -> int:
-        """Port that the page listens on."""
         return self._server.get_port()
 
     def events(self) -> Sequence[BrowserRefused]:
-        """Events about browsers since the last call."""
         return self._guard.events()
 
     def close(self) -> None:
-        """Close the page."""
         self._closed.set()
         self._thread.join()
         stop(self._server)
@@ -108,8 +103,8 @@ class Page:
         while not self._closed.wait(max(0.0, due_s - time.monotonic())):
             due_s = max(due_s + 1 / MOVES_HZ, time.monotonic())
             clients = self._server.get_clients()
-            for gone in self._panels.keys() - clients.keys():
-                del self._panels[gone]
+            for number in self._panels.keys() - clients.keys():
+                del self._panels[number]
             if not clients:
                 continue
             moves += 1
@@ -131,7 +126,7 @@ class Page:
                 with self._alone(number):
                     self._panels[number] = self._panel(client)
                 draws = True
-                break  # one at a time: a browser that keeps reconnecting costs no more
+                break  # one at a time, which bounds the cost of a browser that keeps reconnecting
         with self._server.atomic():
             self._scene.move(states)
             if draws:
@@ -144,13 +139,13 @@ class Page:
                         panel.show(now_ns)
 
     def _reads(self, number: int) -> bool:
-        """Whether a browser has read what it was sent; nothing is drawn for one that has not."""
+        """Whether a browser has read everything sent; if not, nothing is drawn for it."""
         connection = self._connections.get(number)
         return connection is not None and not connection.paused
 
     @contextlib.contextmanager
     def _alone(self, number: int) -> Iterator[None]:
-        """Contain errors of one browser's panel: they close its connection, and no other.
+        """Close only this browser's connection when its panel raises an error.
 
         viser sets values as browsers send them: texts for numbers, lists of any length.
         """
@@ -163,7 +158,6 @@ class Page:
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
     def _begin(self, shown: tuple[object, ...]) -> None:
-        """Build the scene again: other flights are flown."""
         self._server.scene.reset()
         for client in self._server.get_clients().values():
             client.gui.reset()

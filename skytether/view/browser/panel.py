@@ -36,23 +36,25 @@ IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see 
 ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see docs/together.md"
 GUIDES, DRAWS = "sends the vehicle", "draws a zone"
 CLICKS = ("looks", GUIDES, DRAWS)
-CLICKED = "What a click on the map does: the chosen vehicle's goal, or two corners of a box."
-MAY_END = "The vehicle then brakes and hovers. Without a link it lands after a while for good."
+CLICKED = "Effect of a click on the map: sets the chosen vehicle's goal, or a corner of a box."
+MAY_END = (
+    "The vehicle then brakes and hovers. Without a link it lands after a while and stays down."
+)
 ALL_IS_LOST = "Every packet is lost then, both ways."
 GOAL_S = 60.0
 """Age up to which a desired position is shown as known [s]."""
 LEAD_S = 5.0
-"""Age up to which a target that is moved in flight is shown as known [s]."""
+"""Age up to which the position of a draggable target is shown as known [s]."""
 AFTER_LEAP = (
-    "Once its position has leapt: fly on in the old frame (the leap is subtracted), in the new one "
-    "(figure and fence move with it), or stay, see docs/failsafe.md"
+    "After its position has leapt: fly on in the old frame (the leap is subtracted), in the new "
+    "one (figure and fence move with it), or stay, see docs/failsafe.md"
 )
 FIXED = (
-    "Both ends agree on the scheme and the length of a step before a flight, and reckon with them: "
-    "they cannot be changed in it. Fly again, with --control.scheme or --control.dt."
+    "Both ends agree on the scheme and the step length before a flight and predict with them: "
+    "they cannot be changed in flight. Start a new flight with --control.scheme or --control.dt."
 )
 WIDE_PLOTS = 760
-"""Width of plots where no scene is beside them [pixels]."""
+"""Width of plots that have no scene beside them [pixels]."""
 NARROW = 800
 """Window width up to which panels lie over the scene, not beside it [pixels]."""
 MOVED_M = 0.05
@@ -63,7 +65,7 @@ const label = [...document.querySelectorAll('label')].find(each => each.textCont
 const prefers = matchMedia('(prefers-color-scheme: light)').matches;
 if (prefers && !label.control.checked) label.control.click();
 ">"""
-"""HTML that makes the page light in a browser that prefers it; only the browser knows."""
+"""HTML that makes the page light if the browser prefers that; the server cannot tell."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
@@ -72,11 +74,8 @@ class Panel:
     """Panel of one browser.
 
     Args:
-        client: the browser.
-        flights: flights on the page, all of them with known scenarios.
-        scene: the scene.
-        may_play: whether the browser may change the flight.
-        unlock: checks a token and returns whether it is right; None where there is no token.
+        flights: flights on the page, all with known scenarios.
+        unlock: checks a token and returns whether it is right; None if the page has no token.
         more: adds further controls for a browser that may change the flight; the function that it
             returns is called at each redraw.
     """
@@ -96,7 +95,7 @@ class Panel:
         gui = client.gui
         self._dress(light=False)
         gui.set_panel_label("Skytether")
-        # On a narrow window another panel would lie closed below everything in this one.
+        # On a narrow window a second panel would lie closed below everything in this one.
         tabs = gui.add_tab_group() if client.camera.image_width <= NARROW else None
         if tabs is None:
             gui.main_panel.dock_right()
@@ -110,7 +109,6 @@ class Panel:
         self._add_plots(tabs or gui.add_panel())
 
     def _add_words(self, more: More | None, *, may_play: bool) -> None:
-        """Add what is said of the flights, and the controls."""
         gui, flights = self._client.gui, self._flights
         self._status = [gui.add_html("") for _ in flights]
         flying = [each for each in flights if each.state.flies]
@@ -145,7 +143,6 @@ class Panel:
             ground.colors = np.array(GROUND_RGB[light.value], np.uint8)
 
     def _add_plots(self, panel: viser.GuiTabGroupHandle | viser.PanelHandle) -> None:
-        """Add plots and events, in tabs."""
         gui, flights = self._client.gui, self._flights
         titles = [each.title for each in flights]
         scenarios = [each.state.scenario for each in flights]
@@ -153,7 +150,6 @@ class Panel:
         solves = any(not each.control.properties.splines for each in scenarios)
         flies = any(each.state.flies for each in flights)
         self._nobody = None if flies else VehicleTrack(0, scenarios[0])
-        """Placeholder for a vehicle where only netem is known."""
         if flies:
             with panel.add_tab("Flight"):
                 self._plots.append(
@@ -176,9 +172,9 @@ class Panel:
     def _let_look(self) -> None:
         """Explain why this browser cannot change anything, and how it could."""
         with self._play:
-            said = "This page can only be looked at: it may be played with on the machine itself"
+            text = "This page is read-only here: changes can be made on the machine itself"
             self._client.gui.add_html(
-                words.note(said + (", or with its token." if self._unlock else "."))
+                words.note(text + (", or with its token." if self._unlock else "."))
             )
             if self._unlock is None:
                 return
@@ -206,7 +202,6 @@ class Panel:
             camera.position, camera.look_at = aim, target
 
     def show(self, now_ns: int) -> None:
-        """Update the panel."""
         self._aim()
         numbers = sorted({number for each in self._flights for number in each.state.vehicles})
         if numbers and tuple(map(str, numbers)) != tuple(self._vehicle.options):
@@ -233,7 +228,7 @@ class Panel:
 
 
 def assign(handle: Any, value: Any) -> None:
-    """Set a handle's value; mypy takes viser's property for a read-only one."""
+    """Set a handle's value; mypy takes viser's property for read-only."""
     handle.value = value
 
 
@@ -258,7 +253,6 @@ class _Slider:
                 ask(knob, float(self._slider.value))
 
     def show(self, values: Values) -> None:
-        """Set the slider to the value, unless the user is moving it."""
         number = self.knob.read(values)
         self._slider.visible = number is not None
         if number is None or time.monotonic() - self._moved_s < HELD_S:
@@ -273,14 +267,12 @@ class _Question:
     """Question that confirms a change which may end the flight; one at a time.
 
     Args:
-        gui: elements of the browser that is asked.
-        warning: what happens then.
+        warning: consequence of the change.
     """
 
     def __init__(self, gui: viser.GuiApi, warning: str) -> None:
         self._gui, self._warning = gui, warning
         self._shown: Any = None
-        """Window with the question that is shown, or None."""
 
     def ask(
         self,
@@ -289,13 +281,12 @@ class _Question:
         change: Callable[[], None],
         leave: Callable[[], None] = lambda: None,
     ) -> None:
-        """Ask once more, unless a question is shown already.
+        """Ask for confirmation, unless a question is shown already.
 
         Args:
-            title: the question.
             yes: text of the button that confirms.
-            change: called when it is meant.
-            leave: called when it is not.
+            change: called if the user confirms.
+            leave: called if not.
         """
         if self._shown is not None:
             leave()
@@ -316,8 +307,6 @@ class _Question:
 
 
 class _Network:
-    """Text fields of both network directions, which the browser changes together."""
-
     def __init__(
         self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None], *, flies: bool
     ) -> None:
@@ -336,7 +325,6 @@ class _Network:
             ask({way: text.value for way, text in self._texts.items()})
 
     def show(self, values: Values) -> None:
-        """Show the directions after they have changed."""
         known = texts(values)
         self._folder.visible = bool(known)
         if known != self._known:
@@ -349,8 +337,6 @@ class Controls:
     """Controls of one browser; a change applies to all flights on the page.
 
     Args:
-        client: the browser.
-        flights: flights on the page.
         vehicle: returns the number of the chosen vehicle.
     """
 
@@ -387,7 +373,6 @@ class Controls:
                 flight.heal()
 
     def _let_fly(self) -> None:
-        """Add controls that only flights have, and not netem alone."""
         gui, scenario = self._client.gui, self._flights[0].state.scenario
         self._trigger = gui.add_dropdown(
             "Trigger",
@@ -396,7 +381,7 @@ class Controls:
             hint="Rule for sending a plan",
         )
         self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
-        self._armed = gui.add_checkbox("Armed", True, hint="Whether plans are flown at all")
+        self._armed = gui.add_checkbox("Armed", True, hint="Disarmed: the vehicle ignores plans")
         self._after_leap = gui.add_button_group(
             "After a leap", ("old", "new", "stay"), visible=False, hint=AFTER_LEAP
         )
@@ -425,7 +410,7 @@ class Controls:
                 arm()
             else:
                 rearm = partial(assign, self._armed, True)
-                self._question.ask("Fly no more plans?", "Yes, disarm", arm, rearm)
+                self._question.ask("Disarm the vehicle?", "Yes, disarm", arm, rearm)
 
     def _cut_all(self) -> None:
         for flight in self._flights:
@@ -447,7 +432,6 @@ class Controls:
             flight.ask(knob.process, changed)
 
     def show(self) -> None:
-        """Update the controls and the newest answer."""
         flight = self._flights[0]
         if self._flights[0].state.flies:
             self._show_flight(flight)
@@ -475,8 +459,8 @@ class Controls:
         if armed != self._armed.value:
             assign(self._armed, armed)
         flies_real = flight.state.scenario.vehicle.kind == "mavlink"
-        said = flight.values.get("client", {})
-        self._after_leap.visible = flies_real and "vehicle.after_leap" in said
+        values = flight.values.get("client", {})
+        self._after_leap.visible = flies_real and "vehicle.after_leap" in values
         if self._lead:
             self._lead.show()
         if self._mission:
@@ -496,7 +480,6 @@ class _Mission:
         self._flight, self._state, self._ask = flights[0], flights[0].state, ask
         self._known, self._vehicle = self._state.zones, vehicle
         self._corners: list[NDArray[Any]] = []
-        """Clicked corners of a box."""
         gui = client.gui
         with gui.add_folder("Mission"):
             self._text = gui.add_text("Zones", self._known, hint=ZONES)
@@ -526,24 +509,21 @@ class _Mission:
                     self._draw(at)
 
     def _goal(self) -> NDArray[Any] | None:
-        """The chosen vehicle's goal [m; shape (axes,)]; None where it is not known."""
         track = self._state.vehicles.get(self._vehicle())
         return track.goal(GOAL_S) if track else None
 
     def _drag(self, place: NDArray[Any], held: bool) -> None:
-        """Send the chosen vehicle to the place where its goal was dropped."""
         if not held:
             self._guide(place)
 
     def _guide(self, place: NDArray[Any]) -> None:
-        """Send the chosen vehicle to a place [m; shape (axes,) at least]."""
+        """Set the chosen vehicle's goal [m; shape (axes,) at least]."""
         values = self._flight.values.get("server", {})
         goals = parse_goals(values.get(GUIDED, ""), self._axes)
         goals[self._vehicle()] = np.round(place[: self._axes], 2)
         self._ask({GUIDED: format_goals(goals)})
 
     def _draw(self, at: NDArray[Any]) -> None:
-        """Take a corner of a box; the second corner completes it."""
         self._corners.append(at)
         if len(self._corners) == 2:
             (x0, y0), (x1, y1) = np.sort(np.round(self._corners, 2), axis=0)
@@ -552,7 +532,6 @@ class _Mission:
             self._ask({ZONED: " & ".join(filter(None, (self._state.zones, box)))})
 
     def show(self) -> None:
-        """Show the zones after they have changed, and the chosen vehicle's goal."""
         self._handle.show(self._goal())
         if self._state.zones != self._known:
             self._known = self._state.zones
@@ -560,13 +539,11 @@ class _Mission:
 
 
 class _Handle:
-    """Handle in the scene that this browser can drag.
+    """Handle in the scene that the user can drag.
 
     Args:
-        client: the browser.
-        name: of the handle.
         axes: axes along which it can be dragged.
-        moved: is called with the place to which it was dragged [m; shape (3,)], and whether it is
+        moved: called with the position to which it was dragged [m; shape (3,)], and whether it is
             still held.
     """
 
@@ -595,19 +572,16 @@ class _Handle:
 
     @property
     def place(self) -> NDArray[Any]:
-        """Place of the handle [m]; shape (3,)."""
         return np.asarray(self._handle.position)
 
     def stay(self) -> None:
-        """Stay where it is for a while: the answer is still under way."""
+        """Ignore positions for HELD_S, until the answer to a change has come."""
         self._free_s = time.monotonic() + HELD_S
 
     def put(self, place: NDArray[Any]) -> None:
-        """Move to a place [m; shape (3,)]."""
         self._handle.position = place
 
     def show(self, goal: NDArray[Any] | None) -> None:
-        """Move the handle to a goal [m; shape (axes,)], unless the user holds the handle."""
         if goal is None or self._held or time.monotonic() < self._free_s:
             return
         place = in_space(goal[None])[0]
@@ -616,13 +590,13 @@ class _Handle:
 
 
 class _Lead:
-    """Target that this browser can drag, or place by a click."""
+    """Target that the user can drag, or place by a click."""
 
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights
         self._axes = flights[0].state.scenario.model.axes
         self._handle = _Handle(client, "/lead", self._axes, lambda place, _: self._move(place))
-        client.gui.add_html(words.note("Drag the target, or click where it shall be."))
+        client.gui.add_html(words.note("Drag the target, or click where it should be."))
 
         @client.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
@@ -639,6 +613,5 @@ class _Lead:
             flight.ask("server", {LED: [np.round(place[: self._axes], 3).tolist()]})
 
     def show(self) -> None:
-        """Move the handle to the target, unless it is being dragged."""
         for track in list(self._flights[0].state.vehicles.values())[:1]:
             self._handle.show(track.goal(LEAD_S))

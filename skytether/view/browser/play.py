@@ -1,8 +1,8 @@
-"""Changes requested on the page, on their way to the processes.
+"""Sender of changes requested on the page to the flight's processes.
 
-A dragged slider makes many requests per second, and a process answers in its own time: of the
-requests waiting for a key only the newest is sent. All go through the control sockets
-(`shell.control`), and so through the checks of a scenario.
+A dragged slider makes many requests per second, and processes may answer slowly: of the requests
+waiting for a key only the newest is sent. All go through the control sockets (`shell.control`), and
+so through the checks of a scenario.
 """
 
 import threading
@@ -23,7 +23,7 @@ class Operator:
     """Sender of changes to a flight's processes, in a thread of its own.
 
     Args:
-        folder: folder of their sockets.
+        folder: folder of their control sockets.
         answered: called in the thread with the name of a process, the requested values, and its
             answer, or None for no answer.
     """
@@ -39,13 +39,12 @@ class Operator:
         self._thread.start()
 
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
-        """Queue a request for other values; without values, for the present ones."""
+        """Queue a request for new values; without values, for the present ones."""
         with self._changed:
             self._wanted.setdefault(process, {}).update(values)
             self._changed.notify()
 
     def close(self) -> None:
-        """Stop sending requests."""
         with self._changed:
             self._closed = True
             self._changed.notify()

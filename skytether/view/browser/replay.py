@@ -18,49 +18,40 @@ from skytether.view.network import SPAN_S
 from skytether.view.state import State
 
 TICK_S = 0.04
-"""Time from one batch of frames to the next [s]."""
+"""Time between two batches of frames."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
-"""Speeds offered to the user, relative to real time."""
 Placed = tuple[int, int, str, Frame]
 """Time of a frame since its flight's first [ns], index of its flight, process, and the frame."""
 
 
 class Player:
-    """Player of recorded frames.
-
-    Args:
-        flights: flights on the page.
-        frames: frames of each flight, in order.
-    """
-
     def __init__(self, flights: Sequence[PageFlight], frames: Sequence[Sequence[Timed]]) -> None:
         self._flights = flights
         self._openings: list[Placed] = []
         self._frames: list[Placed] = []
         begin = []
-        for own in frames:
-            later = (time_ns for time_ns, _, frame in own if not isinstance(frame, Opened))
+        for flight_frames in frames:
+            later = (
+                time_ns for time_ns, _, frame in flight_frames if not isinstance(frame, Opened)
+            )
             begin.append(next(later, 0))
         placed = (
-            [(time_ns - begin[place], place, name, frame) for time_ns, name, frame in own]
-            for place, own in enumerate(frames)
+            [(time_ns - begin[place], place, name, frame) for time_ns, name, frame in flight_frames]
+            for place, flight_frames in enumerate(frames)
         )
         for each in merge(*placed, key=lambda item: item[0]):
             (self._openings if isinstance(each[3], Opened) else self._frames).append(each)
         self._begin_ns = begin[0] if begin else 0
         self._times_ns = [each[0] for each in self._frames]
         self.end_ns = self._times_ns[-1] if self._times_ns else 0
-        """Time of the last frame since the first [ns]."""
+        """Time of the last frame since the first."""
         self._lock = threading.Lock()
         self._at_ns = 0
         self._next = 0
-        """Index of the next frame."""
         self.speed = 1.0
-        """Playback speed relative to real time."""
         self.plays = True
-        """Whether playback is running."""
         self._wanted_ns: int | None = None
-        """Requested time [ns]; None where it is shown already."""
+        """Time that the user has requested; None once it is shown."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -68,15 +59,14 @@ class Player:
 
     @property
     def at_ns(self) -> int:
-        """Time shown, since the first frame [ns]."""
+        """Since the first frame."""
         return self._at_ns
 
     def now_ns(self) -> int:
-        """Time shown, on the clock of the first flight [ns]."""
+        """On the clock of the first flight."""
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:
-        """Jump to another time."""
         with self._lock:
             for flight in self._flights:
                 with flight.lock:
@@ -87,7 +77,6 @@ class Player:
             self._go(at_ns)
 
     def advance(self, passed_ns: int) -> None:
-        """Play the frames of some more time."""
         with self._lock:
             self._go(min(self._at_ns + passed_ns, self.end_ns))
 
@@ -96,7 +85,7 @@ class Player:
         for _, place, process, frame in self._frames[self._next : until]:
             self._flights[place].take(process, frame)
         self._next = max(self._next, until)
-        self._at_ns = at_ns  # last: pages may be drawn meanwhile, and would call the link cut
+        self._at_ns = at_ns  # last: a page drawn in between would show the link as cut
 
     def _work(self) -> None:
         before_s = time.monotonic()
@@ -110,7 +99,6 @@ class Player:
             before_s = now_s
 
     def close(self) -> None:
-        """Stop playback."""
         self._closed.set()
         self._thread.join()
 

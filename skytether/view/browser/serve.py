@@ -1,4 +1,4 @@
-"""Page server: its address, who may change the flight, and how it ends."""
+"""Page server: its address, its token, and its end."""
 
 import errno
 import secrets
@@ -21,7 +21,7 @@ from skytether.view.browser.play import PROCESSES
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
-"""Interval at which Ctrl-C is checked [s]."""
+"""Interval at which Ctrl-C is checked."""
 PORTS, PORTS_TRIED = 65536, 100
 """Number of ports that exist, and of those that are tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
@@ -46,38 +46,30 @@ def page(
     now_ns: Callable[[], int] | None = None,
     more: More | None = None,
 ) -> Iterator[tuple[Page, PageServed]]:
-    """Serve a page for as long as the block takes; yields the page and its address.
+    """Serve a page during the block; yields the page and its address.
 
     Args:
         at: address to listen at; if its port is taken, the next free one.
-        flights: flights on the page.
         now_ns, more: see `Page`.
-
-    Raises:
-        CommandError: the address cannot be listened at.
     """
     host, port = at
     free = next_free(host, port)
     token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
     with closing(Page(host, free, flights, token=token, more=more, now_ns=now_ns)) as shown:
-        here = address_text("127.0.0.1" if host in ANYWHERE else host, shown.port)
-        query = f"/?websocket=ws://{here}/?token={token}" if token else ""
-        taken = address_text(*at) if port and shown.port != port else ""
-        yield shown, PageServed(address=f"http://{here}{query}", taken=taken)
+        page_address = address_text("127.0.0.1" if host in ANYWHERE else host, shown.port)
+        query = f"/?websocket=ws://{page_address}/?token={token}" if token else ""
+        taken_address = address_text(*at) if port and shown.port != port else ""
+        yield shown, PageServed(address=f"http://{page_address}{query}", taken=taken_address)
 
 
 def next_free(host: str, port: int) -> int:
-    """First free port from the given one on; 0, which takes any free port, stays 0.
-
-    Raises:
-        CommandError: no port is free, or the host is not this machine.
-    """
+    """First free port, from `port` on; 0, which takes any free port, stays 0."""
     for candidate in range(port, min(port + PORTS_TRIED, PORTS)):
         try:
-            found = socket.getaddrinfo(
+            addresses = socket.getaddrinfo(
                 host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )
-            family, kind, _, _, address = found[0]
+            family, kind, _, _, address = addresses[0]
             with socket.socket(family, kind) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
@@ -105,9 +97,6 @@ def until_told(
     Args:
         at, flights, now_ns, more: see `page`.
         log: form of the log.
-
-    Raises:
-        CommandError: the address cannot be listened at.
     """
     with (
         interruptible() as interrupted,
