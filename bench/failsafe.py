@@ -197,12 +197,7 @@ def _off_path(scenario: Scenario, positions: Array) -> float:
 
 
 def _ending(aboard: PilotedVehicle, speed: float, modes: Changes) -> Ending:
-    """End state of the vehicle, in words.
-
-    Args:
-        speed: horizontal speed at the end [m/s].
-        modes: modes of the client after the fault.
-    """
+    """End state of the vehicle, in words; `modes` are those of the client after the fault."""
     if not aboard.armed:
         return "has landed"
     if aboard.mode is FlightMode.PILOT:

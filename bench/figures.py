@@ -216,11 +216,6 @@ class FiguresOptions:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Make figures as the command line says, and print how each compares.
-
-    Raises:
-        CommandError: a number has left its tolerance, or its text is not in its page.
-    """
     options = tyro.cli(FiguresOptions, args=argv, description=__doc__)
     figures = {
         name: figure
@@ -255,11 +250,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def make(figure: Figure, page: Path, folder: Path, flags: Flags) -> Verdict:
-    """Make a figure, and compare it with its page.
-
-    Args:
-        page: file of the page, which is read after the flights.
-        folder: folder for finished flights; figures of the same flights share them.
+    """Make a figure, and compare it with its page; `folder` is for the finished flights.
 
     Raises:
         CommandError: interrupted.

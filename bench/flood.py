@@ -134,11 +134,7 @@ def tap(pipe: Connection, port: int) -> None:
 
 
 def forgeries(good: bytes) -> list[bytes]:
-    """Forged packets: random bytes under a valid packet's header, and random bytes alone.
-
-    Args:
-        good: a packet of a channel that is in use.
-    """
+    """Forged packets: random bytes under the header of the packet `good`, and bare random bytes."""
     rng = np.random.default_rng(1)
     packets = []
     for number in range(POOL):

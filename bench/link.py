@@ -58,12 +58,7 @@ QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=
 
 
 class Ends:
-    """Both ends of one vehicle's link.
-
-    Args:
-        hello: first message of the vehicle.
-        welcome: the server's answer.
-    """
+    """Both ends of one vehicle's link, with its HELLO and the server's WELCOME."""
 
     def __init__(
         self, gate: server.SecureGate, keyring: Keyring, vehicle: int, hello: bytes, welcome: bytes

@@ -252,11 +252,7 @@ def timed() -> Iterator[list[float]]:
 def fly_with_deaths(
     scenario: Scenario, vehicles: int, deaths: Sequence[tuple[float, float]]
 ) -> tuple[Record, list[Server]]:
-    """Flight in which the server restarts without memory, and all runs of the server.
-
-    Args:
-        deaths: times at which the server stops and restarts [s], in order.
-    """
+    """Flight in which the server stops and restarts at `deaths` [s]; and all runs of the server."""
     lives: list[Server] = []
 
     def live(world: World | None = None) -> None:
@@ -284,13 +280,7 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 def mission_scenario(
     name: str, seed: int, duration: float, goals: Array, folder: Path
 ) -> dict[str, Any]:
-    """Table of a scenario with other goals.
-
-    Args:
-        name: name of the scenario that is changed.
-        goals: starts and goals [m]; shape (2, vehicles, axes).
-        folder: folder for the file of goals.
-    """
+    """Table of a scenario with other starts and goals [m]; shape (2, vehicles, axes)."""
     rows = [
         ",".join([str(number), str(at_s), *(f"{each:.4f}" for each in place)])
         for number, both in enumerate(goals.swapaxes(0, 1), start=1)

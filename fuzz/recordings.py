@@ -301,11 +301,7 @@ OUTSIDE = (bomb, misled, scattered)
 
 
 def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
-    """Mutated recording, and the name of the mutation.
-
-    Args:
-        known: records of the recording.
-    """
+    """Mutated recording, and the name of the mutation; `known` are the records in `content`."""
     if rng.random() < 0.6:
         how, found = rng.choice(INSIDE), list(known)
         how(rng, found)

@@ -87,12 +87,7 @@ class Decisions(NamedTuple):
 
 
 class Controller:
-    """The paper's algorithms on the server, for up to `capacity` vehicles.
-
-    Args:
-        stopwatch: measures the parts of a step; the core has no clock of its own.
-        references: see `Desired`.
-    """
+    """The paper's algorithms on the server, for up to `capacity` vehicles."""
 
     def __init__(
         self,
@@ -224,10 +219,7 @@ class Controller:
         return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
-        """Plan for vehicles, and decide which of them are sent their horizon.
-
-        Args:
-            rows: vehicles returned by `able`, no more than BLOCK; shape (n,).
+        """Plan for at most BLOCK vehicles from `able`, and decide which are sent their horizon.
 
         Source: algorithms 1, 2.
         """

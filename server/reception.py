@@ -65,14 +65,7 @@ CONTRADICTED = {
 
 
 class Reception:
-    """Receives messages of vehicles.
-
-    Args:
-        boot_id: number unique to this run of the server.
-        grid: ticks, started by an observation.
-        out: list to which answers are appended.
-        events: list to which events for the operator are appended.
-    """
+    """Receives messages of vehicles; appends answers to `out`, and events to `events`."""
 
     def __init__(
         self,
@@ -265,11 +258,7 @@ class Reception:
             self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
     def _anew(self, row: int, life: tuple[int, int] | None) -> None:
-        """Forget everything about a vehicle except its session.
-
-        Args:
-            life: its number and boot id, if its clock may be the same as before.
-        """
+        """Forget everything about a vehicle except its session; `life`: see `ClockMap.forget`."""
         self._clock.forget(row, life)
         self._controller.forget(row)
         self._sessions.idle[row] = Idle.PLANS

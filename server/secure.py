@@ -166,12 +166,7 @@ class _Answer:
 
 
 class SecureGate:
-    """Gate that only vehicles with a key pass.
-
-    Args:
-        keyring: keys of all admissible vehicles.
-        entropy: returns this many unpredictable bytes.
-    """
+    """Gate that only vehicles of the keyring pass; `entropy` returns unpredictable bytes."""
 
     secure = True
 

@@ -142,12 +142,7 @@ class Desired:
             self._pages[0, :, 0] = self._point.at(now_ns)
 
     def now(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states of vehicles at their steps k [m, m/s]; shape (n, axes, 2).
-
-        Args:
-            rows: the vehicles, no more than a block; shape (n,).
-            steps: k of each; shape (n,).
-        """
+        """Desired states at the steps k of vehicles [m, m/s]; shape (n, axes, 2)."""
         pages, place, first = self._find(rows, steps, self._at_once)
         n = len(rows)
         states: Array = pages[place[:n], -self._axes :, first[:n]]
@@ -162,13 +157,7 @@ class Desired:
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states of vehicles from k + d on, valid until the next call.
-
-        Args:
-            rows: the vehicles, no more than a block; shape (n,).
-            steps: k of each; shape (n,).
-            ahead: d of each, in the first n items.
-        """
+        """Desired states from k + d on, valid until the next call; the n first of `ahead` are d."""
         if self._all:
             return self._find(rows, steps, ahead)
         found = self._find(rows, steps, self._at_once)

@@ -218,8 +218,7 @@ class MissionPlanner(SplineScheme):
         return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
 
     def clock_m(self, row: int) -> float | None:
-        """Distance by which the clock error may displace a vehicle along its motion now [m]; None
-        without a motion.
+        """Displacement along its motion that a vehicle's clock error may cause [m]; or None.
 
         Other vehicles keep away by this much more, along its path.
         """
@@ -299,8 +298,7 @@ class MissionPlanner(SplineScheme):
             vehicle.zone_blocks = False
 
     def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
-        """Nearest position clear of zones, for a vehicle that rests within a zone [m]; None if it
-        rests outside.
+        """Nearest position clear of zones [m], for a vehicle that rests within a zone, or None.
 
         No motion leads into a zone, so the vehicle has been there since the server started.
         """
@@ -376,13 +374,11 @@ class MissionPlanner(SplineScheme):
     def _motion_toward(
         self, row: int, vehicle: VehicleMotions, k: int, goal: Array
     ) -> Motion | None:
-        """Motion from the motion in force towards a goal, away from all others; None if none is
-        found.
+        """Motion from the motion in force towards a goal, away from all others; None if not found.
 
         The result is added to the possible motions, so that the next vehicle's plan accounts for
-        it. Constraints are added only once a solution violates them: usually nothing is near, and
-        the
-            path is straight.
+        it. Constraints are added once a solution violates them: usually the path is free and
+        straight.
         """
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
@@ -460,12 +456,8 @@ class MissionPlanner(SplineScheme):
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
-        """Flags of the others' motions that a motion comes too near to at any time; the last flag
-        is for zones.
-
-        Args:
-            motion: the motion, by the vehicle's own steps.
-            planned: the same motion, by common steps.
+        """Flags of the motions that are too near; the last is for zones. `planned`: in common
+        steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None

@@ -39,8 +39,7 @@ class Yielding(NamedTuple):
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:
-    """Index of the first of several positions that a path passes too near to; None if there is
-    none.
+    """Index of the first position that a path passes too near to, or None.
 
     A position too near to the start of the path only counts if the path comes nearer to it.
 

@@ -58,8 +58,7 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
 def planned_state(
     mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
 ) -> tuple[float, float]:
-    """Planned state x_p(k|k-1) on one axis: state of the generator's previous plan after `plan.gap`
-    steps.
+    """Planned state x_p(k|k-1) on one axis, from the generator's previous plan.
 
     Source: eq. (14).
     """
@@ -80,8 +79,7 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add the squared deviations, on one axis, of flying on with `held` from the generator's
-    previous plan.
+    """Add the squared deviations of flying on with `held` from the previous plan, on one axis.
 
     Args:
         i: index of the vehicle in the block.

@@ -261,14 +261,7 @@ def _keep(batch: PlanBatch, simd: SimdBatch, some: I1, tier: int, axis: int) -> 
 
 @part
 def _plan_some(batch: PlanBatch, memory: F3, some: I1, which: int, work: RiccatiWorkspace) -> int:
-    """Plan for some vehicles at once, after `begin`; returns the number of unsolved plans.
-
-    Args:
-        memory: memory of a `SimdBatch` for as many vehicles.
-        some: indices of the vehicles in the block; shape (L,).
-        which: weights of all of them, FIRST or LATER.
-        work: workspace of the exact solver.
-    """
+    """Plan for the vehicles `some` of the block at once; returns the number of unsolved plans."""
     mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
     simd, settled, undone = simd_batch(memory), batch.settled[: len(some)], 0
     for lane in range(len(some)):
@@ -310,8 +303,7 @@ def _conclude(batch: PlanBatch, i: int) -> None:
 
 @kernel
 def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
-    """Plan for vehicles with the exact solver, see `Planner.plan`; returns the number of unsolved
-    plans.
+    """Plan with the exact solver, see `Planner.plan`; returns the number of unsolved plans.
 
     The data of unsolved vehicles do not change, except that `solved` is False in their figures.
     """

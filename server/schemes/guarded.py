@@ -120,11 +120,7 @@ class GuardedScheme(Scheme):
         return failed
 
     def _check(self, foresight: Foresight) -> None:
-        """Check that the plans can be flown.
-
-        Raises:
-            ValueError: an array has a value out of bounds.
-        """
+        """Raise ValueError unless the plans can be flown."""
         splines = foresight.splines
         if not ((foresight.ahead >= 0) & (foresight.ahead <= self._ahead_max)).all():
             raise ValueError(f"expected delay bounds from 0 to {self._ahead_max} in `ahead`")
