@@ -187,9 +187,9 @@ def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
     """
     for name, table in tables.items():
         body = table.markdown().replace("\\", r"\\")
-        document, found = place_of(name).subn(rf"\n{body}\n", document)
-        if found != 1:
-            raise ValueError(f"table {name}: got {found} places in the document, expected 1")
+        document, count = place_of(name).subn(rf"\n{body}\n", document)
+        if count != 1:
+            raise ValueError(f"table {name}: got {count} places in the document, expected 1")
     return document
 
 

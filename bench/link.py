@@ -226,9 +226,9 @@ def _demo(counts: LinkCounts) -> dict[str, Any]:
     rmse: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for seed in progress(range(1, counts.seeds + 1), "demo"):
         for kind, secure in KINDS.items():
-            flown = msgspec.structs.replace(scenario, seed=seed)
-            rows = flight.fly(flown, secure=secure).client
-            xy = summarise(flown, "demo-committed", rows).rmse_xy
+            seeded = msgspec.structs.replace(scenario, seed=seed)
+            rows = flight.fly(seeded, secure=secure).client
+            xy = summarise(seeded, "demo-committed", rows).rmse_xy
             assert xy is not None
             rmse[kind].append(xy)
     return rmse

@@ -66,7 +66,7 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
     else:
         flights = fly_batch(scenario, range(1, seeds + 1))
     took_ns = time.process_time_ns() - start_ns
-    return [sum(len(flown.client) for flown in flights) * SECOND_NS / took_ns]
+    return [sum(len(record.client) for record in flights) * SECOND_NS / took_ns]
 
 
 @cache

@@ -166,5 +166,5 @@ def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
 
 
 def words_of(texts: Sequence[bytes]) -> list[bytes]:
-    found = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
-    return sorted(token for token in found if not token.isspace())
+    tokens = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
+    return sorted(token for token in tokens if not token.isspace())

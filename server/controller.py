@@ -64,7 +64,7 @@ MISSION_KERNELS = (missions, splines)
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
-    """Modules whose kernels are not called in a scenario."""
+    """Names of the modules whose kernels are not called in a scenario."""
     own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
     every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
     names = tuple(f"{module.__name__}." for module in every.difference(own))
@@ -189,10 +189,10 @@ class Controller:
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
-        kept = self.scheme.observe(row, observation)
-        if kept:
+        is_stored = self.scheme.observe(row, observation)
+        if is_stored:
             self._takes[row] = bool(observation.takes)
-        return kept
+        return is_stored
 
     def note_heartbeats(self, rows: list[int]) -> None:
         """Set the vehicles to which a heartbeat is due at this tick unless a plan is sent."""

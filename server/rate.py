@@ -97,9 +97,9 @@ class RateControl:
         self._delays_s.clear()
 
     def _listen(self, rows: Indices) -> None:
-        heard = self._seen.vehicles["echoes"][rows]
-        new = rows[heard != self._echoes_used[rows]]
-        self._echoes_used[rows] = heard
+        echoes = self._seen.vehicles["echoes"][rows]
+        new = rows[echoes != self._echoes_used[rows]]
+        self._echoes_used[rows] = echoes
         if not len(new):
             return
         slot = (self._seen.vehicles["echoes"][new] - 1) % self._seen.echoes.shape[1]

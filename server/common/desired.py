@@ -157,20 +157,20 @@ class Desired:
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states from k + d on, valid until the next call; the n first of `ahead` are d."""
+        """Desired states from k + d on, valid until the next call; d: first n of `ahead`."""
         if self._all:
             return self._find(rows, steps, ahead)
-        found = self._find(rows, steps, self._at_once)
+        visible = self._find(rows, steps, self._at_once)
         window = self._foreseen.states
-        _foresee(found, len(rows), ahead, self._outlook, self._dt_s, self._bound_m, window)
+        _foresee(visible, len(rows), ahead, self._outlook, self._dt_s, self._bound_m, window)
         return self._foreseen
 
     def states(self, rows: Indices, steps: Indices, ahead: Indices) -> Array:
         """Copy of the desired states of `window` [m, m/s]; shape (n, axes, H + 1, 2)."""
         states, place, first = self.window(rows, steps, ahead)
         n, stages = len(rows), np.arange(self._foreseen.states.shape[2])
-        found: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
-        return found.transpose(0, 2, 1, 3)
+        selected: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
+        return selected.transpose(0, 2, 1, 3)
 
     def _find(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
         if self._point:

@@ -1,8 +1,8 @@
 """Motions in kernels: state at a step, and bounds of speed and curvature.
 
 Distances along the third axis may count less than those in the plane: coordinates are multiplied by
-`Metric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as downwash
-requires.
+`MotionMetric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as
+downwash requires.
 """
 
 from typing import NamedTuple

@@ -383,14 +383,14 @@ class MissionPlanner(SplineScheme):
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
         due = k + self._kept_steps
-        kept = states(base, k, self._kept_steps // SPACING + 1, self._dt_s)
-        p0 = kept[0][-1]
+        kept_knots = states(base, k, self._kept_steps // SPACING + 1, self._dt_s)
+        p0 = kept_knots[0][-1]
         planes, violated = None, np.zeros(self._state.possible.count + 1, dtype=np.bool_)
         rests = partial(self._state.resting_places, row)
         for waypoint in self._waypoints.candidates(vehicle, k, p0, goal, rests):
             for _ in range(ROUNDS):
                 constraints = planes.from_some(violated) if planes else None
-                solved = qp.solve(*kept, waypoint, constraints)
+                solved = qp.solve(*kept_knots, waypoint, constraints)
                 if solved is None:
                     self.counts["unsolved"] += 1
                     return None

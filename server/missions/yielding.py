@@ -65,8 +65,8 @@ def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     Plans keep a larger distance than motions must. A vehicle that is nearer already must only not
     come nearer.
     """
-    kept: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
-    return kept
+    distance: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
+    return distance
 
 
 def distance_from_way(places: Array, way: Array) -> Array:
