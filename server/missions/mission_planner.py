@@ -15,11 +15,12 @@ A new motion is sent only if at all times it keeps the distance
     D = separation_m + 2 tube_m
 
 from all motions that all other vehicles may fly, at every position that the errors of their clocks
-allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); a vehicle
-observed outside its tube is kept away from by as much more. The earlier motions were apart already.
-So whichever are accepted, and whichever packets are lost or late, vehicles are `separation_m` apart
-as long as each stays in its tube (docs/together.md has the theorem). The distance from zones is
-`tube_m`. Staying on the motion in force is always possible: it needs no packet.
+allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
+keep more distance from a vehicle observed outside its tube. The motions sent earlier were apart
+already. So whichever motions are accepted, and whichever packets are lost or late, vehicles are
+`separation_m` apart as long as each stays in its tube (docs/together.md has the theorem). The
+distance from zones is `tube_m`. Staying on the motion in force is always possible: it needs no
+packet.
 
 `mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
 `half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a
