@@ -29,6 +29,7 @@ PROMPT_COUNT = 8
 
 class SentMotion(NamedTuple):
     step: int
+    """Step of its packet; -1 for the resting position of a vehicle without a motion."""
     motion: Motion
 
 
@@ -36,7 +37,6 @@ class VehicleMotions:
     def __init__(self) -> None:
         self.in_force: SentMotion | None = None
         """Motion that the vehicle flies; None before the first observation."""
-
         self.is_foreign = False
         """Whether `in_force` stands for a motion of another server: the vehicle rests where it was
         last observed, or is still flying."""
