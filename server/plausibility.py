@@ -34,6 +34,7 @@ class Statement:
     """Numpy record: an observation without its state."""
 
     step: int
+    """Step of the observation, or -1 without one."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
