@@ -74,7 +74,7 @@ class _HandshakeRate:
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Virtual time of the rate limit, which each handshake advances by 1 / HANDSHAKES [ns]."""
+        """Virtual time of the rate limit, which a handshake advances by 1 / HANDSHAKES s [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""
