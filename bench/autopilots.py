@@ -164,8 +164,8 @@ def fly(
     if law is not None:
         return straight.fly(scenario, law, flavour, changes=changes)
     autopilot, truth = autopilot_of(scenario, flavour)
-    flown = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
-    return as_it_was(scenario, flown, parse(truth.getvalue()))
+    record = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
+    return as_it_was(scenario, record, parse(truth.getvalue()))
 
 
 def autopilot_of(
@@ -218,10 +218,10 @@ def judged(
     watched = (times_s >= CUT_S) & (times_s < WATCHED_S)
     errors = np.linalg.norm(position_error(scenario, cut.client)[watched], axis=1)
     whole_summary, cut_summary = (
-        summarise(scenario, "autopilot", flown.client, flown.server, flown.netem, secure=secure)
+        summarise(scenario, "autopilot", record.client, record.server, record.netem, secure=secure)
         if cell.contender in OURS
-        else summary_of(scenario, "autopilot", flown)
-        for flown in (whole, cut)
+        else summary_of(scenario, "autopilot", record)
+        for record in (whole, cut)
     )
     return FlownCell(
         **cell._asdict(), whole=whole_summary, cut=cut_summary, largest_m=float(errors.max())

@@ -230,8 +230,8 @@ class QpOases:
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002
         inputs, solved = np.empty_like(gradient), True
-        for axis, (solver, given) in enumerate(self._axes):
-            inputs[0, axis] = np.asarray(solver(g=gradient[0, axis], **given)["x"])[:, 0]
+        for axis, (solver, arguments) in enumerate(self._axes):
+            inputs[0, axis] = np.asarray(solver(g=gradient[0, axis], **arguments)["x"])[:, 0]
             solved = solved and solver.stats()["success"]
         return inputs, np.array([solved])
 
@@ -311,7 +311,7 @@ class Ipopt:
 class EmptySolver:
     """Solver that does nothing, to measure the cost of the measurement itself."""
 
-    def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - like any other
+    def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - as of any `Solver`
         self._solved = np.array([True])
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002

@@ -100,9 +100,9 @@ def beginning(flavour: FlavourName, seed: int) -> tuple[float, float]:
     """Times at which the motors are switched on and the first step begins, without a fault [s]."""
     scenario = msgspec.structs.replace(scenario_of(flavour, seed), duration=1.0, settle=0.0)
     autopilot, _ = autopilots.autopilot_of(scenario, flavour)
-    flown = flight.fly(scenario, beside={"autopilot": autopilot})
+    record = flight.fly(scenario, beside={"autopilot": autopilot})
     assert autopilot.flight.armed_ns is not None
-    return autopilot.flight.armed_ns / SECOND_NS, autopilots.began_ns(flown) / SECOND_NS
+    return autopilot.flight.armed_ns / SECOND_NS, autopilots.began_ns(record) / SECOND_NS
 
 
 def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
@@ -141,7 +141,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
             down_s = min(down_s, now_s - fault_s)
         return now_s >= fault_s + WATCHED_S
 
-    flown = flight.fly(
+    record = flight.fly(
         scenario, beside={"autopilot": autopilot}, changes=changes, actions=actions, stopped=watch
     )
 
@@ -152,7 +152,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
     modes = since_fault(
         [
             (event.after.upper(), time_ns / SECOND_NS)
-            for time_ns, _, event in flown.events
+            for time_ns, _, event in record.events
             if isinstance(event, ModeChanged) and event.before != event.after
         ]
     )
@@ -194,12 +194,7 @@ def _off_path(scenario: Scenario, positions: Array) -> float:
 
 
 def _ending(aboard: PilotedVehicle, speed: float, modes: Changes) -> Ending:
-    """End state of the vehicle, in words.
-
-    Args:
-        speed: horizontal speed at the end [m/s].
-        modes: modes of the client after the fault.
-    """
+    """End state of the vehicle, in words; `modes` are those of the client after the fault."""
     if not aboard.armed:
         return "has landed"
     if aboard.mode is FlightMode.PILOT:

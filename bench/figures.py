@@ -216,11 +216,6 @@ class FiguresOptions:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Make figures as the command line says, and print how each compares.
-
-    Raises:
-        CommandError: a number has left its tolerance, or its text is not in its page.
-    """
     options = tyro.cli(FiguresOptions, args=argv, description=__doc__)
     figures = {
         name: figure
@@ -229,11 +224,11 @@ def main(argv: Sequence[str]) -> None:
     }
     if unknown := set(options.only) - figures.keys():
         raise command.CommandError(f"--only: got {', '.join(sorted(unknown))}, no such figure", 2)
-    kept, rows, bad = options.out / code(), list[list[str]](), 0
+    cache, rows, bad = options.out / code(), list[list[str]](), 0
     for name, figure in figures.items():
         page = ROOT / figure.page
         try:
-            verdict = make(figure, page, kept, Flags(options.jobs))
+            verdict = make(figure, page, cache, Flags(options.jobs))
         except (ValueError, subprocess.CalledProcessError) as error:
             rows.append([name, figure.page, "", "", "", str(error)])
             bad += 1
@@ -255,11 +250,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def make(figure: Figure, page: Path, folder: Path, flags: Flags) -> Verdict:
-    """Make a figure, and compare it with its page.
-
-    Args:
-        page: file of the page, which is read after the flights.
-        folder: folder for finished flights; figures of the same flights share them.
+    """Make a figure, and compare it with its page; `folder` is for the finished flights.
 
     Raises:
         CommandError: interrupted.
@@ -267,15 +258,15 @@ def make(figure: Figure, page: Path, folder: Path, flags: Flags) -> Verdict:
     """
     if figure.module:
         module = import_module(f"bench.{figure.module}")
-        made = module.document_tables(folder / figure.module, flags)
-        return compare_tables(figure, page.read_text(), made)
+        new_tables = module.document_tables(folder / figure.module, flags)
+        return compare_tables(figure, page.read_text(), new_tables)
     tasks = cells(figure)
     settings = {"tasks": [[*key, *each.seeds, each.command] for key, each in tasks.items()]}
-    kept = folder / hashlib.sha256(msgspec.json.encode(settings)).hexdigest()[:12]
+    cache = folder / hashlib.sha256(msgspec.json.encode(settings)).hexdigest()[:12]
     flights = sum(len(each.seeds) for each in tasks.values())
     with crew(flags, "flying", flights, "flights") as flyers:
         kind = list[dict[str, Any]]
-        results = flyers.study(fly, tasks, kind, settings, kept, size=lambda each: len(each.seeds))
+        results = flyers.study(fly, tasks, kind, settings, cache, size=lambda each: len(each.seeds))
     return compare(figure, page.read_text(), results)
 
 

@@ -134,11 +134,7 @@ def tap(pipe: Connection, port: int) -> None:
 
 
 def forgeries(good: bytes) -> list[bytes]:
-    """Forged packets: random bytes under a valid packet's header, and random bytes alone.
-
-    Args:
-        good: a packet of a channel that is in use.
-    """
+    """Forged packets: random bytes under the header of the packet `good`, and bare random bytes."""
     rng = np.random.default_rng(1)
     packets = []
     for number in range(POOL):
@@ -172,8 +168,8 @@ def flood(
         used_ns = used_ns or time.process_time_ns()
         while sent < due:
             first = sent % len(packets)
-            some = packets[first : first + min(due - sent, BATCH_MAX)]
-            sent += batch.send(sock, some, [peer] * len(some))
+            chunk = packets[first : first + min(due - sent, BATCH_MAX)]
+            sent += batch.send(sock, chunk, [peer] * len(chunk))
     return sent, time.process_time_ns() - used_ns
 
 
@@ -248,10 +244,12 @@ class _State:
 def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
     duration_s = counts.lead_s + counts.seconds + AFTER_S
     # A report at every step: a missing report was lost.
-    flown = derive("demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"})
+    scenario = derive(
+        "demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"}
+    )
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skytether-")))
-        lab = Lab(stack, folder, flown, range(1, NEWCOMER + 1))
+        lab = Lab(stack, folder, scenario, range(1, NEWCOMER + 1))
         server = lab.server()
         port = server.address[1]
         way = start(stack, tap, port)
@@ -283,12 +281,12 @@ def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
     strange = sum(not is_admitted(packet) for packet in packets)
     kept_out = min(gone, sent * strange // POOL)
     lost = good - end["observations"]
-    times_s = [each["step"] * flown.control.dt for each in rows]
+    times_s = [each["step"] * scenario.control.dt for each in rows]
     meanwhile = [
         each[(t >= counts.lead_s) & (t < counts.lead_s + counts.seconds)]
         for each, t in zip(rows, times_s, strict=True)
     ]
-    error = position_error(flown, meanwhile[0])
+    error = position_error(scenario, meanwhile[0])
     return Flood(
         kind=kind,
         sent=sent / counts.seconds,

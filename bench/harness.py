@@ -127,12 +127,7 @@ def progress(steps: Sequence[Step], title: str) -> Iterable[Step]:
 
 
 def figures_us(durations: Durations | Sequence[float], per: float = 1.0) -> dict[str, float]:
-    """Median and p99 of durations [µs].
-
-    Args:
-        durations: durations [ns].
-        per: number of packets or vehicles by which they are divided.
-    """
+    """Median and p99 [µs] of durations [ns], divided by `per` packets or vehicles."""
     p50, p99 = np.quantile(durations, [0.5, 0.99]) / 1000.0 / per
     return {"p50_us": float(p50), "p99_us": float(p99)}
 
@@ -192,9 +187,9 @@ def refresh(document: str, tables: Mapping[str, TextTable]) -> str:
     """
     for name, table in tables.items():
         body = table.markdown().replace("\\", r"\\")
-        document, found = place_of(name).subn(rf"\n{body}\n", document)
-        if found != 1:
-            raise ValueError(f"table {name}: got {found} places in the document, expected 1")
+        document, count = place_of(name).subn(rf"\n{body}\n", document)
+        if count != 1:
+            raise ValueError(f"table {name}: got {count} places in the document, expected 1")
     return document
 
 

@@ -58,12 +58,7 @@ QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=
 
 
 class Ends:
-    """Both ends of one vehicle's link.
-
-    Args:
-        hello: first message of the vehicle.
-        welcome: the server's answer.
-    """
+    """Both ends of one vehicle's link, with its HELLO and the server's WELCOME."""
 
     def __init__(
         self, gate: server.SecureGate, keyring: Keyring, vehicle: int, hello: bytes, welcome: bytes
@@ -231,9 +226,9 @@ def _demo(counts: LinkCounts) -> dict[str, Any]:
     rmse: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for seed in progress(range(1, counts.seeds + 1), "demo"):
         for kind, secure in KINDS.items():
-            flown = msgspec.structs.replace(scenario, seed=seed)
-            rows = flight.fly(flown, secure=secure).client
-            xy = summarise(flown, "demo-committed", rows).rmse_xy
+            seeded = msgspec.structs.replace(scenario, seed=seed)
+            rows = flight.fly(seeded, secure=secure).client
+            xy = summarise(seeded, "demo-committed", rows).rmse_xy
             assert xy is not None
             rmse[kind].append(xy)
     return rmse

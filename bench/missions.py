@@ -212,8 +212,8 @@ def fly_mission(
         last = int(away.max(initial=-1)) + 1
         late += last == len(rows)
         arrived_s.append(last * dt_s - (goal_at_s or min(began_s) - began))
-        flown = rows["state"][int(np.argmax(rows["mode"] == Mode.TRACK)) :, :, 0]
-        clear_m.append(float(scenario.zones.clearance(flown).min(initial=np.inf)))
+        positions = rows["state"][int(np.argmax(rows["mode"] == Mode.TRACK)) :, :, 0]
+        clear_m.append(float(scenario.zones.clearance(positions).min(initial=np.inf)))
     packets = sum(record.figures["netem"][way]["packets"] for way in ("uplink", "downlink"))
     counts = Counter[str]()
     for life in lives:
@@ -252,11 +252,7 @@ def timed() -> Iterator[list[float]]:
 def fly_with_deaths(
     scenario: Scenario, vehicles: int, deaths: Sequence[tuple[float, float]]
 ) -> tuple[Record, list[Server]]:
-    """Flight in which the server restarts without memory, and all runs of the server.
-
-    Args:
-        deaths: times at which the server stops and restarts [s], in order.
-    """
+    """Flight in which the server stops and restarts at `deaths` [s]; and all runs of the server."""
     lives: list[Server] = []
 
     def live(world: World | None = None) -> None:
@@ -284,13 +280,7 @@ def deaths(seed: int, duration: float) -> list[tuple[float, float]]:
 def mission_scenario(
     name: str, seed: int, duration: float, goals: Array, folder: Path
 ) -> dict[str, Any]:
-    """Table of a scenario with other goals.
-
-    Args:
-        name: name of the scenario that is changed.
-        goals: starts and goals [m]; shape (2, vehicles, axes).
-        folder: folder for the file of goals.
-    """
+    """Table of a scenario with other starts and goals [m]; shape (2, vehicles, axes)."""
     rows = [
         ",".join([str(number), str(at_s), *(f"{each:.4f}" for each in place)])
         for number, both in enumerate(goals.swapaxes(0, 1), start=1)
@@ -321,8 +311,8 @@ def random_mission(options: RandomOptions, seed: int, folder: Path) -> Scenario:
     half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
     shapes = list(_zones(rng, obstacles, half_m))
     apart_m = reading.load("swap").clearances.apart_m
-    kept = zone_texts.parse(" & ".join(shapes), 2)
-    places = _places(rng, vehicles, half_m, kept, apart_m)
+    forbidden = zone_texts.parse(" & ".join(shapes), 2)
+    places = _places(rng, vehicles, half_m, forbidden, apart_m)
     if options.space:
         heights = stream(seed, "heights")
         shapes = [_between(heights, each) for each in shapes]
@@ -364,17 +354,17 @@ def _between(heights: np.random.Generator, shape: str) -> str:
 
 
 def _places(
-    rng: np.random.Generator, vehicles: int, half_m: float, kept: Zones, apart_m: float
+    rng: np.random.Generator, vehicles: int, half_m: float, forbidden: Zones, apart_m: float
 ) -> Array:
     """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
     room_m = 0.75 * apart_m  # from zones, so that others can pass a vehicle at its goal
-    routes, chosen = Routes(kept, room_m), list[Array]()
+    routes, chosen = Routes(forbidden, room_m), list[Array]()
     while len(chosen) < 2:
         places = np.zeros((0, 2))
         for _ in range(20_000):
             place = rng.uniform(-half_m, half_m, (1, 2))
             near = np.linalg.norm(places - place, axis=1) < 1.6 * apart_m
-            if near.any() or kept.clearance(place).min() < room_m + 0.05:
+            if near.any() or forbidden.clearance(place).min() < room_m + 0.05:
                 continue
             if chosen and not routes.reaches(chosen[0][len(places)], place[0]):
                 continue
@@ -423,11 +413,11 @@ def _fly_random(options: RandomOptions, seed: int) -> MissionFlight:
 def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]]:
     """Fly all missions; returns the table, and the flights with a fault."""
     seeds = range(options.first, options.first + options.flights)
-    flown = options.fly(partial(fly_random, options), seeds)
+    flights = options.fly(partial(fly_random, options), seeds)
     asked_m = reading.load("swap").mission.separation_m
     rows = []
     for low, high in ((2, 8), (9, 16), (17, 24), (25, 32)):
-        if those := [each for each in flown if low <= each.vehicles <= high]:
+        if those := [each for each in flights if low <= each.vehicles <= high]:
             figures = (
                 len(those),
                 f"{min(each.least_m for each in those):.3f}",
@@ -454,7 +444,7 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
     ]
     faults = [
         each
-        for each in flown
+        for each in flights
         if each.least_m < asked_m or each.was_in_zone or (each.late and not options.harsh)
     ]
     return TextTable(headings, rows), faults
@@ -492,14 +482,14 @@ def swap_table(options: SwapOptions) -> TextTable:
     asked = reading.load(options.shape).mission.separation_m
     rows = []
     for i, network in enumerate(SWAP_NETWORKS):
-        flown = done[i :: len(SWAP_NETWORKS)]
+        flights = done[i :: len(SWAP_NETWORKS)]
         figures = (
-            f"{min(each.least_m for each in flown):.3f}",
-            f"{sum(each.least_m < asked for each in flown)} of {len(flown)}",
-            sum(not each.late for each in flown),
-            arrivals(flown),
-            f"{np.mean([each.packets for each in flown]):.2f}",
-            sum(each.left for each in flown),
+            f"{min(each.least_m for each in flights):.3f}",
+            f"{sum(each.least_m < asked for each in flights)} of {len(flights)}",
+            sum(not each.late for each in flights),
+            arrivals(flights),
+            f"{np.mean([each.packets for each in flights]):.2f}",
+            sum(each.left for each in flights),
         )
         rows.append([network, *map(str, figures)])
     headings = [
@@ -599,17 +589,17 @@ def published_table(options: PublishedOptions) -> TextTable:
     done = options.fly(partial(fly_published, options), cells)
     rows = []
     for i, (name, network) in enumerate(kinds):
-        flown = done[i :: len(kinds)]
-        arrived = [each.arrived_s for each in flown if each.arrived_s is not None]
-        crashes = sum(each.least_m < TASKS[name].separation_m for each in flown)
+        flights = done[i :: len(kinds)]
+        arrived = [each.arrived_s for each in flights if each.arrived_s is not None]
+        crashes = sum(each.least_m < TASKS[name].separation_m for each in flights)
         rows.append(
             [
                 f"{name}, {network}",
-                f"{min(each.least_m for each in flown):.3f}",
-                f"{crashes} of {len(flown)}",
+                f"{min(each.least_m for each in flights):.3f}",
+                f"{crashes} of {len(flights)}",
                 f"{sum(each <= TOLD_S for each in arrived)}, {len(arrived)}",
-                arrivals(flown),
-                f"{np.mean([each.plan_ms for each in flown]):.2f}",
+                arrivals(flights),
+                f"{np.mean([each.plan_ms for each in flights]):.2f}",
             ]
         )
     headings = [

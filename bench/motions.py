@@ -173,9 +173,9 @@ def watched(plan_us: list[float], problems: list[list[MotionProblem]] | None) ->
 
     def last_of(self: MissionPlanner, *given: Any) -> Any:
         before = len(of_tick)
-        found = toward(self, *given)
+        motion = toward(self, *given)
         del of_tick[before:-1]
-        return found
+        return motion
 
     own: Any = MissionPlanner
     if problems is None:
@@ -195,15 +195,15 @@ def measure(counts: MotionsCounts) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         kinds = list(itertools.product(counts.fleets, counts.shares))
         for vehicles, share in progress(kinds, "fleets"):
-            flown = shared_space(vehicles, share, counts.duration, Path(folder))
+            scenario = shared_space(vehicles, share, counts.duration, Path(folder))
             spent: list[float] = []
             problems: list[list[MotionProblem]] = []
             with watched([], None):  # loads machine code
-                flight.fly(msgspec.structs.replace(flown, duration=2 * LEG_S), vehicles=vehicles)
+                flight.fly(msgspec.structs.replace(scenario, duration=2 * LEG_S), vehicles=vehicles)
             with watched(spent, None):
-                flight.fly(flown, vehicles=vehicles)
+                flight.fly(scenario, vehicles=vehicles)
             with watched([], problems):  # the same flight again, bit for bit
-                flight.fly(flown, vehicles=vehicles)
+                flight.fly(scenario, vehicles=vehicles)
             planned = [tick for tick, each in enumerate(problems) if each]
             beside = _beside_osqp(spent, problems, planned)
             fleets.append({"vehicles": vehicles, "near": share, **beside})

@@ -138,10 +138,7 @@ def solving(make: Callable[[Problem], Solver]) -> Iterator[None]:
 
 @contextmanager
 def listening() -> Iterator[list[ProblemRecorder]]:
-    """Within the block, new planners solve exactly, and their problems are recorded.
-
-    Yields the recorder of first steps and that of later steps.
-    """
+    """Within the block, new planners solve exactly; yields recorders of first and later steps."""
     listeners: list[ProblemRecorder] = []
 
     def make(problem: Problem) -> Solver:

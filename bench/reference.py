@@ -26,12 +26,7 @@ class NoReference(Exception):
 
 
 class Reference:
-    """Exact inputs of box-constrained QPs of one Hessian.
-
-    Args:
-        hessian: shape (H, H).
-        bound: bound of every input [m/s].
-    """
+    """Exact inputs of box-constrained QPs with one Hessian (H, H) and bound [m/s]."""
 
     def __init__(self, hessian: Array, bound: float) -> None:
         self._hessian, self._bound = hessian, bound

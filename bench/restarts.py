@@ -222,11 +222,11 @@ class Processes:
     def end(self) -> list[ProcessLife]:
         """End the client; returns all runs of the vehicle that flew, in order."""
         self._children["client"].stop()
-        flown = scenario()
+        flown_scenario = scenario()
         lives = []
         for part, child in self._parts:
             if flying := child.all(Flying):
-                lives.append(ProcessLife.of(record.read(part), flying[0].time_ns, flown))
+                lives.append(ProcessLife.of(record.read(part), flying[0].time_ns, flown_scenario))
         return lives
 
 
@@ -316,9 +316,9 @@ def measure(counts: RestartsCounts) -> dict[str, Any]:
             flight.wait_for_flight()
         lateness.sleep(counts.flight_s)
         lives = flight.end()
-    flown = scenario()
+    flown_scenario = scenario()
     return {
-        "verdicts": [asdict(judge(outage, lives, flown)) for outage in outages],
+        "verdicts": [asdict(judge(outage, lives, flown_scenario)) for outage in outages],
         "wake": lateness.figures(),
     }
 

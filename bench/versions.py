@@ -225,8 +225,8 @@ def _compete(
             turns[side].append(_ask(workers[side], *contest.turn))
     values = {side: np.array(turns[side][1:]) / contest.per_unit for side in SIDES}
     figures: dict[str, Any] = {
-        side: {"p50": float(np.median(found)), "p99": float(np.quantile(found, 0.99))}
-        for side, found in values.items()
+        side: {"p50": float(np.median(measured)), "p99": float(np.quantile(measured, 0.99))}
+        for side, measured in values.items()
     }
     medians = (np.median(values[side], axis=1) for side in ("after", "before"))
     figures["ratio"] = {

@@ -58,14 +58,7 @@ def planning(name: str, vehicles: int, count: int) -> list[float]:
 
 
 def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
-    """Vehicle-steps per second of CPU time, of one flight in virtual time, or of a batch of seeds.
-
-    Args:
-        name: name of the scenario.
-        seconds: length of a flight [s].
-        vehicles: number of vehicles in each flight; 1 in a batch.
-        seeds: number of flights; a single one is flown with the scenario's own seed.
-    """
+    """Vehicle-steps per second of CPU time, of one flight in virtual time, or of a batch."""
     scenario = derive(name, duration=seconds, settle=0.0)
     start_ns = time.process_time_ns()
     if seeds == 1:
@@ -73,7 +66,7 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
     else:
         flights = fly_batch(scenario, range(1, seeds + 1))
     took_ns = time.process_time_ns() - start_ns
-    return [sum(len(flown.client) for flown in flights) * SECOND_NS / took_ns]
+    return [sum(len(record.client) for record in flights) * SECOND_NS / took_ns]
 
 
 @cache

@@ -32,12 +32,7 @@ def memory_mb() -> float:
 
 
 def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> str:
-    """Feed random inputs to a target; returns the result, as a sentence.
-
-    Args:
-        count: largest number of inputs.
-        seconds: longest time [s].
-    """
+    """Feed at most `count` random inputs to a target; returns the result, as a sentence."""
     target, rng = TARGETS[name](folder), Random(seed)
     begin_s, done, before_mb = time.monotonic(), 0, 0.0
     while done < count and time.monotonic() - begin_s < seconds:
@@ -59,12 +54,7 @@ def rate(name: str, done: int, took_s: float) -> str:
 
 
 def guided(name: str, folder: Path, seconds: float) -> str:
-    """Let atheris search from a target's seeds, in another process; returns the result, as a
-    sentence.
-
-    Raises:
-        SystemExit: with 1, if a fault was found.
-    """
+    """Let atheris search in another process; returns the result, or exits with 1 at a fault."""
     done = multiprocessing.RawValue(c_longlong, 0)
     child = multiprocessing.get_context("fork").Process(
         target=_search, args=(name, folder, seconds, done)

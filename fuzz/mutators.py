@@ -145,11 +145,7 @@ def bytes_changed(rng: Random, payload: bytes, most: int = 2000) -> bytes:
 
 
 def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
-    """Text with a few tokens replaced, removed, repeated or swapped, or with changed bytes.
-
-    Args:
-        words: replacements for tokens, besides WORDS.
-    """
+    """Text with a few tokens changed, some to `words` or WORDS, or with changed bytes."""
     if rng.random() < 0.15:
         return bytes_changed(rng, text, len(text) + 1000)
     tokens = (TOKENS if rng.random() < 0.5 else SMALL_TOKENS).findall(text)
@@ -170,5 +166,5 @@ def text_changed(rng: Random, text: bytes, words: Sequence[bytes]) -> bytes:
 
 
 def words_of(texts: Sequence[bytes]) -> list[bytes]:
-    found = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
-    return sorted(token for token in found if not token.isspace())
+    tokens = {token for text in texts for token in TOKENS.findall(text) if len(token) > 1}
+    return sorted(token for token in tokens if not token.isspace())

@@ -37,7 +37,7 @@ from skytether.view.recording import BEGUN, FEED
 from skytether.view.report import page
 
 REPORTED = 50
-"""One readable recording in this number is also drawn, because drawing is slow."""
+"""One in REPORTED readable recordings is also drawn, because drawing is slow."""
 MEMORY_MAX_MB = 300
 """Memory that reading may take above the process's earlier peak [MB]."""
 ODD: tuple[Any, ...] = (
@@ -82,11 +82,11 @@ COLUMNS = (
 def records(content: bytes) -> list[Any]:
     """Metadata, attachments, schemas, channels and messages of a recording."""
     kinds = Metadata | Attachment | Schema | Channel | Message
-    found: list[Any] = []
+    items: list[Any] = []
     for each in StreamReader(io.BytesIO(content)).records:
-        if isinstance(each, kinds) and not (isinstance(each, Schema | Channel) and each in found):
-            found.append(each)
-    return found
+        if isinstance(each, kinds) and not (isinstance(each, Schema | Channel) and each in items):
+            items.append(each)
+    return items
 
 
 def written(found: list[Any]) -> bytes:
@@ -301,11 +301,7 @@ OUTSIDE = (bomb, misled, scattered)
 
 
 def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
-    """Mutated recording, and the name of the mutation.
-
-    Args:
-        known: records of the recording.
-    """
+    """Mutated recording, and the name of the mutation; `known` are the records in `content`."""
     if rng.random() < 0.6:
         how, found = rng.choice(INSIDE), list(known)
         how(rng, found)
@@ -340,12 +336,12 @@ class RecordingFile(Target):
     def __call__(self, payload: bytes) -> None:
         self._path.write_bytes(payload)
         with suppress(RecordingError):
-            known = read(self._path)
-            for columns in export.tables(known).values():
+            recording = read(self._path)
+            for columns in export.tables(recording).values():
                 export.csv(columns)
-            join([known], io.BytesIO())
+            join([recording], io.BytesIO())
             if crc32(payload) % REPORTED == 0:
-                page(known, [])
+                page(recording, [])
         assert peak_mb() < self._before_mb + MEMORY_MAX_MB
 
 

@@ -31,11 +31,7 @@ class Target:
     """Size of the largest input [B]."""
 
     def __call__(self, payload: bytes) -> None:
-        """Check an input.
-
-        Raises:
-            Exception: a guarantee is broken.
-        """
+        """Check an input; raises an exception if a guarantee is broken."""
         raise NotImplementedError
 
     def seeds(self) -> Sequence[bytes]:

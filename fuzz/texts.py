@@ -54,12 +54,7 @@ POLICIES = [name.encode() for name in (*TRIGGERS, *REFERENCES)] + b"( ) & | ! ,"
 
 
 class Text(Target):
-    """Target that takes text.
-
-    Args:
-        known: texts that are mutated.
-        words: replacements for tokens, besides the words of these texts.
-    """
+    """Target that takes text: mutations of `known`, with tokens of `known` and `words`."""
 
     largest = 8192
 

@@ -76,7 +76,7 @@ def emulate(argv: Sequence[str]) -> None:
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options with the network that --to-client and --to-server describe.
+    """Options with the network of --to-client and --to-server.
 
     Raises:
         ConfigError: the network is invalid.
@@ -89,11 +89,7 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
 
 
 def _check_server(server: Address, bind: Address) -> None:
-    """Refuse netem itself as the server, since packets would circulate.
-
-    Raises:
-        CommandError: the server's address leads back to netem.
-    """
+    """Refuse an address of netem itself as the server, since packets would circulate."""
     with suppress(OSError):  # an unknown host is reported when it is used
         if leads_back(server, bind):
             at = address_text(*server)
@@ -102,8 +98,7 @@ def _check_server(server: Address, bind: Address) -> None:
 
 
 def _flows(requested: int | None) -> int:
-    """Largest number of clients at once; a warning is printed if the system allows fewer than
-    FLOWS_MAX.
+    """Largest number of clients at once; prints a warning if the system allows few.
 
     Raises:
         CommandError: the system does not allow the requested number.

@@ -46,11 +46,7 @@ class Codel:
     dropping: bool = False
 
     def drops(self, now_ns: int, *, is_fine: bool) -> bool:
-        """Whether to drop the packet at the front.
-
-        Args:
-            is_fine: whether it waited briefly, or the queue behind it is nearly empty.
-        """
+        """Whether to drop the packet at the front; `is_fine`: short wait, or queue nearly empty."""
         late = False
         if is_fine:
             self.above_ns = 0
@@ -107,11 +103,7 @@ class Bottleneck(Generic[T]):
         )
 
     def accept(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
-        """Add a packet; call `release` for the packets that passed before it first.
-
-        Args:
-            size: bytes including headers [B].
-        """
+        """Add a packet of `size` bytes, headers included; call `release` first."""
         packet = Waiting(item, size, flow, now_ns)
         self._largest = max(self._largest, size)
         if self._served is None:

@@ -155,13 +155,7 @@ class Queue:
 
 
 class Link:
-    """Delays, loses and reorders packets of one direction.
-
-    Args:
-        direction: UPLINK or DOWNLINK, for the record.
-        mtu: longest UDP payload that passes [B].
-        recorder: receives one row per packet.
-    """
+    """Delays, loses and reorders packets of one direction; drops UDP payloads above `mtu` [B]."""
 
     def __init__(
         self, direction: int, mtu: int, recorder: Recorder | None, path: Path | None = None

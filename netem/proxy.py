@@ -38,13 +38,7 @@ LAPS_MAX = 16
 
 
 class Proxy(Endpoint):
-    """Delays, reorders and loses datagrams between clients and one server.
-
-    Args:
-        scenario: uses `network` and `seed`.
-        flows: largest number of clients at once, a socket each.
-        recorder: receives one row per packet.
-    """
+    """Delays, reorders and loses datagrams between one server and at most `flows` clients."""
 
     changeable = keys_of(InFlight.IMPAIRMENT)
     patience_ns = MILLISECOND_NS // 4
@@ -177,8 +171,7 @@ class Proxy(Endpoint):
         return flow
 
     def _laps(self, datagram: Datagram) -> int:
-        """Number of flows, each from another address, through which a packet has passed one after
-        another.
+        """Number of new addresses, one after another, from which a packet has come.
 
         If no server answers, such a packet is one that netem itself has sent.
         """

@@ -115,12 +115,7 @@ class SharedBudget:
         return chosen
 
     def charge(self, row: int, size: int, *, is_plan: bool) -> None:
-        """Subtract a packet from the budget.
-
-        Args:
-            size: bytes of its payloads with one header each [B].
-            is_plan: True for a plan granted by `choose`, False for a heartbeat.
-        """
+        """Subtract a packet of `size` bytes, headers included; `is_plan`: not a heartbeat."""
         self._spent += size
         if is_plan:
             self._bytes[row] = size

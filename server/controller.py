@@ -64,7 +64,7 @@ MISSION_KERNELS = (missions, splines)
 
 
 def other_schemes(scenario: Scenario) -> set[str]:
-    """Modules whose kernels are not called in a scenario."""
+    """Names of the modules whose kernels are not called in a scenario."""
     own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
     every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
     names = tuple(f"{module.__name__}." for module in every.difference(own))
@@ -87,12 +87,7 @@ class Decisions(NamedTuple):
 
 
 class Controller:
-    """The paper's algorithms on the server, for up to `capacity` vehicles.
-
-    Args:
-        stopwatch: measures the parts of a step; the core has no clock of its own.
-        references: see `Desired`.
-    """
+    """The paper's algorithms on the server, for up to `capacity` vehicles."""
 
     def __init__(
         self,
@@ -194,10 +189,10 @@ class Controller:
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
-        kept = self.scheme.observe(row, observation)
-        if kept:
+        is_stored = self.scheme.observe(row, observation)
+        if is_stored:
             self._takes[row] = bool(observation.takes)
-        return kept
+        return is_stored
 
     def note_heartbeats(self, rows: list[int]) -> None:
         """Set the vehicles to which a heartbeat is due at this tick unless a plan is sent."""
@@ -224,10 +219,7 @@ class Controller:
         return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
-        """Plan for vehicles, and decide which of them are sent their horizon.
-
-        Args:
-            rows: vehicles returned by `able`, no more than BLOCK; shape (n,).
+        """Plan for at most BLOCK vehicles from `able`, and decide which are sent their horizon.
 
         Source: algorithms 1, 2.
         """

@@ -34,6 +34,7 @@ class Statement:
     """Numpy record: an observation without its state."""
 
     step: int
+    """Step of the observation, or -1 without one."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
@@ -86,11 +87,7 @@ class Plausibility:
         self._observed.numbers["step"][:, row] = -1
 
     def judge(self, row: int, observation: Observation, F: int, G: int) -> int:
-        """Check an observation; returns a `Belief`.
-
-        Args:
-            F, G: of the observation and its echo, see `server.common.clock` [ns].
-        """
+        """Check an observation with its F and G [ns], see `clock`; returns a `Belief`."""
         message = observation
         return _judge(
             self._observed,
@@ -135,13 +132,7 @@ def _against(
 
 @part
 def _jumps(observed: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
-    """Whether no vehicle can get from the state of another observation to the new state in time.
-
-    Args:
-        which: index of the other observation.
-        time: time between the two [s].
-        noise_m: change of position that noise may cause [m].
-    """
+    """Whether no vehicle can get from another observed state to the new one in a time [s]."""
     jumps = False
     for axis in range(observed.states.shape[2]):
         p, v = observed.states[which, row, axis, 0], observed.states[which, row, axis, 1]

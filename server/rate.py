@@ -82,12 +82,7 @@ class RateControl:
         """Queueing delay of the newest epoch [s]."""
 
     def update(self, rows: Indices, spent_bytes: float, now_ns: int) -> None:
-        """Process the echoes and bytes since the last update.
-
-        Args:
-            rows: vehicles in session; shape (n,).
-            spent_bytes: bytes sent since the last update [B].
-        """
+        """Process the echoes and the bytes sent since the last update."""
         self._listen(rows)
         self._spent += spent_bytes
         if self._began_ns is None:
@@ -102,9 +97,9 @@ class RateControl:
         self._delays_s.clear()
 
     def _listen(self, rows: Indices) -> None:
-        heard = self._seen.vehicles["echoes"][rows]
-        new = rows[heard != self._echoes_used[rows]]
-        self._echoes_used[rows] = heard
+        echoes = self._seen.vehicles["echoes"][rows]
+        new = rows[echoes != self._echoes_used[rows]]
+        self._echoes_used[rows] = echoes
         if not len(new):
             return
         slot = (self._seen.vehicles["echoes"][new] - 1) % self._seen.echoes.shape[1]

@@ -65,14 +65,7 @@ CONTRADICTED = {
 
 
 class Reception:
-    """Receives messages of vehicles.
-
-    Args:
-        boot_id: number unique to this run of the server.
-        grid: ticks, started by an observation.
-        out: list to which answers are appended.
-        events: list to which events for the operator are appended.
-    """
+    """Receives messages of vehicles; appends answers to `out`, and events to `events`."""
 
     def __init__(
         self,
@@ -223,7 +216,7 @@ class Reception:
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
         session.hearing.hear(observation.number, observation.step)
         self.observations += 1
-        found = self._clock.observe(
+        contradiction = self._clock.observe(
             row,
             forward_ns,
             backward_ns,
@@ -231,7 +224,7 @@ class Reception:
             now_ns=now_ns,
             is_newest=observation.step > self._controller.observed_step[row],
         )
-        self._report_clock(session.vehicle, found)
+        self._report_clock(session.vehicle, contradiction)
         if not self._controller.observe(row, observation):
             session.stale += 1
             return
@@ -256,20 +249,16 @@ class Reception:
         epoch_ns = stamped_ns(message.epoch_us, near_ns=ahead_ns - offset_ns)
         age_ns = max(now_ns + offset_ns + bound_ns - message.step * self._terms.dt_ns, 0)
         error_ns += message.error_us * MICROSECOND_NS + age_ns // DRIFT + MICROSECOND_NS
-        found = self._clock.tell(session.row, ahead_ns - epoch_ns, error_ns, now_ns=now_ns)
-        self._report_clock(session.vehicle, found)
+        contradiction = self._clock.tell(session.row, ahead_ns - epoch_ns, error_ns, now_ns=now_ns)
+        self._report_clock(session.vehicle, contradiction)
 
-    def _report_clock(self, vehicle: int, found: Contradiction) -> None:
-        if found is not Contradiction.NOTHING:
-            what = CONTRADICTED[found]
+    def _report_clock(self, vehicle: int, contradiction: Contradiction) -> None:
+        if contradiction is not Contradiction.NOTHING:
+            what = CONTRADICTED[contradiction]
             self._events.append(ClockContradicted(vehicle=vehicle, what=what))
 
     def _anew(self, row: int, life: tuple[int, int] | None) -> None:
-        """Forget everything about a vehicle except its session.
-
-        Args:
-            life: its number and boot id, if its clock may be the same as before.
-        """
+        """Forget everything about a vehicle except its session; `life`: see `ClockMap.forget`."""
         self._clock.forget(row, life)
         self._controller.forget(row)
         self._sessions.idle[row] = Idle.PLANS

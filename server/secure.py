@@ -74,7 +74,7 @@ class _HandshakeRate:
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Virtual time of the rate limit, which each handshake advances by 1 / HANDSHAKES [ns]."""
+        """Virtual time of the rate limit, which a handshake advances by 1 / HANDSHAKES s [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""
@@ -166,12 +166,7 @@ class _Answer:
 
 
 class SecureGate:
-    """Gate that only vehicles with a key pass.
-
-    Args:
-        keyring: keys of all admissible vehicles.
-        entropy: returns this many unpredictable bytes.
-    """
+    """Gate that only vehicles of the keyring pass; `entropy` returns unpredictable bytes."""
 
     secure = True
 

@@ -235,11 +235,7 @@ class Sessions:
         return session
 
     def end(self, vehicle: int, number: int) -> None:
-        """End the live session of a vehicle.
-
-        Raises:
-            ProtocolError: it has no session with this number.
-        """
+        """End the live session; raises ProtocolError if the vehicle has none with this number."""
         session = self._live.get(vehicle)
         if session is None or session.number != number:
             raise ProtocolError(Drop.UNKNOWN_SESSION)

@@ -111,12 +111,7 @@ class Ticker:
         """Duration of each tick, while the stopwatch runs."""
 
     def tick(self, tick_ns: int, now_ns: int) -> None:
-        """Run a tick: plan, send, and record.
-
-        Args:
-            tick_ns: time at which the tick was due.
-            now_ns: time now.
-        """
+        """Run the tick that was due at `tick_ns`: plan, send, and record."""
         controller = self._controller
         self._stopwatch.start()
         before_ns = self._stopwatch.total_ns

@@ -235,12 +235,7 @@ class ClockMap:
         return {"clock_steps": steps} if steps else {}
 
     def step_errors(self, rows: Indices, steps: Indices, early: Array, late: Array) -> None:
-        """Fill in the possible errors of the latest counted steps, see `StepError`.
-
-        Args:
-            rows, steps: arguments and result of `steps`; shape (n,).
-            early, late: output, written at these rows; shape (capacity,).
-        """
+        """Fill in `StepError` of the latest counted steps, at `rows` of two arrays (capacity,)."""
         _step_errors(self.seen, rows, steps, self.tick_ns, self._dt_ns, early, late)
 
     def bound_ns(self, row: int) -> int:
@@ -357,13 +352,7 @@ def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
 
 @part
 def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> int:
-    """Narrow the bounds of a vehicle's clock offset by F and G [ns]; returns what these contradict.
-
-    Args:
-        forward, backward: F and G [ns].
-        is_new: whether G is of an echo that no earlier observation contained.
-        now: server's time [ns].
-    """
+    """Narrow the bounds by F and G [ns]; `is_new` if no earlier observation contained the echo."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
     # F is as old as the observation, which is no older than the round trip. An echo is newer than

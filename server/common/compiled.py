@@ -51,12 +51,7 @@ def axes_of(model: Model) -> Axes:
 
 
 def laws_of(terms: Terms, gain: Array) -> Laws:
-    """Model, bound and feedback of each axis, with K rounded as it will be sent.
-
-    Args:
-        terms: terms of the flight.
-        gain: K of feedback aboard, 0 without; shape (axes, 2).
-    """
+    """Model, bound and feedback of each axis; K (axes, 2) is rounded as it will be sent."""
     laws = np.zeros(terms.axes, dtype=AXIS_LAW)
     for name, numbers in terms.model._asdict().items():
         laws[name] = numbers

@@ -142,12 +142,7 @@ class Desired:
             self._pages[0, :, 0] = self._point.at(now_ns)
 
     def now(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states of vehicles at their steps k [m, m/s]; shape (n, axes, 2).
-
-        Args:
-            rows: the vehicles, no more than a block; shape (n,).
-            steps: k of each; shape (n,).
-        """
+        """Desired states at the steps k of vehicles [m, m/s]; shape (n, axes, 2)."""
         pages, place, first = self._find(rows, steps, self._at_once)
         n = len(rows)
         states: Array = pages[place[:n], -self._axes :, first[:n]]
@@ -162,26 +157,20 @@ class Desired:
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states of vehicles from k + d on, valid until the next call.
-
-        Args:
-            rows: the vehicles, no more than a block; shape (n,).
-            steps: k of each; shape (n,).
-            ahead: d of each, in the first n items.
-        """
+        """Desired states from k + d on, valid until the next call; d: first n of `ahead`."""
         if self._all:
             return self._find(rows, steps, ahead)
-        found = self._find(rows, steps, self._at_once)
+        visible = self._find(rows, steps, self._at_once)
         window = self._foreseen.states
-        _foresee(found, len(rows), ahead, self._outlook, self._dt_s, self._bound_m, window)
+        _foresee(visible, len(rows), ahead, self._outlook, self._dt_s, self._bound_m, window)
         return self._foreseen
 
     def states(self, rows: Indices, steps: Indices, ahead: Indices) -> Array:
         """Copy of the desired states of `window` [m, m/s]; shape (n, axes, H + 1, 2)."""
         states, place, first = self.window(rows, steps, ahead)
         n, stages = len(rows), np.arange(self._foreseen.states.shape[2])
-        found: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
-        return found.transpose(0, 2, 1, 3)
+        selected: Array = states[place[:n, None], : self._axes, first[:n, None] + stages]
+        return selected.transpose(0, 2, 1, 3)
 
     def _find(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
         if self._point:

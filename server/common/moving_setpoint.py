@@ -19,13 +19,7 @@ REST_S = 1.0
 
 
 class LivePoint:
-    """A point that an operator moves.
-
-    Args:
-        position: initial position [m]; shape (axes,).
-        velocity: its velocity [m/s], or None if not given; shape (axes,).
-        fastest: largest velocity estimated from moves [m/s]; shape (axes,).
-    """
+    """A point that an operator moves; `fastest` limits the velocity estimated from moves [m/s]."""
 
     def __init__(self, position: Array, velocity: Array | None, fastest: Array) -> None:
         self._position = position

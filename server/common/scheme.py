@@ -105,7 +105,7 @@ class PlanFigures:
 
 FIGURES = record(PlanFigures)
 Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
-"""Shape (n,)."""
+"""A `PlanFigures` for each plan; shape (n,)."""
 
 
 LOSS_CASES = 4

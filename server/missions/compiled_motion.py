@@ -1,8 +1,8 @@
 """Motions in kernels: state at a step, and bounds of speed and curvature.
 
 Distances along the third axis may count less than those in the plane: coordinates are multiplied by
-`Metric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as downwash
-requires.
+`MotionMetric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as
+downwash requires.
 """
 
 from typing import NamedTuple
@@ -79,12 +79,7 @@ def last_step(motion: Motion) -> int:
 
 @part
 def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, high: F1) -> None:
-    """Fill in two corners of a box around a motion and a landing after it, scaled [m].
-
-    Args:
-        lands: whether the vehicle may ever land.
-        low, high: output; shape (axes,).
-    """
+    """Fill in two corners of a box around a motion, and its landing if `lands`, scaled [m]."""
     position, velocity, scale = motion.position, motion.velocity, metric.scale
     for x in range(len(scale)):
         low[x], high[x], turn = np.inf, -np.inf, 0.0

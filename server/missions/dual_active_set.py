@@ -46,11 +46,7 @@ def workspace(n: int, m: int) -> DualWorkspace:
 
 
 class DualActiveSet:
-    """Solver of problems with the same Hessian.
-
-    Args:
-        hessian: G, positive definite; shape (n, n).
-    """
+    """Solver of problems with the same Hessian G, positive definite; shape (n, n)."""
 
     def __init__(self, hessian: NDArray[Any]) -> None:
         self.root = np.linalg.inv(np.linalg.cholesky(hessian))

@@ -142,13 +142,7 @@ def _half_planes(
 def _possible_way(
     other: Motion, step: float, least: float, most: float, dt_s: float, way: F2
 ) -> int:
-    """Fill in corners of the polyline on which another vehicle may be at a step; returns their
-    number.
-
-    Args:
-        least, most: bounds of the steps by which the other vehicle may be ahead.
-        way: output [m]; shape (corners, axes).
-    """
+    """Fill in the corners of a polyline of possible positions [m]; returns their number."""
     first, last = moving_shifts(other, step, step, least, most)
     slices = int(np.ceil((last - first) * SAMPLES / SPACING))
     for j in range(slices + 1):

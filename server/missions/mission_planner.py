@@ -15,11 +15,12 @@ A new motion is sent only if at all times it keeps the distance
     D = separation_m + 2 tube_m
 
 from all motions that all other vehicles may fly, at every position that the errors of their clocks
-allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); a vehicle
-observed outside its tube is kept away from by as much more. The earlier motions were apart already.
-So whichever are accepted, and whichever packets are lost or late, vehicles are `separation_m` apart
-as long as each stays in its tube (docs/together.md has the theorem). The distance from zones is
-`tube_m`. Staying on the motion in force is always possible: it needs no packet.
+allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
+keep more distance from a vehicle observed outside its tube. The motions sent earlier were apart
+already. So whichever motions are accepted, and whichever packets are lost or late, vehicles are
+`separation_m` apart as long as each stays in its tube (docs/together.md has the theorem). The
+distance from zones is `tube_m`. Staying on the motion in force is always possible: it needs no
+packet.
 
 `mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
 `half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a
@@ -217,8 +218,7 @@ class MissionPlanner(SplineScheme):
         return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
 
     def clock_m(self, row: int) -> float | None:
-        """Distance by which the clock error may displace a vehicle along its motion now [m]; None
-        without a motion.
+        """Displacement along its motion that a vehicle's clock error may cause [m]; or None.
 
         Other vehicles keep away by this much more, along its path.
         """
@@ -301,8 +301,7 @@ class MissionPlanner(SplineScheme):
             vehicle.zone_blocks = False
 
     def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
-        """Nearest position clear of zones, for a vehicle that rests within a zone [m]; None if it
-        rests outside.
+        """Nearest position clear of zones [m], for a vehicle that rests within a zone, or None.
 
         No motion leads into a zone, so the vehicle has been there since the server started.
         """
@@ -384,15 +383,14 @@ class MissionPlanner(SplineScheme):
         if none is found.
 
         The result is added to the possible motions, so that the next vehicle's plan accounts for
-        it. Constraints are added only once a solution violates them: usually nothing is near, and
-        the
-            path is straight.
+        it. Constraints are added once a solution violates them: usually the path is free and
+        straight.
         """
         assert vehicle.in_force is not None
         qp, base = self._qp, vehicle.in_force.motion
         due = k + self._state.kept_steps
-        kept = states(base, k, self._state.kept_steps // SPACING + 1, self._dt_s)
-        p0 = kept[0][-1]
+        kept_knots = states(base, k, self._state.kept_steps // SPACING + 1, self._dt_s)
+        p0 = kept_knots[0][-1]
         planes, violated = None, np.zeros(self._state.possible.count + 1, dtype=np.bool_)
         rests = partial(self._state.resting_places, row)
         waypoints = self._waypoints.candidates(vehicle, k, p0, goal, rests)
@@ -400,7 +398,7 @@ class MissionPlanner(SplineScheme):
         for targets in targets_of if path is None else chain([path], targets_of):
             for _ in range(ROUNDS):
                 constraints = planes.from_some(violated) if planes else None
-                solved = qp.solve(*kept, targets, constraints)
+                solved = qp.solve(*kept_knots, targets, constraints)
                 if solved is None:
                     self.counts["unsolved"] += 1
                     return None
@@ -466,12 +464,8 @@ class MissionPlanner(SplineScheme):
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
-        """Flags of the others' motions that a motion comes too near to at any time; the last flag
-        is for zones.
-
-        Args:
-            motion: the motion, by the vehicle's own steps.
-            planned: the same motion, by common steps.
+        """Flags of the motions that are too near; the last is for zones. `planned`: in common
+        steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None

@@ -362,15 +362,13 @@ def _align(
     """Map vehicles to the common grid, and find what is due for each.
 
     Args:
-        rows, step: the vehicles, and the step of each; shape (n,).
         now: present step on the grid.
         due: output: PLAN_DUE, REPEAT_DUE, both or 0; shape (n,) at least.
         moved_by: output: change of the offset on the grid [steps]; shape (n,) at least.
 
     Returns:
-        number of vehicles whose offset on the grid has changed, and the row of a vehicle that may
-        still fly a motion of another server, or
-        -1.
+        number of vehicles with another offset on the grid, and a row that may still fly a motion of
+        another server, or -1.
     """
     moved, foreign = 0, -1
     for i in range(len(rows)):

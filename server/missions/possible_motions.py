@@ -59,11 +59,7 @@ class MotionArrays(NamedTuple):
 
 
 class PossibleMotions:
-    """All motions that vehicles may be flying; those of a vehicle are replaced when they change.
-
-    Args:
-        scale: see `MotionMetric`; shape (axes,).
-    """
+    """All motions that vehicles may be flying; `scale`: see `MotionMetric`."""
 
     def __init__(self, scale: Array, dt_s: float) -> None:
         self.count = 0
@@ -79,11 +75,7 @@ class PossibleMotions:
             self.add(row, motion, extra_m)
 
     def add(self, row: int, motion: PossibleMotion, extra_m: float = 0.0) -> None:
-        """Add a motion.
-
-        Args:
-            extra_m: additional distance to keep from this motion [m].
-        """
+        """Add a motion, from which `extra_m` more is kept than from others [m]."""
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
                 np.concatenate([each, np.zeros_like(each)]) for each in self.arrays

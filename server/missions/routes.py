@@ -24,11 +24,7 @@ TINY_M = 1e-6
 
 
 class Routes:
-    """Routes around zones.
-
-    Args:
-        clearance_m: distance of routes from zones [m].
-    """
+    """Routes around zones, at a distance of `clearance_m`."""
 
     def __init__(self, zones: Zones, clearance_m: float) -> None:
         self._zones, self._clearance_m = zones, clearance_m
@@ -70,11 +66,7 @@ class Routes:
 
 
 class Graph:
-    """Visibility graph in the plane; the zones are taken as infinitely high.
-
-    Args:
-        clearance_m: distance of routes from zones [m].
-    """
+    """Visibility graph in the plane, with a clearance from zones that are infinitely high."""
 
     def __init__(self, zones: Zones, clearance_m: float) -> None:
         self._zones, self._clearance_m = zones, clearance_m
@@ -101,7 +93,7 @@ class Graph:
         node."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest path between two positions; empty if it is straight or absent."""
+        """Corners of the shortest path between two positions; empty if straight or absent."""
         start, end, nodes = place[None], goal[None], self._nodes
         if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]

@@ -111,8 +111,7 @@ def comes_too_near(
     distance: float,
     scratch: F2,
 ) -> bool:
-    """Whether a planned motion comes too near to the possible motion m of another vehicle; see
-    `too_near`.
+    """Whether a planned motion comes too near to the possible motion m; see `too_near`.
 
     Args:
         scratch: its last two rows are the corners of a box around the planned motion [m]; shape (6,
@@ -138,11 +137,7 @@ def comes_too_near(
 
 @part
 def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
-    """Lower bound of the distance of two motions from a step on, at most `limit` [m].
-
-    Args:
-        sides: scratch; shape (4, axes).
-    """
+    """Lower bound of the distance of two motions from a step on, at most `limit` [m]."""
     one, other, metric = pair.one, pair.other, pair.metric
     piece_s = SPACING / SAMPLES * metric.dt_s
     last = last_step(one.motion)
@@ -232,11 +227,7 @@ def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float
 
 @part
 def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
-    """Distance of the midpoints of two motions in a time interval [m].
-
-    Args:
-        lands: whether either vehicle may ever land, so that heights do not count.
-    """
+    """Distance of the midpoints of two motions [m]; if a vehicle `lands`, heights do not count."""
     square = 0.0
     middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
     for x in range(len(pair.metric.scale)):

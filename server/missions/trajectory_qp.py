@@ -140,8 +140,7 @@ class TrajectoryQP:
     def solve(
         self, kept_p: Array, kept_v: Array, targets: Array, planes: HalfPlanes | None = None
     ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots, starting with those of the motion in force; None
-        without a solution.
+        """Positions and velocities of the knots, kept ones first; None without a solution.
 
         Args:
             kept_p, kept_v: knots of the motion in force up to the beginning of the plan [m, m/s];
@@ -166,11 +165,7 @@ class TrajectoryQP:
     def problem(
         self, p0: Array, v0: Array, targets: Array, planes: HalfPlanes | None
     ) -> tuple[Array, Array, Array]:
-        """QP for `DualActiveSet`: linear term, columns of the constraints, and their bounds.
-
-        Args:
-            p0, v0: state at the beginning of the plan [m, m/s]; shape (axes,).
-        """
+        """QP for `DualActiveSet` from the state p0, v0 on: linear term, columns and bounds."""
         columns, (variables, fixed) = self._fixed, self._fixed.shape
         linear = np.empty(variables)
         bounds = np.empty(fixed + (len(planes.time) if planes else 0))

@@ -29,6 +29,7 @@ PROMPT_COUNT = 8
 
 class SentMotion(NamedTuple):
     step: int
+    """Step of its packet; -1 for the resting position of a vehicle without a motion."""
     motion: Motion
 
 
@@ -36,7 +37,6 @@ class VehicleMotions:
     def __init__(self) -> None:
         self.in_force: SentMotion | None = None
         """Motion that the vehicle flies; None before the first observation."""
-
         self.is_foreign = False
         """Whether `in_force` stands for a motion of another server: the vehicle rests where it was
         last observed, or is still flying."""
@@ -84,11 +84,7 @@ class VehicleMotions:
         return motions
 
     def adapt_copies(self, prompt: bool) -> None:
-        """Send motions more often after a loss, and less often when none occurs.
-
-        Args:
-            prompt: whether a motion was acknowledged at once.
-        """
+        """Send motions more often after a loss, and less often after prompt acknowledgements."""
         self.prompt_count = self.prompt_count + 1 if prompt else 0
         if not prompt:
             self.copies = min(self.copies + 1, COPIES_MAX)
@@ -96,13 +92,7 @@ class VehicleMotions:
             self.copies = max(self.copies - 1, 1)
 
     def is_stuck(self, step: int, goal: Array, remaining_m: float) -> bool:
-        """Whether there was no progress for PATIENCE_STEPS; True at most once in that time.
-
-        Args:
-            step: k, by the vehicle's own count.
-            goal: its goal [m]; shape (axes,).
-            remaining_m: length of the remaining path [m].
-        """
+        """Whether there was no progress for PATIENCE_STEPS; True at most once in that time."""
         if self.goal is None or (goal != self.goal).any():
             self.detour = None
             self.closed.clear()

@@ -64,8 +64,7 @@ class Waypoints:
         goal: Array,
         resting_places: Callable[[], Sequence[Array]],
     ) -> Iterator[Array]:
-        """Waypoints to try in turn: on the route to the goal, its next corner, and to the right of
-        that corner.
+        """Waypoints to try in turn: on the route to the goal, then to the right of it.
 
         Args:
             place: position at the beginning of the plan [m]; shape (axes,).
@@ -103,8 +102,8 @@ class Waypoints:
         return vehicle.detour if vehicle.detour and uses_detour else self.routes
 
     def close_way(self, vehicle: VehicleMotions, k: int, place: Array, goal: Array) -> bool:
-        """Close the route ahead of a vehicle until it has another goal, if there is another route;
-        returns whether there is.
+        """Close the route ahead of a vehicle until it has another goal; False without another
+        route.
 
         Routes keep `tube_m` from zones, and motions a margin more: between two zones there may be
         space for a route but not for a motion.

@@ -39,8 +39,7 @@ class Yielding(NamedTuple):
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:
-    """Index of the first of several positions that a path passes too near to; None if there is
-    none.
+    """Index of the first position that a path passes too near to, or None.
 
     A position too near to the start of the path only counts if the path comes nearer to it.
 
@@ -66,8 +65,8 @@ def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     Plans keep a larger distance than motions must. A vehicle that is nearer already must only not
     come nearer.
     """
-    kept: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
-    return kept
+    distance: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
+    return distance
 
 
 def distance_from_way(places: Array, way: Array) -> Array:

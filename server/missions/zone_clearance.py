@@ -12,21 +12,12 @@ is_near = shared(outlines.is_near)
 
 
 def comes_near(zones: Zones, points: Array, clearance_m: float) -> bool:
-    """Whether straight lines from point to point come nearer to a zone than a clearance, or touch a
-    zone.
-
-    Args:
-        points: at least two [m]; shape (n, axes).
-    """
+    """Whether lines from point to point come nearer to a zone than a clearance, or touch it."""
     return _comes_near(zones.outlines, points, clearance_m)
 
 
 def are_clear(zones: Zones, here: Array, there: Array, clearance_m: float) -> Flags:
-    """Whether straight lines in the plane keep a clearance from zones of any height; shape (n,).
-
-    Args:
-        here, there: start and end of each line [m]; shape (n, 2).
-    """
+    """Whether lines (n, 2) in the plane keep a clearance from zones of any height; shape (n,)."""
     clear = np.empty(len(here), dtype=np.bool_)
     _are_clear(zones.outlines, here, there, clearance_m, clear)
     return clear

@@ -58,8 +58,7 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
 def planned_state(
     mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
 ) -> tuple[float, float]:
-    """Planned state x_p(k|k-1) on one axis: state of the generator's previous plan after `plan.gap`
-    steps.
+    """Planned state x_p(k|k-1) on one axis, from the generator's previous plan.
 
     Source: eq. (14).
     """
@@ -80,22 +79,21 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add the squared deviations, on one axis, of flying on with `held` from the generator's
-    previous plan.
+    """Add the squared deviations of flying on with `held` from the previous plan, on one axis.
 
     Args:
         i: index of the vehicle in the block.
         distance: sums to which the stages add, as far as both are flown [m²]; shape (H + 1,).
     """
-    held, flown = foresight.held[i, axis], foresight.usable[i]
+    held, usable = foresight.held[i, axis], foresight.usable[i]
     model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)
     planned = memory.inputs[GENERATOR, plan.row, axis]
     p, v = foresight.start[i, axis, 0], foresight.start[i, axis, 1]
     planned_p, planned_v = planned_state(mpc, memory, plan, axis)
-    for stage in range(min(H - plan.gap, flown) + 1):
+    for stage in range(min(H - plan.gap, usable) + 1):
         away = p - planned_p
         distance[stage] += away * away
-        if stage < flown:
+        if stage < usable:
             p, v = advance(model, p, v, held[stage] + w)
         if stage + plan.gap < H:
             u = planned[stage + plan.gap]

@@ -190,11 +190,7 @@ def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @lanes
 def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
-    """Forward pass: each stage's unconstrained choice decides on the active set.
-
-    Args:
-        singly: whether only the input with the largest violation may change the set.
-    """
+    """Forward pass: unconstrained choices decide on the active set; `singly`: on one input only."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
     u, side, own, changed, held = simd.inputs, simd.side, simd.own, simd.changed, simd.held

@@ -193,15 +193,15 @@ class Planner:
     def _solve(self, tier: int, left: Indices) -> None:
         draft = self._draft
         fresh = self.figures["fresh"][left]
-        for some, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
-            if len(some):
-                inputs, solved = solver.solve(draft.gradient[some], draft.guess[some])
-                draft.inputs[tier, some] = inputs
-                self.figures["solved"][some] &= solved
+        for group, solver in zip((left[fresh], left[~fresh]), self.solvers, strict=True):
+            if len(group):
+                inputs, solved = solver.solve(draft.gradient[group], draft.guess[group])
+                draft.inputs[tier, group] = inputs
+                self.figures["solved"][group] &= solved
 
 
 @part
-def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+def _pose_generator(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, axis: int) -> None:
     """Set up the generator's QP on one axis for some vehicles, by index in the block.
 
     Source: eq. (14).
@@ -214,8 +214,8 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axi
         batch.foresight,
     )
     H = memory.inputs.shape[3]
-    for lane in range(len(some)):
-        i = some[lane]
+    for lane in range(len(indices)):
+        i = indices[lane]
         plan, page, first = batch.figures[i], desired.place[i], desired.first[i]
         x = (foresight.start[i, axis, 0], foresight.start[i, axis, 1])
         if not plan.fresh:
@@ -231,14 +231,14 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axi
 
 
 @part
-def _pose_tracker(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis: int) -> None:
+def _pose_tracker(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, axis: int) -> None:
     """Set up the tracker's QP on one axis, with the generator's solution in `simd.inputs`.
 
     Source: eq. (15).
     """
     mpc, memory, draft, foresight = batch.mpc, batch.memory, batch.draft, batch.foresight
-    for lane in range(len(some)):
-        i = some[lane]
+    for lane in range(len(indices)):
+        i = indices[lane]
         plan = batch.figures[i]
         simd.p[lane], simd.v[lane] = foresight.start[i, axis, 0], foresight.start[i, axis, 1]
         planned = draft.planned[i, axis]
@@ -251,41 +251,36 @@ def _pose_tracker(batch: PlanBatch, simd: SimdBatch, some: I1, which: int, axis:
 
 
 @part
-def _keep(batch: PlanBatch, simd: SimdBatch, some: I1, tier: int, axis: int) -> None:
+def _keep(batch: PlanBatch, simd: SimdBatch, indices: I1, tier: int, axis: int) -> None:
     """Store the solutions of generator or tracker on one axis, rounded as sent."""
-    for lane in range(len(some)):
-        i = some[lane]
+    for lane in range(len(indices)):
+        i = indices[lane]
         batch.memory.bounded[batch.figures[i].row] |= simd.held[lane] > 0.0
         column(simd.inputs, lane, batch.draft.inputs[tier, i, axis])
 
 
 @part
-def _plan_some(batch: PlanBatch, memory: F3, some: I1, which: int, work: RiccatiWorkspace) -> int:
-    """Plan for some vehicles at once, after `begin`; returns the number of unsolved plans.
-
-    Args:
-        memory: memory of a `SimdBatch` for as many vehicles.
-        some: indices of the vehicles in the block; shape (L,).
-        which: weights of all of them, FIRST or LATER.
-        work: workspace of the exact solver.
-    """
+def _plan_some(
+    batch: PlanBatch, memory: F3, indices: I1, which: int, work: RiccatiWorkspace
+) -> int:
+    """Plan for vehicles of the block, by index, at once; returns the number of unsolved plans."""
     mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
-    simd, settled, undone = simd_batch(memory), batch.settled[: len(some)], 0
-    for lane in range(len(some)):
-        settled[lane], batch.memory.bounded[figures[some[lane]].row] = True, False
+    simd, settled, undone = simd_batch(memory), batch.settled[: len(indices)], 0
+    for lane in range(len(indices)):
+        settled[lane], batch.memory.bounded[figures[indices[lane]].row] = True, False
     for axis in range(len(mpc.model)):
-        _pose_generator(batch, simd, some, which, axis)
+        _pose_generator(batch, simd, indices, which, axis)
         active_sets(mpc, axis, which, simd, work.free, settled)
-        _keep(batch, simd, some, GENERATOR, axis)
-        _pose_tracker(batch, simd, some, which, axis)
+        _keep(batch, simd, indices, GENERATOR, axis)
+        _pose_tracker(batch, simd, indices, which, axis)
         active_sets(mpc, axis, which, simd, work.free, settled)
-        _keep(batch, simd, some, TRACKER, axis)
+        _keep(batch, simd, indices, TRACKER, axis)
         if compares:
             slope(mpc, axis, which, simd)
-            for lane in range(len(some)):
-                column(simd.gradient, lane, draft.gradient[some[lane], axis])
-    for lane in range(len(some)):
-        i = some[lane]
+            for lane in range(len(indices)):
+                column(simd.gradient, lane, draft.gradient[indices[lane], axis])
+    for lane in range(len(indices)):
+        i = indices[lane]
         figures[i].solved = settled[lane]
         if settled[lane]:
             _conclude(batch, i)
@@ -310,8 +305,7 @@ def _conclude(batch: PlanBatch, i: int) -> None:
 
 @kernel
 def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
-    """Plan for vehicles with the exact solver, see `Planner.plan`; returns the number of unsolved
-    plans.
+    """Plan with the exact solver, see `Planner.plan`; returns the number of unsolved plans.
 
     The data of unsolved vehicles do not change, except that `solved` is False in their figures.
     """

@@ -41,12 +41,7 @@ class DelayBound(NamedTuple):
 
 
 def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
-    """Delay bounds of vehicles without any sample.
-
-    Args:
-        most: largest d that fits a horizon.
-        fixed_s: fixed bound [s]; None to estimate it.
-    """
+    """Delay bounds without any sample, at most `most`; `fixed_s` is None to estimate them."""
     least = 1
     if fixed_s is not None:
         # Rounded up: d has to cover the whole delay.

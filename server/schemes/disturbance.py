@@ -30,12 +30,7 @@ def observe_disturbance(
     schedule: HorizonSchedule,
     track: FlownTrack,
 ) -> None:
-    """Update the disturbance of a vehicle if it has a new observation.
-
-    Args:
-        trip: steps from the newest observation to where planning starts; long trips slow the
-            observer down.
-    """
+    """Update the disturbance at a new observation, more slowly after a long `trip` [steps]."""
     seen, sent = memory.seen[row], memory.sent
     delivery = sent.delivery[row]
     begin, end = seen.base_step, sent.observed[row]

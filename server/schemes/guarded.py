@@ -67,14 +67,14 @@ class GuardedScheme(Scheme):
             _blank(_cut(foresight, slice(i, i + 1)), self.figures[i : i + 1], rows[i], step[i])
             self.figures["solved"][i], self.planned[i] = False, 0.0
 
-    def _plan(self, rows: Indices, step: Indices, foresight: Foresight, some: slice) -> None:
-        cut, n = _cut(foresight, some), some.stop - some.start
+    def _plan(self, rows: Indices, step: Indices, foresight: Foresight, selected: slice) -> None:
+        cut, n = _cut(foresight, selected), selected.stop - selected.start
         inner = self._inner
-        _blank(cut, inner.figures[:n], rows[some], step[some])
-        inner.foresee(rows[some].copy(), step[some].copy(), cut)
-        inner.plan(rows[some].copy(), step[some].copy(), cut)
+        _blank(cut, inner.figures[:n], rows[selected], step[selected])
+        inner.foresee(rows[selected].copy(), step[selected].copy(), cut)
+        inner.plan(rows[selected].copy(), step[selected].copy(), cut)
         self._check(cut)
-        self.figures[some], self.planned[some] = inner.figures[:n], inner.planned[:n]
+        self.figures[selected], self.planned[selected] = inner.figures[:n], inner.planned[:n]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         """See `Scheme`; the plan of a vehicle for which the scheme fails is not sent."""
@@ -82,10 +82,12 @@ class GuardedScheme(Scheme):
         self._withheld = {int(rows[i]) for i in failed}
 
     def _remember(
-        self, rows: Indices, step: Indices, foresight: Foresight, event: Flags, some: slice
+        self, rows: Indices, step: Indices, foresight: Foresight, event: Flags, selected: slice
     ) -> None:
-        cut = _cut(foresight, some)
-        self._inner.remember(rows[some].copy(), step[some].copy(), cut, event[some].copy())
+        cut = _cut(foresight, selected)
+        self._inner.remember(
+            rows[selected].copy(), step[selected].copy(), cut, event[selected].copy()
+        )
         self._check(cut)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
@@ -120,11 +122,7 @@ class GuardedScheme(Scheme):
         return failed
 
     def _check(self, foresight: Foresight) -> None:
-        """Check that the plans can be flown.
-
-        Raises:
-            ValueError: an array has a value out of bounds.
-        """
+        """Raise ValueError unless the plans can be flown."""
         splines = foresight.splines
         if not ((foresight.ahead >= 0) & (foresight.ahead <= self._ahead_max)).all():
             raise ValueError(f"expected delay bounds from 0 to {self._ahead_max} in `ahead`")
@@ -146,11 +144,11 @@ class GuardedScheme(Scheme):
         self.counts["scheme_errors"] += 1
 
 
-def _cut(foresight: Foresight, some: slice) -> Foresight:
+def _cut(foresight: Foresight, selected: slice) -> Foresight:
     """Predictions for some vehicles of a block; the arrays are views."""
     arrays: Iterable[NDArray[Any]] = foresight[:-1]
-    splines = Splines._make(array[some] for array in foresight.splines)
-    return Foresight._make((*(array[some] for array in arrays), splines))
+    splines = Splines._make(array[selected] for array in foresight.splines)
+    return Foresight._make((*(array[selected] for array in arrays), splines))
 
 
 def _blank(foresight: Foresight, figures: Figures, rows: Indices, step: Indices) -> None:

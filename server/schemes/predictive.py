@@ -48,6 +48,7 @@ class EstimatorSettings(NamedTuple):
     laws: Laws
     """Model, bound and gain of each axis; shape (axes,)."""
     compensate: bool
+    """Whether observations are predicted to the present; False for the scheme "none"."""
     dt_ns: int
     decay: float
     """See `observer.decay_of`."""

@@ -75,12 +75,7 @@ class Sent(NamedTuple):
 
 
 def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
-    """Tracker without any plan.
-
-    Args:
-        ring: number of plans stored for each vehicle.
-        most: largest delay bound d that fits a plan.
-    """
+    """Tracker without any plan; `most` is the largest delay bound d that fits a plan."""
     fixed_s = None if control.delay_bound == "auto" else control.delay_bound
     sent = Sent(
         observed=np.full(capacity, -1, dtype=np.int64),
@@ -164,13 +159,7 @@ def first_after(sent: Sent, row: int, step: int) -> int:
 
 @part
 def first_in_flight(sent: Sent, row: int, in_force: int, observed: int) -> int:
-    """Number of the first plan in flight at an observation: later than the plan in force, not yet
-    due.
-
-    Args:
-        in_force: step that the plan in force was made for.
-        observed: step of the observation.
-    """
+    """Number of the first plan in flight at an observation: after the one in force, not yet due."""
     ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least:
         plan = sent.plans[row, (number - 1) % ring]

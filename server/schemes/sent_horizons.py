@@ -97,9 +97,9 @@ class ReplayMemory(NamedTuple):
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4
-    """Shape (capacity, ring, axes, largest d + H)."""
+    """Inputs of these horizons [m/s]; shape (capacity, ring, axes, largest d + H)."""
     reference: Annotated[NDArray[np.void], records(REFERENCE_STATE, 3)]
-    """Shape (capacity, ring, axes)."""
+    """Reference states of these horizons; shape (capacity, ring, axes)."""
 
 
 @kernel

@@ -226,12 +226,7 @@ KERNELS = (knots, splines, exact)
 
 @inline
 def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
-    """State of the trajectory that would be sent now at a stage, on one axis [m, m/s].
-
-    Args:
-        intended: states from k on [m, m/s]; shape (seen + 1, 2).
-        stage: steps after k.
-    """
+    """State at a stage after k of the trajectory that would be sent now [m, m/s]."""
     # After its end the trajectory is a straight line, as the spline is.
     last = min(stage, settings.seen)
     v = intended[last, 1]
@@ -242,11 +237,7 @@ def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
 def _followed(
     settings: Settings, memory: Memory, row: int, number: int, axis: int, step: int
 ) -> tuple[float, float]:
-    """State of a sent trajectory at a step, on one axis [m, m/s].
-
-    Args:
-        number: number of the trajectory; negative if the vehicle hovers without one.
-    """
+    """State of a sent trajectory at a step [m, m/s]; with a negative number the vehicle hovers."""
     if number < 0:
         return memory.state[row, axis, 0], 0.0
     slot = number % RING
@@ -258,13 +249,7 @@ def _followed(
 
 @part
 def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
-    """Probability π that a packet will still arrive, although an observation does not acknowledge
-    it.
-
-    Args:
-        loss: loss rate, from 0 to 1.
-        since: steps from sending to the observation; negative if the observation is older.
-    """
+    """Probability π that a packet sent `since` steps before the observation will still arrive."""
     left = 1.0 - loss
     if since > 0:
         count, later = min(bound.seen[row], SAMPLES), 0
