@@ -162,12 +162,12 @@ class Navigation:
         _, position, velocity = measured
         velocity_now = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
         # Eq. (1) in closed form: the input is constant over this time.
-        left, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
+        decay, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
         if position is not None:
-            bridged = steady * age + (velocity_now - steady) * self._tau_s * (1.0 - left)
+            bridged = steady * age + (velocity_now - steady) * self._tau_s * (1.0 - decay)
             position = (position + bridged).tolist()
         if velocity is not None:
-            velocity = (steady + (velocity_now - steady) * left).tolist()
+            velocity = (steady + (velocity_now - steady) * decay).tolist()
         return Measurement(to_ns, position, velocity)
 
 

@@ -227,9 +227,9 @@ class Pilot:
             without_feedback=without_feedback,
             speed_max=speed_max,
         )
-        return self._settled(flown, without_feedback, speed_max, now_ns)
+        return self._final_input(flown, without_feedback, speed_max, now_ns)
 
-    def _settled(
+    def _final_input(
         self,
         flown: list[float] | None,
         without_feedback: Sequence[float],

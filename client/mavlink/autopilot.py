@@ -216,9 +216,11 @@ class Autopilot:
         if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._streams_refused:
-            asked = f"send {stream} at its rate"
+            request = f"send {stream} at its rate"
             answer = RESULTS.get(result, f"result {result}")
-            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+            self._events.append(
+                AutopilotRefused(vehicle=self._vehicle, asked=request, answer=answer)
+            )
         self._streams_refused += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:

@@ -252,8 +252,8 @@ class Launch:
             case LaunchStep.LIFT:
                 return self._accepted or condition.is_airborne
             case LaunchStep.CLIMB:
-                there = self._positions.altitude >= self._altitude - THERE_M
-                return there and abs(self._positions.velocity[2]) < STILL_MPS
+                at_altitude = self._positions.altitude >= self._altitude - THERE_M
+                return at_altitude and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
         """Wait for the autopilot; give up after too long."""
@@ -399,8 +399,10 @@ class Launch:
         answer = RESULTS.get(result, f"result {result}")
         if (command, result) not in self._refused:
             self._refused.add((command, result))
-            asked = WORDS[command]
-            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+            command_text = WORDS[command]
+            self._events.append(
+                AutopilotRefused(vehicle=self._vehicle, asked=command_text, answer=answer)
+            )
         self._stated_reason = self._stated_reason or answer
 
     def hear_text(self, text: str) -> None:

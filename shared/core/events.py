@@ -84,9 +84,9 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Largest speed of the vehicle along the same axis [m/s]."""
 
     def __str__(self) -> str:
-        asked = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
+        required = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
         most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
-        return f"{asked}, and the vehicle flies at most {most}: it cannot follow"
+        return f"{required}, and the vehicle flies at most {most}: it cannot follow"
 
 
 class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -292,8 +292,8 @@ class NumberTaken(PeerEvent, frozen=True, kw_only=True):
     """HOST:PORT of the vehicle that already uses this number."""
 
     def __str__(self) -> str:
-        taken = f"another client flies under this number, from {self.holder}; see --id"
-        return f"vehicle {self.vehicle} from {self.peer} is refused: {taken}"
+        conflict = f"another client flies under this number, from {self.holder}; see --id"
+        return f"vehicle {self.vehicle} from {self.peer} is refused: {conflict}"
 
 
 class NoSession(PeerEvent, frozen=True, kw_only=True):
@@ -316,8 +316,8 @@ class NoAnswer(PeerEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         if self.secure:
-            said = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
-            return f"vehicle {self.vehicle}: {said}"
+            no_answer = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
+            return f"vehicle {self.vehicle}: {no_answer}"
         return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
 
 
@@ -513,8 +513,8 @@ class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     values: dict[str, Any]
 
     def __str__(self) -> str:
-        each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
-        return f"set in flight and in force again, from {self.path}: {each}"
+        settings = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
+        return f"set in flight and in force again, from {self.path}: {settings}"
 
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):

@@ -97,12 +97,12 @@ class Parameter:
 
     def without_unit(self, value: Value | None) -> Value | None:
         """A number in the parameter's own unit, from a word such as 50ms, 10% or 1mbit."""
-        found = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
+        match = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
         units = next(units for end, units in UNITS.items() if self.name.endswith(end))
-        if found is None or found[2].lower() not in units:
+        if match is None or match[2].lower() not in units:
             return value
-        multiplier, divisor = units[found[2].lower()]
-        return float(found[1]) * multiplier / divisor
+        multiplier, divisor = units[match[2].lower()]
+        return float(match[1]) * multiplier / divisor
 
     @property
     def file(self) -> bool:
@@ -379,8 +379,8 @@ class PluginTable(dict[str, Entry]):
             raise ConfigError(f"{what}: expected another name, {other.source} has one of this name")
         if lacking := sorted(getattr(make, "__abstractmethods__", ())):
             raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
-        given = self._class if isinstance(make, type) else self._given
-        parameters = _parameters(what, make, given, texts=self._texts)
+        passed = self._class if isinstance(make, type) else self._given
+        parameters = _parameters(what, make, passed, texts=self._texts)
         about = inspect.cleandoc(make.__doc__ or "").partition("\n\n")[0]
         self[name] = Entry(make, parameters, " ".join(about.split()), needs)
 
@@ -415,10 +415,10 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     default = None if taken.default is taken.empty else taken.default
     words = texts and typing.get_origin(kind) is Literal and typing.get_args(kind)
-    written = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
+    is_writable = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
     is_rest = texts and taken.kind is taken.VAR_POSITIONAL
-    one = taken.kind is taken.POSITIONAL_OR_KEYWORD or is_rest
-    if not one or not (written or (texts and kind is File)):
+    is_single = taken.kind is taken.POSITIONAL_OR_KEYWORD or is_rest
+    if not is_single or not (is_writable or (texts and kind is File)):
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
     for mark in marks:
         if not isinstance(mark, Meta | str):  # a bound of another kind would not be checked

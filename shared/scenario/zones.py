@@ -170,8 +170,8 @@ class Zones:
         begin, end = self._begin, self._begin + self._along
         spans = (begin[:, 1] > y) != (end[:, 1] > y)
         rise = np.where(self._along[:, 1] == 0.0, 1.0, self._along[:, 1])
-        left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
-        crossed = np.add.reduceat((spans & left).astype(np.int64), self._starts, axis=1)
+        is_left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
+        crossed = np.add.reduceat((spans & is_left).astype(np.int64), self._starts, axis=1)
         inside: Flags = crossed % 2 == 1
         return inside
 
@@ -397,8 +397,8 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     if kind == "Point":
         ((x, y),) = placed([coordinates]).tolist()
         if "radius_m" not in properties:
-            known = ", ".join(map(str, properties))[:80] or "no properties"
-            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
+            names = ", ".join(map(str, properties))[:80] or "no properties"
+            raise ValueError(f"a Point with the property radius_m in metres, not with {names}")
         radius = _number(properties["radius_m"], "radius_m")
         if not 0.0 < radius <= METRES_MAX:
             raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")

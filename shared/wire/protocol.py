@@ -352,11 +352,11 @@ def _is_plain(value: object) -> bool:
 def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
     """State and input of an observation; the input is NO_INPUT if the scheme does not use it."""
     axes = ours.axes
-    told = _FLOATS[axes * (2 if ours.splines else 3)]
-    if type(value) is not bytes or len(value) != told.size:
+    layout = _FLOATS[axes * (2 if ours.splines else 3)]
+    if type(value) is not bytes or len(value) != layout.size:
         raise ProtocolError(Drop.SHAPE)
     # Struct takes 0.2 µs for six numbers, np.frombuffer and tolist 0.7 µs.
-    numbers = told.unpack(value)
+    numbers = layout.unpack(value)
     # The sum of float32 numbers is finite unless one of them is not.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
@@ -474,9 +474,9 @@ _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
-def _told(said: Observation) -> list[object]:
+def _observation_fields(sent: Observation) -> list[object]:
     """Fields of an observation on the wire."""
-    vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = said
+    vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = sent
     numbers = state.ravel().tolist() + u.tolist()
     return [
         # Steps are sent as differences, mode and `takes` as one number: usually a byte each instead
@@ -496,8 +496,8 @@ def _told(said: Observation) -> list[object]:
     ]
 
 
-def _observation(told: Iterable[Any]) -> Observation:
-    vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = told
+def _observation(fields: Iterable[Any]) -> Observation:
+    vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = fields
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
     # Differences may lead below step 0 even if each of them is within its range.
@@ -512,7 +512,7 @@ def _observation(told: Iterable[Any]) -> Observation:
 def encode(message: Message) -> bytes:
     """Datagram of a message; arrays are sent as little-endian bytes."""
     if type(message) is Observation:
-        payload: bytes = _PACKER.pack(_told(message))
+        payload: bytes = _PACKER.pack(_observation_fields(message))
     else:
         payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
     assert len(payload) <= PAYLOAD_BYTES_MAX
@@ -531,8 +531,8 @@ def encode_horizon(
     silence: int,
 ) -> bytes:
     """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
-    told = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
-    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *told))
+    fields = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
@@ -560,10 +560,10 @@ def decode(payload: bytes, terms: Terms) -> Message:
         raise ProtocolError(Drop.TOO_LONG)
     if payload.startswith(_QUICK_START):
         with suppress(msgspec.DecodeError):
-            told = list(_QUICK.decode(payload)[2:])
+            quick = list(_QUICK.decode(payload)[2:])
             for i, made_of in _MADE:
-                told[i] = made_of(told[i], terms)
-            return _observation(told)
+                quick[i] = made_of(quick[i], terms)
+            return _observation(quick)
     try:
         # No message has a map or an extension, so none is ever built from received bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
