@@ -121,11 +121,7 @@ class MavlinkVehicle(Vehicle):
 
 
 def altitude(scenario: Scenario, number: int = 1) -> float:
-    """Take-off altitude of a vehicle [m].
-
-    Raises:
-        ConfigError: the flight would begin on the ground.
-    """
+    """Take-off altitude of a vehicle [m]; ConfigError if the flight would begin on the ground."""
     takeoff_m = scenario.mavlink.takeoff_m
     if takeoff_m != "auto":
         return float(takeoff_m)

@@ -193,6 +193,8 @@ class Entry:
 class PluginTable(dict[str, Entry]):
     """Entries of one kind by name, and the decorator that adds one.
 
+    Methods with a text of entries raise GrammarError if a part of it is invalid.
+
     Args:
         kind: noun for an entry, for messages.
         form: example of a text with entries, for messages.
@@ -210,11 +212,7 @@ class PluginTable(dict[str, Entry]):
         self._given, self._class, self._texts = given, class_, texts
 
     def parse(self, text: str) -> Expression:
-        """Parse entries combined with & and |, and bind their arguments to parameters.
-
-        Raises:
-            GrammarError: a part of the text is invalid.
-        """
+        """Parse entries combined with & and |, and bind their arguments to parameters."""
 
         def bound(expression: Expression) -> Expression:
             match expression:
@@ -226,11 +224,7 @@ class PluginTable(dict[str, Entry]):
         return bound(grammar.parse(text, self.form))
 
     def one(self, text: str) -> Call:
-        """Parse a text that names a single entry.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Parse a text that names a single entry."""
         call = grammar.parse(text, self.form)
         # Without arguments, no spaces or parentheses: other code compares the text with names.
         if not isinstance(call, Call) or not (call.keys or text == call.name):
@@ -238,19 +232,11 @@ class PluginTable(dict[str, Entry]):
         return self._bound(call)
 
     def calls(self, text: str) -> list[Call]:
-        """Parse entries joined by & only; an empty text has none.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Parse entries joined by & only; an empty text has none."""
         return [self._bound(each) for each in grammar.calls(text, self.form)]
 
     def files(self, text: str) -> list[str]:
-        """Names of files in a text of entries joined by &.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Names of files in a text of entries joined by &."""
         return [str(value) for call in self.calls(text) for value, file in self._args(call) if file]
 
     def make(self, call: Call, files: Files = (), *given: object) -> Any:
@@ -271,11 +257,7 @@ class PluginTable(dict[str, Entry]):
         return self[call.name].make(*given, *args)
 
     def with_files(self, text: str, change: Callable[[str], str]) -> str:
-        """Text of entries joined by &, with each file name replaced by `change(name)`.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Text of entries joined by &, with each file name replaced by `change(name)`."""
         for call in reversed(self.calls(text)):
             if any(file for _, file in self._args(call)):
                 values = [change(str(value)) if file else value for value, file in self._args(call)]
