@@ -60,7 +60,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     """State that a client saves for its next run."""
 
     boot_id: int | None = None
-    """Boot id of the conversation with the server; None if it cannot continue."""
+    """Boot id of the conversation with the server; None if the conversation cannot continue."""
     began_ns: Time | None = None
     heard_ns: Time = 0
     motion: FlownMotion | None = None

@@ -56,9 +56,9 @@ class Echo(NamedTuple):
     """Newest packet of the server, as echoed in observations."""
 
     server_ns: int
-    """Server time at which it was sent [ns]."""
+    """Server time at which the packet was sent [ns]."""
     received_ns: int
-    """Time of arrival [ns; our clock]."""
+    """Time of its arrival [ns; the client's clock]."""
     heard: int
     """Number of packets received up to and including that packet, modulo NUMBERS."""
 

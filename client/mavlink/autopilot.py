@@ -80,12 +80,13 @@ class Autopilot:
         self._texts = LoggedTexts(vehicle, events)
         self.sets_parameters = False
         self.flavour: Flavour = ARDUPILOT
-        """Which autopilot it is; set with `parts`."""
+        """Kind of autopilot; set with `parts`."""
         self._target = (0, 0)
-        """Numbers of its system and component."""
+        """Numbers of the autopilot's system and component."""
         self._streams_refused = 0
         self._was_armed = False
-        """Whether a run of the client has armed it since an operator last allowed arming."""
+        """Whether a run of the client has armed the vehicle since an operator last allowed
+        arming."""
 
     @property
     def is_ready(self) -> bool:

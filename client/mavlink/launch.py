@@ -103,7 +103,7 @@ class Launch:
         self._since_ns: int | None = None
         """Start of the current step."""
         self._asked_ns: int | None = None
-        """Time at which its command was last sent."""
+        """Time at which the command of the current step was last sent."""
         self._accepted = False
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
@@ -115,7 +115,7 @@ class Launch:
         self._closed = False
         """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
-        """Number of the mode in which it descends."""
+        """Number of the mode for landing."""
         self.waits_for = ""
         """What prevents the take-off, in words; empty if nothing does."""
         self._stated_reason = ""

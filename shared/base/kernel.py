@@ -127,7 +127,8 @@ class Missing(NamedTuple):
     name: str
     is_stored: bool
     compile: Callable[[], None]
-    """Function that compiles it, or loads machine code compiled by another process since."""
+    """Function that compiles the kernel, or loads machine code compiled by another process
+    since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:

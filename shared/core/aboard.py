@@ -163,7 +163,7 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
     """
 
     sets: bool = False
-    """Whether the client was allowed to set them."""
+    """Whether the client was allowed to set the parameters."""
 
     @property
     def brief(self) -> str:

@@ -49,7 +49,7 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
     taken: str = ""
-    """Requested HOST:PORT, if it is in use already."""
+    """Requested HOST:PORT if another process uses that address."""
 
     def __str__(self) -> str:
         # Only a space may follow the address: it is copied, or clicked.
@@ -417,7 +417,7 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle on a mission is farther from its motion than allowed."""
 
     off_m: float
-    """Distance outside its tube [m]."""
+    """Distance of the vehicle outside its tube [m]."""
 
     def __str__(self) -> str:
         off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"
@@ -509,7 +509,7 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     path: str
-    """Journal that contains them."""
+    """Journal with the values."""
     values: dict[str, Any]
 
     def __str__(self) -> str:

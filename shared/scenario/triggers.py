@@ -159,7 +159,7 @@ class Verdict(NamedTuple):
     """Figure of the leftmost policy that compares one, or V(k) of eq. (16) if none does; shape
     (n,)."""
     threshold: Array
-    """Threshold of that figure, or 0 if nothing is compared; shape (n,)."""
+    """Threshold of `figure`, or 0 if nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
     """Which figure is compared with the threshold."""
 

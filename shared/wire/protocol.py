@@ -60,7 +60,7 @@ STAMPS = 2**32
 REFERENCE_P = 0
 """Column of `Horizon.feedback`: position of x̄ at the horizon's step [m]."""
 REFERENCE_V = 1
-"""Column of `Horizon.feedback`: velocity of x̄ at that step [m/s]."""
+"""Column of `Horizon.feedback`: velocity of x̄ at the horizon's step [m/s]."""
 REFERENCE = [REFERENCE_P, REFERENCE_V]
 """Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
@@ -130,7 +130,7 @@ class Mode(IntEnum):
     COAST = 4
     """Flies on along a horizon without a newer one."""
     BRAKE = 5
-    """Brakes to a stop, beginning at its last input."""
+    """Brakes to a stop from the last input."""
     HOVER = 6
     """At rest, holding the position."""
     LAND = 7
@@ -162,7 +162,7 @@ class Observation(NamedTuple):
     """First step that was flown with that horizon."""
     backward_us: int
     """Time stamp: arrival of the server's newest packet, in time since the vehicle's step 0, minus
-    the server's clock when it was sent."""
+    the server's clock when the packet was sent."""
     heard: int
     """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
@@ -187,7 +187,7 @@ class Horizon(NamedTuple):
     step: int
     """Step k of the first input, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     age: int
     """Steps from the server's newest observation to `step`."""
     inputs: NDArray[np.float32]
@@ -209,7 +209,7 @@ class Trajectory(NamedTuple):
     step: int
     """Step k of the first knot, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     age: int
     """Steps from the server's newest observation to `step`."""
     spacing: int
@@ -247,7 +247,7 @@ class Heartbeat(NamedTuple):
     vehicle: int
     session: int
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     idle: int
     degraded: int
     """1 if the server misses too many ticks, else 0."""
@@ -270,11 +270,11 @@ class Time(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k in which it is sent, on the vehicle's grid."""
+    """Step k in which the message is sent, on the vehicle's grid."""
     epoch_us: int
     """Time stamp: the time since 1970 at which step 0 began."""
     error_us: int
-    """Largest error of that time [µs]."""
+    """Largest error of `epoch_us` [µs]."""
 
 
 # With 10 % loss, all three are lost once in a thousand times.
