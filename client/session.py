@@ -123,7 +123,6 @@ class ServerSession:
         self._refusal: NoSession | None = None
         """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
-        """Event that makes a session impossible."""
 
     # -- receiving ---------------------------------------------------------------------------
 

@@ -80,9 +80,7 @@ class Autopilot:
         self._texts = LoggedTexts(vehicle, events)
         self.sets_parameters = False
         self.flavour: Flavour = ARDUPILOT
-        """Kind of autopilot; set with `parts`."""
         self._target = (0, 0)
-        """Numbers of the autopilot's system and component."""
         self._streams_refused = 0
         self._was_armed = False
         """Whether a run of the client has armed the vehicle since an operator last allowed

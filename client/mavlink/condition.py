@@ -48,7 +48,6 @@ class Condition:
         """Number of the autopilot's flight mode; -1 if unknown."""
         self.armed = False
         self.landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
-        """MAV_LANDED_STATE."""
         self.charge: float | None = None
         """Charge of the battery, from 0 to 1; None if unknown."""
         self.voltage: float | None = None

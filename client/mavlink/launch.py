@@ -101,7 +101,6 @@ class Launch:
         self.phase = Phase.GROUND
         self._step = 0
         self._since_ns: int | None = None
-        """Start of the current step."""
         self._asked_ns: int | None = None
         """Time at which the command of the current step was last sent."""
         self._accepted = False
@@ -115,7 +114,6 @@ class Launch:
         self._closed = False
         """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
-        """Number of the mode for landing."""
         self.waits_for = ""
         """What prevents the take-off, in words; empty if nothing does."""
         self._stated_reason = ""

@@ -407,7 +407,6 @@ class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
 
 class InZone(VehicleEvent, frozen=True, kw_only=True):
     zone: str
-    """Zone, as written in the scenario."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is guided out"
@@ -509,7 +508,6 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     path: str
-    """Journal with the values."""
     values: dict[str, Any]
 
     def __str__(self) -> str:

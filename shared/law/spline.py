@@ -40,7 +40,6 @@ class AxisSpline(NamedTuple):
     model: Axis
     knots: Knots
     spacing: int
-    """Steps from one knot to the next."""
     dt_s: float
     length: int
     """Number of stages at which the spline may be flown."""

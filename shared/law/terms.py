@@ -35,7 +35,6 @@ class Terms(NamedTuple):
 
     dt_ns: int
     horizon: int
-    """Number of steps planned ahead, H."""
     axes: int
     tau_s: tuple[float, ...]
     """Time constant of the model, eq. (2)-(3), of each axis [s]."""

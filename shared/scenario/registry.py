@@ -137,7 +137,6 @@ class Entry:
     """Function or class; called with the program's arguments, then those of the scenario."""
     parameters: tuple[Parameter, ...]
     about: str
-    """First paragraph of the docstring of `make`."""
     needs: str = ""
     """Figure that a scheme must compute for this entry (`schemes.SchemeProperties.computes`), or
     empty."""

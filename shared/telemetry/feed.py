@@ -49,7 +49,6 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     time_ns: int
     """Time at which the rows were recorded [ns; CLOCK_MONOTONIC]."""
     rows: bytes
-    """Rows as in memory."""
 
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -62,7 +61,6 @@ class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     time_ns: int
     figures: dict[str, Any]
-    """Figures by name, see `Endpoint.figures`."""
 
 
 Frame = Opened | Rows | Said | Figures

@@ -62,7 +62,6 @@ REFERENCE_P = 0
 REFERENCE_V = 1
 """Column of `Horizon.feedback`: velocity of x̄ at the horizon's step [m/s]."""
 REFERENCE = [REFERENCE_P, REFERENCE_V]
-"""Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
 """Column of `Horizon.feedback`: disturbance ŵ that the inputs compensate [m/s]."""
 GAIN_P = 3
@@ -70,7 +69,6 @@ GAIN_P = 3
 GAIN_V = 4
 """Column of `Horizon.feedback`: K on velocity."""
 FEEDBACK = 5
-"""Number of columns of `Horizon.feedback`."""
 
 NO_FEEDBACK = np.empty((0, 0), np.float32)
 FLOAT_MAX = float(np.finfo(np.float32).max)
@@ -213,7 +211,6 @@ class Trajectory(NamedTuple):
     age: int
     """Steps from the server's newest observation to `step`."""
     spacing: int
-    """Steps from one knot to the next."""
     knots: NDArray[np.float32]
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     number: int = 0
@@ -475,7 +472,6 @@ _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
 def _observation_fields(sent: Observation) -> list[object]:
-    """Fields of an observation on the wire."""
     vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = sent
     numbers = state.ravel().tolist() + u.tolist()
     return [

@@ -24,7 +24,6 @@ from skytether.shared.law.model import Array
 ROWS_MAX = 1_000_000
 LINES_MAX = 2 * ROWS_MAX
 LINE_MAX = 400
-"""Number of characters read of a line."""
 EVERY_S = 1.0
 """Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
