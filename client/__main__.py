@@ -87,8 +87,8 @@ def fly(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
-        given = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
-        raise CommandError(f"--id: got {given}, expected 0 to 65535", 2)
+        numbers_text = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
+        raise CommandError(f"--id: got {numbers_text}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
     keyring = keys.load(options.keys) if options.keys else None
     alone = len(numbers) == 1
@@ -170,8 +170,8 @@ def fly(argv: Sequence[str]) -> None:
                 command.write(options.json, msgspec.json.encode(summary))
         if failure := endpoint.failure:
             refused = isinstance(failure, SessionRefused | NoSession | ParametersUnsafe)
-            said = failure.brief if isinstance(failure, ParametersUnsafe) else str(failure)
-            raise CommandError(said, command.CONFIGURATION if refused else command.RUN)
+            message = failure.brief if isinstance(failure, ParametersUnsafe) else str(failure)
+            raise CommandError(message, command.CONFIGURATION if refused else command.RUN)
 
 
 @contextmanager
@@ -202,8 +202,8 @@ def _memory(
         if options.new_flight:
             memory.forget()
     except OSError as error:
-        said = f"vehicle.memory: {error.strerror or error}"
-        raise CommandError(f"{said}; expected a folder of its own, or none", 2) from None
+        problem = f"vehicle.memory: {error.strerror or error}"
+        raise CommandError(f"{problem}; expected a folder of its own, or none", 2) from None
     with closing(memory):
         yield memory
 

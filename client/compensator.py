@@ -34,7 +34,7 @@ class Compensator:
         self._H, self._age_max, self._join = terms.horizon, terms.age_max, terms.join
         self._late_max, self._brake = late_max(terms.horizon), terms.brake
         self.begins = 0
-        """Step of stage 0: the step that the horizon was made for, or at which it was dropped."""
+        """Step of stage 0: the step that the horizon was made for, or the step of its drop."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
         """Follower of the horizon in force; without a horizon, of the braking curve."""
         self._chosen = 0

@@ -72,9 +72,9 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
     # (1 - K) P as variance / total · P: 1 - K loses its digits if the sensor is good.
-    left = variance / total
+    share = variance / total
     return (kp, kv, kw), Spread(
-        left * pp, left * pv, left * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
+        share * pp, share * pv, share * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
     )
 
 
@@ -82,9 +82,9 @@ def by_velocity(P: Spread, variance: float) -> tuple[Gain, Spread]:
     pp, pv, pw, vv, vw, ww = P
     total = vv + variance
     kp, kv, kw = pv / total, vv / total, vw / total
-    left = variance / total
+    share = variance / total
     return (kp, kv, kw), Spread(
-        pp - kp * pv, left * pv, pw - kp * vw, left * vv, left * vw, ww - kw * vw
+        pp - kp * pv, share * pv, pw - kp * vw, share * vv, share * vw, ww - kw * vw
     )
 
 

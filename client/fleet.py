@@ -76,8 +76,8 @@ class ClientFleet(Endpoint):
             client.learn_time(utc_ns, error_ns, now_ns=now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        said = (client.objection(scenario, keys) for client in self._clients)
-        return next(filter(None, said), "")
+        objections = (client.objection(scenario, keys) for client in self._clients)
+        return next(filter(None, objections), "")
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         for client in self._clients:

@@ -113,7 +113,7 @@ class HorizonFollower:
         self,
         stage: int,
         state: Array,
-        disturbance: Array,  # noqa: ARG002 - a horizon contains its own
+        disturbance: Array,  # noqa: ARG002 - the horizon contains ŵ
         before: Array,  # noqa: ARG002 - used along a spline only
     ) -> Array:
         flown = np.empty((2, len(state)))

@@ -60,7 +60,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     """State that a client saves for its next run."""
 
     boot_id: int | None = None
-    """Boot id of the conversation with the server; None if it cannot continue."""
+    """Boot id of the conversation with the server; None if the conversation cannot continue."""
     began_ns: Time | None = None
     heard_ns: Time = 0
     motion: FlownMotion | None = None
@@ -173,9 +173,9 @@ def _is_same(one: SavedState, other: SavedState) -> bool:
     """Whether the next run would do the same with either state: times that only advance are
     ignored.
     """
-    return _lasting(one) == _lasting(other)
+    return _compared_part(one) == _compared_part(other)
 
 
-def _lasting(kept: SavedState) -> tuple[object, ...]:
-    frame = msgspec.structs.replace(kept.frame, boot_ms=0, at_ns=0)
-    return kept.boot_id, kept.began_ns, kept.motion, frame
+def _compared_part(state: SavedState) -> tuple[object, ...]:
+    frame = msgspec.structs.replace(state.frame, boot_ms=0, at_ns=0)
+    return state.boot_id, state.began_ns, state.motion, frame

@@ -43,9 +43,9 @@ class Sensing(NamedTuple):
     every_ns: tuple[int, int]
     """Interval between positions, and between velocities [ns]; 0: never measured."""
     prompt: bool
-    """Whether it measures the whole state at every step without delay."""
+    """Whether the sensor measures the whole state at every step without delay."""
     exact: bool
-    """Whether it also has neither noise nor bias."""
+    """Whether the sensor is `prompt` and has neither noise nor bias."""
 
 
 def sensing(scenario: Scenario) -> Sensing:
@@ -94,8 +94,8 @@ class Navigation:
         """Estimated present state, position [m] and velocity [m/s] of each axis; shape (axes,
         2)."""
         self.predicted = self.estimate
-        """State in which the next input will take effect, used by feedback and in observations.
-        Without a dead time it is the estimate."""
+        """State in which the next input will take effect, used by feedback and in observations;
+        equal to the estimate without a dead time."""
         self.is_known = False
         """Whether the estimate is finite, also as float32."""
 
@@ -162,12 +162,12 @@ class Navigation:
         _, position, velocity = measured
         velocity_now = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
         # Eq. (1) in closed form: the input is constant over this time.
-        left, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
+        decay, steady = np.exp(-age / self._tau_s), self._gain * due + self.filter.disturbance()
         if position is not None:
-            bridged = steady * age + (velocity_now - steady) * self._tau_s * (1.0 - left)
+            bridged = steady * age + (velocity_now - steady) * self._tau_s * (1.0 - decay)
             position = (position + bridged).tolist()
         if velocity is not None:
-            velocity = (steady + (velocity_now - steady) * left).tolist()
+            velocity = (steady + (velocity_now - steady) * decay).tolist()
         return Measurement(to_ns, position, velocity)
 
 
@@ -187,8 +187,8 @@ class Leaps:
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         self.off_m: list[float] = []
-        """Distance of the newest position from the nearest one that the vehicle could have reached,
-        on each axis [m]; empty unless it has leapt."""
+        """Distance of the newest position from the nearest reachable one, on each axis [m]; empty
+        unless the position has leapt."""
         self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position = self._velocity = np.full(scenario.model.axes, math.nan)

@@ -89,7 +89,7 @@ class Pilot:
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
-        """Magnitude of its part without feedback [m/s]."""
+        """Magnitude of the input without feedback [m/s]."""
         self.covered = 0
         self._covered_last = 0
         """Step after the last one with a planned input."""
@@ -227,9 +227,9 @@ class Pilot:
             without_feedback=without_feedback,
             speed_max=speed_max,
         )
-        return self._settled(flown, without_feedback, speed_max, now_ns)
+        return self._final_input(flown, without_feedback, speed_max, now_ns)
 
-    def _settled(
+    def _final_input(
         self,
         flown: list[float] | None,
         without_feedback: Sequence[float],

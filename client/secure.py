@@ -36,8 +36,6 @@ COOKIES_MAX = 64
 
 
 class _Attempt:
-    """Handshake that has not been adopted yet."""
-
     def __init__(self, noise: Initiator, hello: bytes, began_ns: int) -> None:
         self.noise = noise
         self.hello = hello
@@ -65,7 +63,6 @@ class SecureLink:
         """INITIATIONs to be sent in answer to CHALLENGEs."""
         self._attempt: _Attempt | None = None
         self._candidate: Channel | None = None
-        """Channel of the newest WELCOME."""
         self._current: Channel | None = None
         self._previous: Channel | None = None
 

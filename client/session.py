@@ -56,9 +56,9 @@ class Echo(NamedTuple):
     """Newest packet of the server, as echoed in observations."""
 
     server_ns: int
-    """Server time at which it was sent [ns]."""
+    """Server time at which the packet was sent [ns]."""
     received_ns: int
-    """Time of arrival [ns; our clock]."""
+    """Time of its arrival [ns; the client's clock]."""
     heard: int
     """Number of packets received up to and including that packet, modulo NUMBERS."""
 
@@ -123,7 +123,6 @@ class ServerSession:
         self._refusal: NoSession | None = None
         """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
-        """Event that makes a session impossible."""
 
     # -- receiving ---------------------------------------------------------------------------
 

@@ -106,11 +106,11 @@ class Vehicle(ABC):
         """What prevents the flight, in words; empty if nothing does."""
         return ""
 
-    def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - most fly from the start
+    def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - ignored by default
         """Take off if needed; True once the vehicle can be flown by velocities."""
         return True
 
-    def is_up(self, *, now_ns: int) -> bool:  # noqa: ARG002 - most fly from the start
+    def is_up(self, *, now_ns: int) -> bool:  # noqa: ARG002 - ignored by default
         """Whether the vehicle is in the air and can be flown by velocities; does not arm it."""
         return True
 
@@ -121,11 +121,11 @@ class Vehicle(ABC):
         """
         return False
 
-    def hindrance(self, *, now_ns: int) -> Reason | None:  # noqa: ARG002 - most know of none
+    def hindrance(self, *, now_ns: int) -> Reason | None:  # noqa: ARG002 - ignored by default
         """Reason on the vehicle's side that forbids following a plan now, if there is one."""
         return None
 
-    def decide(self, *, keeps_frame: bool) -> None:  # noqa: B027 - most watch for no leap
+    def decide(self, *, keeps_frame: bool) -> None:  # noqa: B027 - optional
         """Decide about `leap_m` after a leap.
 
         Args:
@@ -137,7 +137,7 @@ class Vehicle(ABC):
         """Land without further commands; False if the vehicle cannot, and has to be flown down."""
         return False
 
-    def return_home(self) -> None:  # noqa: B027 - most cannot
+    def return_home(self) -> None:  # noqa: B027 - optional
         """Return home without commands and land there; only called if `returns` is True."""
 
     @property
@@ -150,12 +150,12 @@ class Vehicle(ABC):
         """State that the next run of the client needs."""
         return VehicleMemory()
 
-    def recall(self, frame: VehicleMemory) -> None:  # noqa: B027 - most keep nothing
+    def recall(self, frame: VehicleMemory) -> None:  # noqa: B027 - optional
         """Restore state saved by an earlier run of the client; called before anything else, if at
         all.
         """
 
-    def arm(self) -> None:  # noqa: B027 - most need not be armed
+    def arm(self) -> None:  # noqa: B027 - optional
         """Allow arming, on an operator's order in flight."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
@@ -166,5 +166,5 @@ class Vehicle(ABC):
         """True position [m] and velocity [m/s], shape (axes, 2); None if unknown."""
         return None
 
-    def change(self, scenario: Scenario) -> None:  # noqa: B027 - most have nothing that changes
+    def change(self, scenario: Scenario) -> None:  # noqa: B027 - optional
         """Apply the `changeable` keys of another scenario from now on."""

@@ -42,8 +42,8 @@ def make(scenario: Scenario, number: int) -> Vehicle:
         named = VEHICLES.one(scenario.vehicle.kind)
     except GrammarError as error:
         raise ConfigError(f"vehicle.kind: got {error.given!r}, expected {error.expected}") from None
-    made: Vehicle = VEHICLES[named.name].make(scenario, number, *named.values)
-    if scenario.vehicle.on_loss == "return" and not made.returns:
+    instance: Vehicle = VEHICLES[named.name].make(scenario, number, *named.values)
+    if scenario.vehicle.on_loss == "return" and not instance.returns:
         expected = f"'land' with vehicle.kind = {named.name!r}, which cannot return by itself"
         raise ConfigError(f"vehicle.on_loss: got 'return', expected {expected}")
-    return made
+    return instance

@@ -80,12 +80,11 @@ class Autopilot:
         self._texts = LoggedTexts(vehicle, events)
         self.sets_parameters = False
         self.flavour: Flavour = ARDUPILOT
-        """Which autopilot it is; set with `parts`."""
         self._target = (0, 0)
-        """Numbers of its system and component."""
         self._streams_refused = 0
         self._was_armed = False
-        """Whether a run of the client has armed it since an operator last allowed arming."""
+        """Whether a run of the client has armed the vehicle since an operator last allowed
+        arming."""
 
     @property
     def is_ready(self) -> bool:
@@ -216,9 +215,11 @@ class Autopilot:
         if result in (ACCEPTED, IN_PROGRESS):
             return
         if not self._streams_refused:
-            asked = f"send {stream} at its rate"
+            request = f"send {stream} at its rate"
             answer = RESULTS.get(result, f"result {result}")
-            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+            self._events.append(
+                AutopilotRefused(vehicle=self._vehicle, asked=request, answer=answer)
+            )
         self._streams_refused += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:

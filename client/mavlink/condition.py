@@ -45,15 +45,14 @@ class Condition:
         self._number = 0
         self._number_ns: int | None = None
         self.mode = -1
-        """Number of its flight mode; -1 if unknown."""
+        """Number of the autopilot's flight mode; -1 if unknown."""
         self.armed = False
         self.landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
-        """MAV_LANDED_STATE."""
         self.charge: float | None = None
         """Charge of the battery, from 0 to 1; None if unknown."""
         self.voltage: float | None = None
         self.home: tuple[float, float, float] | None = None
-        """Latitude and longitude of home [°], and its altitude above the sea [m]."""
+        """Latitude and longitude of home [°], and altitude of home above the sea [m]."""
         self.home_up = 0.0
         """Altitude of home in the autopilot's local frame [m]."""
         self._is_bad: dict[str, bool] = {}

@@ -30,7 +30,6 @@ class Arrivals(NamedTuple):
     others: Sequence[Message] = ()
     """Messages of other senders than autopilot and client, once the autopilot is known."""
     met: Message | None = None
-    """First heartbeat of the autopilot."""
     moved: bool = False
 
 

@@ -45,12 +45,12 @@ class Flavour:
     """Numbers of the modes allowed between arming and following set-points."""
     steps: tuple[LaunchStep, ...]
     streams_first: bool
-    """Whether set-points have to be sent before the autopilot enters its guided mode; they also
+    """Whether the autopilot needs set-points before it enters its guided mode; set-points also
     bring it back there."""
     words_for_stations: bool
-    """Whether it sends status texts to ground stations only."""
+    """Whether the autopilot sends status texts to ground stations only."""
     time_out: str
-    """Name of the parameter of its set-point time-out [s]."""
+    """Name of the parameter of the set-point time-out [s]."""
     above_sea: bool
     """Whether the take-off altitude is given above the sea, not above home."""
     bytewise: bool

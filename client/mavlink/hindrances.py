@@ -46,7 +46,7 @@ class Hindrances:
         self._yields = False
         """Whether a second commander flies the vehicle, so that nothing is sent."""
         self._was_disarmed = False
-        """Whether it was disarmed since it flew, so that it is not flown again."""
+        """Whether the vehicle was disarmed since it flew, so that it is not flown again."""
         self._reported_ns: dict[Reason, int] = {}
         """Times at which a second commander was reported, by kind of detection."""
         self._reported_unusable = False

@@ -101,9 +101,8 @@ class Launch:
         self.phase = Phase.GROUND
         self._step = 0
         self._since_ns: int | None = None
-        """Start of the current step."""
         self._asked_ns: int | None = None
-        """Time at which its command was last sent."""
+        """Time at which the command of the current step was last sent."""
         self._accepted = False
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
@@ -115,7 +114,6 @@ class Launch:
         self._closed = False
         """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
-        """Number of the mode in which it descends."""
         self.waits_for = ""
         """What prevents the take-off, in words; empty if nothing does."""
         self._stated_reason = ""
@@ -252,8 +250,8 @@ class Launch:
             case LaunchStep.LIFT:
                 return self._accepted or condition.is_airborne
             case LaunchStep.CLIMB:
-                there = self._positions.altitude >= self._altitude - THERE_M
-                return there and abs(self._positions.velocity[2]) < STILL_MPS
+                at_altitude = self._positions.altitude >= self._altitude - THERE_M
+                return at_altitude and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
         """Wait for the autopilot; give up after too long."""
@@ -399,8 +397,10 @@ class Launch:
         answer = RESULTS.get(result, f"result {result}")
         if (command, result) not in self._refused:
             self._refused.add((command, result))
-            asked = WORDS[command]
-            self._events.append(AutopilotRefused(vehicle=self._vehicle, asked=asked, answer=answer))
+            command_text = WORDS[command]
+            self._events.append(
+                AutopilotRefused(vehicle=self._vehicle, asked=command_text, answer=answer)
+            )
         self._stated_reason = self._stated_reason or answer
 
     def hear_text(self, text: str) -> None:

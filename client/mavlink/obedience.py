@@ -31,7 +31,7 @@ MARGIN_MPS = 1.0
 NOTICED_NS = 100 * MILLISECOND_NS
 """Time for which the deviation has to be larger."""
 QUIET_NS = SECOND_NS
-"""Time without such a deviation after which the vehicle counts as obedient again."""
+"""Time without a large deviation after which the vehicle counts as obedient again."""
 COMMANDS_MAX = 256
 
 

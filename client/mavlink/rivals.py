@@ -53,7 +53,8 @@ class Rivals:
         self._active_ns: int | None = None
         """Time of the newest set-point of a second commander; None without one."""
         self.newest: tuple[int, int, str] = (0, 0, "")
-        """Numbers of its system and component, and the type of its newest message."""
+        """System and component of the newest second commander, and the type of its newest
+        message."""
 
     def hear(self, message: Message, system: int, *, now_ns: int) -> None:
         """Process a message of another sender; `system` is the number of our autopilot's system."""

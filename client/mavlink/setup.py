@@ -98,7 +98,7 @@ class Setup:
                 if can & (BYTEWISE | CONVERTED):
                     self._bytewise = bool(can & BYTEWISE)
                 version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
-                self._found(f"{self._flavour.name} {version}")
+                self._parameter_answered(f"{self._flavour.name} {version}")
             case "PARAM_VALUE":
                 self._hear_parameter(message)
 
@@ -119,7 +119,7 @@ class Setup:
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 
-    def _found(self, name: str) -> None:
+    def _parameter_answered(self, name: str) -> None:
         self._version = name
         self._events.append(
             AutopilotFound(vehicle=self._vehicle, name=name, system=self._target[0])
@@ -139,19 +139,19 @@ class Setup:
         self._asked_ns = now_ns
         if self._version is None:
             return self._ask_version()
-        asked = []
+        questions = []
         for name in list(self._tries)[:AT_ONCE]:
             self._tries[name] += 1
             if self._tries[name] > TRIES:
                 del self._tries[name]
             else:
-                asked.append(self._question(name))
-        return asked
+                questions.append(self._question(name))
+        return questions
 
     def _ask_version(self) -> list[Message]:
         self._version_tries += 1
         if self._version_tries > TRIES:
-            self._found(f"{self._flavour.name} of an unknown version")
+            self._parameter_answered(f"{self._flavour.name} of an unknown version")
         command = dialect.MAV_CMD_REQUEST_MESSAGE
         number = float(VERSION)
         return [

@@ -39,7 +39,7 @@ class MavlinkVehicle(Vehicle):
         self._autopilot = self._port.autopilot
 
     @property
-    def failure(self) -> AboardFailure | None:  # type: ignore[override] # it comes of itself
+    def failure(self) -> AboardFailure | None:  # type: ignore[override] # set in flight
         return self._autopilot.failure
 
     def set_parameters(self) -> bool:
@@ -87,7 +87,7 @@ class MavlinkVehicle(Vehicle):
         return self._port.hindrance(now_ns=now_ns)
 
     @property
-    def leap_m(self) -> tuple[float, ...] | None:  # type: ignore[override] # it comes of itself
+    def leap_m(self) -> tuple[float, ...] | None:  # type: ignore[override] # set in flight
         return self._autopilot.positions.leap_m
 
     def decide(self, *, keeps_frame: bool) -> None:
@@ -115,17 +115,13 @@ class MavlinkVehicle(Vehicle):
         """A known origin cannot be changed, since that would move the fence in flight."""
         if keys & ORIGIN and self._autopilot.positions.has_origin:
             x, y, z = self._autopilot.positions.origin
-            known = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
-            return f"mavlink.origin: got {scenario.mavlink.origin}, but {known}"
+            origin_text = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
+            return f"mavlink.origin: got {scenario.mavlink.origin}, but {origin_text}"
         return ""
 
 
 def altitude(scenario: Scenario, number: int = 1) -> float:
-    """Take-off altitude of a vehicle [m].
-
-    Raises:
-        ConfigError: the flight would begin on the ground.
-    """
+    """Take-off altitude of a vehicle [m]; ConfigError if the flight would begin on the ground."""
     takeoff_m = scenario.mavlink.takeoff_m
     if takeoff_m != "auto":
         return float(takeoff_m)

@@ -91,18 +91,18 @@ def claim(path: Path, *, is_input: bool = False) -> None:
         OSError: the file cannot be written, the command reads it, another option names it, or
             another command has locked it.
     """
-    made = check(path, is_input=is_input) is None
-    if made and is_input:
+    is_new = check(path, is_input=is_input) is None
+    if is_new and is_input:
         return
     folder = path.absolute().parent
     if not os.access(folder, os.W_OK | os.X_OK):
         folder.stat()  # raises if it is missing, which access does not distinguish
         raise OSError(EACCES, os.strerror(EACCES), str(path))
     with ExitStack() as stack:
-        flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if made else 0)
+        flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if is_new else 0)
         descriptor = os.open(path, flags, MODE)
         stack.callback(os.close, descriptor)
-        if made:
+        if is_new:
             stack.callback(_remove_empty, path, descriptor)
         _hold(path, descriptor, stack, is_input=is_input)
 
@@ -186,8 +186,8 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
         if not stat.S_ISREG(mode):
             raise OSError(EINVAL, "it is no plain file")
         if private and stat.S_IMODE(mode) & 0o177:
-            found = f"its mode is {stat.S_IMODE(mode):04o}"
-            raise OSError(EACCES, f"{found}, expected 0600: nobody else may read or write it")
+            problem = f"its mode is {stat.S_IMODE(mode):04o}"
+            raise OSError(EACCES, f"{problem}, expected 0600: nobody else may read or write it")
         note(path, file)
         content = file.read(most + 1)
     if len(content) > most:
@@ -210,8 +210,8 @@ def check_private(path: Path) -> None:
             mode = stat.S_IMODE(each.stat().st_mode)
             # With the sticky bit, the folders within belong to their owners.
             if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
-                found = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
-                raise OSError(EACCES, f"{found}: expected one where nobody else may")
+                problem = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
+                raise OSError(EACCES, f"{problem}: expected one where nobody else may")
 
 
 # -- writing ----------------------------------------------------------------------------------

@@ -127,7 +127,8 @@ class Missing(NamedTuple):
     name: str
     is_stored: bool
     compile: Callable[[], None]
-    """Function that compiles it, or loads machine code compiled by another process since."""
+    """Function that compiles the kernel, or loads machine code compiled by another process
+    since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:
@@ -378,11 +379,11 @@ def _dependencies(function: Callable[..., Any]) -> list[Callable[..., Any]]:
     """A function and all that it calls, as Python functions."""
     reached, waiting = [], [function]
     while waiting:
-        each = waiting.pop()
-        if each in reached:
+        candidate = waiting.pop()
+        if candidate in reached:
             continue
-        reached.append(each)
-        for called in map(each.__globals__.get, each.__code__.co_names):
+        reached.append(candidate)
+        for called in map(candidate.__globals__.get, candidate.__code__.co_names):
             plain_one: Any = getattr(called, "py_func", called)
             if inspect.isfunction(plain_one):
                 waiting.append(plain_one)

@@ -8,14 +8,14 @@ from itertools import pairwise
 
 def meanings(of: type) -> dict[str, str]:
     """Docstring of each field, in one line."""
-    found: dict[str, str] = {}
+    docstrings: dict[str, str] = {}
     for each in reversed(of.__mro__):
         with suppress(TypeError, OSError):  # not a class of Python's own, or without its source
             (definition,) = ast.parse(inspect.getsource(each)).body
             assert isinstance(definition, ast.ClassDef)
-            found |= {
+            docstrings |= {
                 ast.unparse(key.target): " ".join(ast.literal_eval(text.value).split())
                 for key, text in pairwise(definition.body)
                 if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr)
             }
-    return found
+    return docstrings

@@ -163,17 +163,17 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
     """
 
     sets: bool = False
-    """Whether the client was allowed to set them."""
+    """Whether the client was allowed to set the parameters."""
 
     @property
     def brief(self) -> str:
         unknown = ", ".join(each.name for each in self.parameters if each.value is None)
         unsafe = ", ".join(each.name for each in self.parameters if each.value is not None)
         does = "could not set" if self.sets else "sets"
-        told = [f"{unsafe}; --set-parameters {does} them"] if unsafe else []
+        problems = [f"{unsafe}; --set-parameters {does} them"] if unsafe else []
         if unknown:
-            told.append(f"its autopilot has not answered about {unknown}, or does not have it")
-        return f"vehicle {self.vehicle} is not armed: {'; '.join(told)}"
+            problems.append(f"its autopilot has not answered about {unknown}, or does not have it")
+        return f"vehicle {self.vehicle} is not armed: {'; '.join(problems)}"
 
 
 class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
@@ -188,8 +188,8 @@ class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
     why: str
 
     def __str__(self) -> str:
-        said = "arm it anew: skytether set SOCKET armed=true, or on the page"
-        return f"vehicle {self.vehicle} is not armed: {self.why}; {said}"
+        instruction = "arm it anew: skytether set SOCKET armed=true, or on the page"
+        return f"vehicle {self.vehicle} is not armed: {self.why}; {instruction}"
 
 
 class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
@@ -200,10 +200,12 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         at = ", ".join(f"{each:.2f}" for each in self.place)
-        said = "set its origin in that frame: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        instruction = (
+            "set its origin in that frame: skytether set SOCKET 'mavlink.origin=[N, E, UP]'"
+        )
         return (
             f"vehicle {self.vehicle} hovers at [{at}] of its autopilot's local frame "
-            f"(north, east, up), and its origin is not known; {said}"
+            f"(north, east, up), and its origin is not known; {instruction}"
         )
 
 

@@ -144,24 +144,24 @@ class Running:
             ConfigError: a key may not change, or a text has no such argument.
         """
         may, table = sorted(self.changeable), reading.to_table(self._scenario)
-        found: dict[str, Any] = {}
+        merged: dict[str, Any] = {}
         for key, given in values.items():
             text = text_key(key)
             if text in may:
                 set_keys({key: given}, table)
-                found[text] = value(table, text)
+                merged[text] = value(table, text)
                 continue
             try:
                 value(table, text)
             except (KeyError, TypeError):
-                shown = key[:KEY_SHOWN_MAX]
+                shown_key = key[:KEY_SHOWN_MAX]
                 # A request may come from any process that can open the socket: no control
                 # characters in the log.
-                shown = shown if shown.isprintable() else repr(shown)
-                raise ConfigError(f"{shown}: no such key; {hint(key, may)}") from None
+                shown_key = shown_key if shown_key.isprintable() else repr(shown_key)
+                raise ConfigError(f"{shown_key}: no such key; {hint(key, may)}") from None
             what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
-        return found
+        return merged
 
 
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:

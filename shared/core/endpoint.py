@@ -123,7 +123,7 @@ class Endpoint(ABC):
     def next_wake_ns(self) -> int | None:
         """Time of the next wake, or None to wait for datagrams only."""
 
-    def close(self, *, now_ns: int) -> None:  # noqa: B027 - most have nothing to say
+    def close(self, *, now_ns: int) -> None:  # noqa: B027 - optional
         """Send the last datagrams before the driver ends; nothing else is called after it."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
@@ -161,7 +161,7 @@ class Endpoint(ABC):
         """Report an event that originates outside the endpoint."""
         self._events.append(event)
 
-    def undelivered(self, socket: int, reason: str) -> None:  # noqa: B027 - most cannot help it
+    def undelivered(self, socket: int, reason: str) -> None:  # noqa: B027 - optional
         """Note that a datagram from a socket could not be sent, or was refused on its way."""
 
     def figures(self) -> dict[str, Any]:
@@ -172,13 +172,13 @@ class Endpoint(ABC):
         """
         return {}
 
-    def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002 - most keep nothing
+    def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002 - ignored by default
         """State for the next run of this process, if it has changed since the last call; otherwise
         None.
         """
         return None
 
-    def kept(self) -> None:  # noqa: B027 - see `keep`
+    def kept(self) -> None:  # noqa: B027 - optional
         """Note that the latest bytes from `keep` were written."""
 
     @property

@@ -49,7 +49,7 @@ class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
     taken: str = ""
-    """Requested HOST:PORT, if it is in use already."""
+    """Requested HOST:PORT if another process uses that address."""
 
     def __str__(self) -> str:
         # Only a space may follow the address: it is copied, or clicked.
@@ -84,9 +84,9 @@ class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     """Largest speed of the vehicle along the same axis [m/s]."""
 
     def __str__(self) -> str:
-        asked = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
+        required = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
         most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
-        return f"{asked}, and the vehicle flies at most {most}: it cannot follow"
+        return f"{required}, and the vehicle flies at most {most}: it cannot follow"
 
 
 class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -292,8 +292,8 @@ class NumberTaken(PeerEvent, frozen=True, kw_only=True):
     """HOST:PORT of the vehicle that already uses this number."""
 
     def __str__(self) -> str:
-        taken = f"another client flies under this number, from {self.holder}; see --id"
-        return f"vehicle {self.vehicle} from {self.peer} is refused: {taken}"
+        conflict = f"another client flies under this number, from {self.holder}; see --id"
+        return f"vehicle {self.vehicle} from {self.peer} is refused: {conflict}"
 
 
 class NoSession(PeerEvent, frozen=True, kw_only=True):
@@ -316,8 +316,8 @@ class NoAnswer(PeerEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         if self.secure:
-            said = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
-            return f"vehicle {self.vehicle}: {said}"
+            no_answer = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
+            return f"vehicle {self.vehicle}: {no_answer}"
         return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
 
 
@@ -407,7 +407,6 @@ class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
 
 class InZone(VehicleEvent, frozen=True, kw_only=True):
     zone: str
-    """Zone, as written in the scenario."""
 
     def __str__(self) -> str:
         return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is guided out"
@@ -417,7 +416,7 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle on a mission is farther from its motion than allowed."""
 
     off_m: float
-    """Distance outside its tube [m]."""
+    """Distance of the vehicle outside its tube [m]."""
 
     def __str__(self) -> str:
         off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"
@@ -509,12 +508,11 @@ class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
 
 class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     path: str
-    """Journal that contains them."""
     values: dict[str, Any]
 
     def __str__(self) -> str:
-        each = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
-        return f"set in flight and in force again, from {self.path}: {each}"
+        settings = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
+        return f"set in flight and in force again, from {self.path}: {settings}"
 
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):

@@ -22,8 +22,6 @@ FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 
 
 class Line(NamedTuple):
-    """Address of a vehicle's own hardware."""
-
     kind: Literal["udp", "udpout", "tcp", "serial"]
     host: str
     """Host, or path of a serial port."""

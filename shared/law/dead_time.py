@@ -57,7 +57,7 @@ class PendingInputs:
             deque([0.0] * (axis_dead_time.steps + 2), axis_dead_time.steps + 2)
             for axis_dead_time in dead_times
         ]
-        """Inputs of each axis, those of n + 1 steps ago first [m/s]; 0 before the flight."""
+        """Inputs of each axis, oldest (n + 1 steps ago) first [m/s]; 0 before the flight."""
         self._has_rest = any(axis_dead_time.rest for axis_dead_time in dead_times)
 
     def issue(self, command: Array) -> tuple[Array, Array | None]:

@@ -96,9 +96,9 @@ class Hearing:
         self.newest = -1
         """Largest number of a packet that arrived; -1 before the first."""
         self._newest_at = BEFORE
-        """Step or time at which that packet was sent."""
+        """Step or time at which the packet with the largest number was sent."""
         self._silence = 0
-        """Cached `silence`; 0 if it has to be computed again."""
+        """Cached `silence`; 0: to be computed again."""
 
     def begin(self) -> None:
         self._received, self.newest, self._newest_at, self._silence = 0, -1, BEFORE, 0

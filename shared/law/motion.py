@@ -75,8 +75,8 @@ class Clearances(NamedTuple):
 
     @property
     def margin_m(self) -> float:
-        """Margin of a plan beyond these: for the times between those that are checked, and the
-        solver's tolerance [m].
+        """Margin of a plan beyond the other clearances, for times between those that are checked,
+        and the solver's tolerance [m].
         """
         return max(MARGIN_M, 2.0 * self.bend_m + 0.02)
 

@@ -30,8 +30,6 @@ from skytether.shared.law.model import Array, Axis, advance
 
 
 class AxisHorizon(NamedTuple):
-    """Horizon on one axis."""
-
     model: Axis
     inputs: Sequence[float] | Array
     """Inputs of the horizon, from k_h on [m/s]."""

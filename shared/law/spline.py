@@ -40,14 +40,13 @@ class AxisSpline(NamedTuple):
     model: Axis
     knots: Knots
     spacing: int
-    """Steps from one knot to the next."""
     dt_s: float
     length: int
-    """Number of stages at which it may be flown."""
+    """Number of stages at which the spline may be flown."""
     last: float
-    """Input ū at the last of these stages [m/s]."""
+    """Input ū at the last stage that may be flown [m/s]."""
     speed: float
-    """Magnitude of that input over all axes [m/s]."""
+    """Magnitude of ū at the last stage, over all axes [m/s]."""
     brake: float
     """Decrease of speed per step when braking [m/s]; 0 continues along the spline for ever."""
     bound: float

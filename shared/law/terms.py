@@ -35,7 +35,6 @@ class Terms(NamedTuple):
 
     dt_ns: int
     horizon: int
-    """Number of steps planned ahead, H."""
     axes: int
     tau_s: tuple[float, ...]
     """Time constant of the model, eq. (2)-(3), of each axis [s]."""
@@ -54,16 +53,16 @@ class Terms(NamedTuple):
     """Deceleration with which braking takes the desired velocity to zero [m/s²]."""
     age_max_s: float
     join_s: float
-    """Time after its first knot up to which a trajectory is accepted [s]; 0: at any time."""
+    """Time after a trajectory's first knot up to which it is accepted [s]; 0: at any time."""
     land_after_s: float
     """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
     shape: str
     radius_m: float
     """Half the width of circle, figure-eight and square [m]."""
     period_s: float
-    """Time for one round of these shapes [s]."""
+    """Time for one round of circle, figure-eight or square [s]."""
     altitude_m: float
-    """Altitude of these shapes in 3-D [m]."""
+    """Altitude of the shape in 3-D [m]."""
     points: str
     """Digest of the waypoints."""
     speed_mps: float

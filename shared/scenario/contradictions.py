@@ -391,8 +391,8 @@ def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
     if fence.wind_mps >= slowest:
         yield "fence.wind_mps", fence.wind_mps, f"less than {slowest:g}, the vehicle's speed"
     if any(least >= most for least, most in zip(low, high, strict=True)):
-        room = f"more than {2 * drawn:.2g} m above fence.low_m, with {wind}"
-        yield "fence.high_m", list(fence.high_m), room
+        spacing = f"more than {2 * drawn:.2g} m above fence.low_m, with {wind}"
+        yield "fence.high_m", list(fence.high_m), spacing
     if radius <= 0.0:
         yield "fence.radius_m", fence.radius_m, f"more than {drawn:.2g} m, with {wind}"
 
@@ -427,9 +427,13 @@ def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Cont
         if over.any():
             at = int(over.argmax())
             where = ", ".join(f"{each:.3g}" for each in position[at])
-            asked = f"at {at * scenario.control.dt:g} s ({where}) m at {speed[at]:.3g} m/s"
-            kept = f"{max(margins(scenario)):.2g} m inside"
-            yield key, value, f"{more}, for the trajectory asks {asked}, and the fence keeps {kept}"
+            demanded = f"at {at * scenario.control.dt:g} s ({where}) m at {speed[at]:.3g} m/s"
+            margin = f"{max(margins(scenario)):.2g} m inside"
+            yield (
+                key,
+                value,
+                f"{more}, for the trajectory asks {demanded}, and the fence keeps {margin}",
+            )
             return
 
 

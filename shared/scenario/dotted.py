@@ -98,8 +98,8 @@ def with_argument(key: str, text: str, path: str, value: object) -> str:
         return table.with_argument(text, at, value)
     except KeyError:
         name, _, last = at.partition(".")
-        known = [each.name for each in table[name].parameters] if name in table else list(table)
-        suggestion = hint(last if name in table else name, known)
+        names = [each.name for each in table[name].parameters] if name in table else list(table)
+        suggestion = hint(last if name in table else name, names)
         raise ConfigError(f"{path}: no such key; {suggestion}") from None
     except GrammarError as error:
         raise ConfigError(f"{path}: got {error.given!r}, expected {error.expected}") from None

@@ -39,7 +39,7 @@ def stationary_gain(model: Model, control: ControlConfig) -> Array:
     S of the weights is added to R.
     """
     weight = control.input_weight + control.change_weight
-    gain = _settled(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)
+    gain = _converged_gain(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)
     return gain[:, :2]
 
 
@@ -49,13 +49,13 @@ def regulator(scenario: Scenario) -> Array:
     """
     model, control = scenario.terms().model, scenario.control
     Q, R, S = control.state_weight, control.input_weight, control.change_weight
-    gain = _settled(model.A.tobytes(), model.B.tobytes(), Q, R, S)
+    gain = _converged_gain(model.A.tobytes(), model.B.tobytes(), Q, R, S)
     lag = -gain[:, 2:]
     return np.concatenate([gain[:, :2] / (1.0 - lag), lag], axis=1)
 
 
 @lru_cache(maxsize=64)
-def _settled(
+def _converged_gain(
     a: bytes,
     b: bytes,
     state_weight: tuple[float, float],
@@ -81,8 +81,8 @@ def _settled(
         ahead = np.einsum("ai,aij->aj", B, cost)
         weight = R + np.einsum("aj,aj->a", ahead, B)
         gain = (np.einsum("ai,aij->aj", ahead, A) + cross) / weight[:, None]
-        left = A - B[:, :, None] * gain[:, None, :]
-        rolled = np.einsum("aji,ajk,akl->ail", A, cost, left)
+        closed_loop = A - B[:, :, None] * gain[:, None, :]
+        rolled = np.einsum("aji,ajk,akl->ail", A, cost, closed_loop)
         cost, before = Q + rolled - cross[:, None] * gain[:, None, :], cost
     # Read-only, as the cached array is shared.
     gain.setflags(write=False)

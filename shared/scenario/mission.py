@@ -196,10 +196,10 @@ class _Stays(NamedTuple):
         """
         pairs: list[tuple[float, float, int, int]] = []
         for turn in count():
-            left = first + turn < behind
-            if not left.any() or (pairs and turn > CROWDED):
+            remaining = first + turn < behind
+            if not remaining.any() or (pairs and turn > CROWDED):
                 return pairs
-            stays, first, behind = stays[left], first[left], behind[left]
+            stays, first, behind = stays[remaining], first[remaining], behind[remaining]
             with_ = others[first + turn]
             away_m = np.linalg.norm(self.places_m[stays] - self.places_m[with_], axis=1)
             near = (away_m < apart_m) & (self.vehicles[stays] != self.vehicles[with_])

@@ -26,7 +26,7 @@ class TooFast(NamedTuple):
     speed_mps: float
     """Desired speed along the axis with the largest excess [m/s]."""
     most_mps: float
-    """Largest speed of the vehicle along that axis [m/s]."""
+    """Largest speed of the vehicle along the axis with the largest excess [m/s]."""
 
 
 def is_known(scenario: Scenario) -> bool:

@@ -99,12 +99,12 @@ class Parameter:
 
     def without_unit(self, value: Value | None) -> Value | None:
         """A number in the parameter's own unit, from a word such as 50ms, 10% or 1mbit."""
-        found = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
+        match = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
         units = next(units for end, units in UNITS.items() if self.name.endswith(end))
-        if found is None or found[2].lower() not in units:
+        if match is None or match[2].lower() not in units:
             return value
-        multiplier, divisor = units[found[2].lower()]
-        return float(found[1]) * multiplier / divisor
+        multiplier, divisor = units[match[2].lower()]
+        return float(match[1]) * multiplier / divisor
 
     @property
     def file(self) -> bool:
@@ -139,7 +139,6 @@ class Entry:
     """Function or class; called with the program's arguments, then those of the scenario."""
     parameters: tuple[Parameter, ...]
     about: str
-    """First paragraph of the docstring of `make`."""
     needs: str = ""
     """Figure that a scheme must compute for this entry (`schemes.SchemeProperties.computes`), or
     empty."""
@@ -195,6 +194,8 @@ class Entry:
 class PluginTable(dict[str, Entry]):
     """Entries of one kind by name, and the decorator that adds one.
 
+    Methods with a text of entries raise GrammarError if a part of it is invalid.
+
     Args:
         kind: noun for an entry, for messages.
         form: example of a text with entries, for messages.
@@ -212,11 +213,7 @@ class PluginTable(dict[str, Entry]):
         self._given, self._class, self._texts = given, class_, texts
 
     def parse(self, text: str) -> Expression:
-        """Parse entries combined with & and |, and bind their arguments to parameters.
-
-        Raises:
-            GrammarError: a part of the text is invalid.
-        """
+        """Parse entries combined with & and |, and bind their arguments to parameters."""
 
         def bound(expression: Expression) -> Expression:
             match expression:
@@ -228,11 +225,7 @@ class PluginTable(dict[str, Entry]):
         return bound(grammar.parse(text, self.form))
 
     def one(self, text: str) -> Call:
-        """Parse a text that names a single entry.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Parse a text that names a single entry."""
         call = grammar.parse(text, self.form)
         # Without arguments, no spaces or parentheses: other code compares the text with names.
         if not isinstance(call, Call) or not (call.keys or text == call.name):
@@ -240,19 +233,11 @@ class PluginTable(dict[str, Entry]):
         return self._bound(call)
 
     def calls(self, text: str) -> list[Call]:
-        """Parse entries joined by & only; an empty text has none.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Parse entries joined by & only; an empty text has none."""
         return [self._bound(each) for each in grammar.calls(text, self.form)]
 
     def files(self, text: str) -> list[str]:
-        """Names of files in a text of entries joined by &.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Names of files in a text of entries joined by &."""
         return [str(value) for call in self.calls(text) for value, file in self._args(call) if file]
 
     def make(self, call: Call, files: Files = (), *given: object) -> Any:
@@ -270,11 +255,7 @@ class PluginTable(dict[str, Entry]):
         return self[call.name].make(*given, *args)
 
     def with_files(self, text: str, change: Callable[[str], str]) -> str:
-        """Text of entries joined by &, with each file name replaced by `change(name)`.
-
-        Raises:
-            GrammarError: see `parse`.
-        """
+        """Text of entries joined by &, with each file name replaced by `change(name)`."""
         for call in reversed(self.calls(text)):
             if any(file for _, file in self._args(call)):
                 values = [change(str(value)) if file else value for value, file in self._args(call)]
@@ -378,8 +359,8 @@ class PluginTable(dict[str, Entry]):
             raise ConfigError(f"{what}: expected another name, {other.source} has one of this name")
         if lacking := sorted(getattr(make, "__abstractmethods__", ())):
             raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
-        given = self._class if isinstance(make, type) else self._given
-        parameters = _parameters(what, make, given, texts=self._texts)
+        passed = self._class if isinstance(make, type) else self._given
+        parameters = _parameters(what, make, passed, texts=self._texts)
         about = inspect.cleandoc(make.__doc__ or "").partition("\n\n")[0]
         self[name] = Entry(make, parameters, " ".join(about.split()), needs)
 
@@ -414,10 +395,10 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     default = None if taken.default is taken.empty else taken.default
     words = texts and typing.get_origin(kind) is Literal and typing.get_args(kind)
-    written = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
+    is_writable = kind in (int, float) or (words and all(isinstance(each, str) for each in words))
     is_rest = texts and taken.kind is taken.VAR_POSITIONAL
-    one = taken.kind is taken.POSITIONAL_OR_KEYWORD or is_rest
-    if not one or not (written or (texts and kind is File)):
+    is_single = taken.kind is taken.POSITIONAL_OR_KEYWORD or is_rest
+    if not is_single or not (is_writable or (texts and kind is File)):
         raise ConfigError(f"{what}: {taken}: expected a number, as in {taken.name}: float")
     for mark in marks:
         if not isinstance(mark, Meta | str):  # a bound of another kind would not be checked

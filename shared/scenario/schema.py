@@ -109,8 +109,8 @@ class ControlConfig(Section, frozen=True):
     scheme: Term[Text] = "trajectory"
     """Delay compensation, see `skytether schemes`."""
     feedback: Term[bool] = True
-    """Whether the vehicle corrects deviations from a horizon's states. If it can only play back
-    inputs: false, and `input_weight` 3, as in the scenario `playback`."""
+    """Whether the vehicle corrects deviations from a horizon's states. A vehicle that can only play
+    back inputs needs false, and `input_weight` 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
     """Longest time from making a horizon to flying it [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
@@ -427,8 +427,7 @@ class Scenario(Section, frozen=True):
     duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
     """Length of the flight [s]."""
     settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
-    """Time at the start that RMSE leaves out [s]; half of the flight if it is shorter than
-    this time."""
+    """Time at the start that RMSE leaves out [s]; half of the flight if the flight is shorter."""
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
     """Seed of all random numbers."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True

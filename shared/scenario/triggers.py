@@ -159,7 +159,7 @@ class Verdict(NamedTuple):
     """Figure of the leftmost policy that compares one, or V(k) of eq. (16) if none does; shape
     (n,)."""
     threshold: Array
-    """Threshold of that figure, or 0 if nothing is compared; shape (n,)."""
+    """Threshold of `figure`, or 0 if nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
     """Which figure is compared with the threshold."""
 
@@ -201,11 +201,11 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
     compared = figure if isinstance(figure, Compared) else Compared.OWN
     values = situation.figures[str(figure)] if isinstance(figure, Compared) else figure
     event = situation.figures["fresh"] | (values > threshold)
-    return Verdict(event, values, _each(len(values), threshold), compared)
+    return Verdict(event, values, _constant(len(values), threshold), compared)
 
 
 @lru_cache(maxsize=256)
-def _each(n: int, number: float) -> Array:
+def _constant(n: int, number: float) -> Array:
     column = np.full(n, number)
     column.flags.writeable = False
     return column
@@ -219,7 +219,7 @@ def _all_of(n: int) -> Flags:
 
 
 def _timed(event: Flags, figures: Figures) -> Verdict:
-    return Verdict(event, figures["state_gap"], _each(len(event), 0.0), Compared.NOTHING)
+    return Verdict(event, figures["state_gap"], _constant(len(event), 0.0), Compared.NOTHING)
 
 
 class _Stateless(Trigger):

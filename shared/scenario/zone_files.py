@@ -195,8 +195,8 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     if kind == "Point":
         ((x, y),) = placed([coordinates]).tolist()
         if "radius_m" not in properties:
-            known = ", ".join(map(str, properties))[:80] or "no properties"
-            raise ValueError(f"a Point with the property radius_m in metres, not with {known}")
+            names = ", ".join(map(str, properties))[:80] or "no properties"
+            raise ValueError(f"a Point with the property radius_m in metres, not with {names}")
         radius = number(properties["radius_m"], "radius_m")
         if not 0.0 < radius <= METRES_MAX:
             raise ValueError(f"radius_m above 0, at most {METRES_MAX:g}")

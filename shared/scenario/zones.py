@@ -148,8 +148,8 @@ class Zones:
         begin, end = self._begin, self._begin + self._along
         spans = (begin[:, 1] > y) != (end[:, 1] > y)
         rise = np.where(self._along[:, 1] == 0.0, 1.0, self._along[:, 1])
-        left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
-        crossed = np.add.reduceat((spans & left).astype(np.int64), self._starts, axis=1)
+        is_left = x < begin[:, 0] + (y - begin[:, 1]) / rise * self._along[:, 0]
+        crossed = np.add.reduceat((spans & is_left).astype(np.int64), self._starts, axis=1)
         inside: Flags = crossed % 2 == 1
         return inside
 

@@ -34,7 +34,8 @@ class ProcessCounts(msgspec.Struct, frozen=True):
     uplink: DirectionCounts = DirectionCounts()
     downlink: DirectionCounts = DirectionCounts()
     refused: int | dict[str, int] = 0
-    """netem's packets without a flow; in a server's figures, refused HELLOs, which are no drops."""
+    """netem's packets without a flow; in a server's figures, refused
+    HELLOs, which are answered and so not drops."""
     kernel_drops: int = 0
 
 

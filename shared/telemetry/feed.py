@@ -35,7 +35,8 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
-    """Parts of the record in this feed, by name: their columns, as numpy's description in JSON."""
+    """Parts of the record in this feed: columns by name of the part, as numpy's description in
+    JSON."""
     wall_ns: int
     """Time of day corresponding to `time_ns` [ns since 1970]."""
     time_ns: int
@@ -46,9 +47,8 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     part: str
     """Name of the part: client, server, plan or netem."""
     time_ns: int
-    """Time at which they were recorded [ns; CLOCK_MONOTONIC]."""
+    """Time at which the rows were recorded [ns; CLOCK_MONOTONIC]."""
     rows: bytes
-    """Rows as in memory."""
 
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -61,7 +61,6 @@ class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
     time_ns: int
     figures: dict[str, Any]
-    """Figures by name, see `Endpoint.figures`."""
 
 
 Frame = Opened | Rows | Said | Figures

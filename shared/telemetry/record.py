@@ -115,7 +115,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("measured", "<f8", (axes, 2)),  # since the step before [m, m/s]; NaN if not measured
             ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
-            ("covered", "?"),  # whether it comes from a horizon: not while hovering or braking
+            ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
             ("in_force", "<i8"),  # step that the horizon in force was made for; -1 for none
             ("age_ns", "<i8"),  # age of the observation behind that horizon; -1 for none
             ("stale", "<i8"),  # number of horizons older than the one in force, so far

@@ -61,11 +61,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     uplink_packets_per_s: float | None = None
     """Rate of packets from the server, including heartbeats and lost ones [1/s]."""
     uplink_bytes_per_s: float | None = None
-    """Data rate of these packets, with HEADER_BYTES per packet [B/s]."""
+    """Data rate of the packets from the server, with HEADER_BYTES per packet [B/s]."""
     downlink_packets_per_s: float | None = None
     """Rate of packets from the vehicle [1/s]."""
     downlink_bytes_per_s: float | None = None
-    """Data rate of these packets, with HEADER_BYTES per packet [B/s]."""
+    """Data rate of the packets from the vehicle, with HEADER_BYTES per packet [B/s]."""
     packets_per_s: float | None = None
     """Rate of packets both ways [1/s]."""
     bytes_per_s: float | None = None
@@ -87,7 +87,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Mean age of information: the age of the observation behind the input [s], over the steps from
     `settle` on."""
     aoi_s_peak: float | None
-    """Mean of the peaks of this age [s]: its value at each step before it decreases."""
+    """Mean of the peaks of the age of information [s]: its value at each step before it
+    decreases."""
     plan_age_s_mean: float | None
     """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
     of information that only the server has, such as the position of a target."""

@@ -11,7 +11,7 @@ from enum import StrEnum
 class Drop(StrEnum):
     """Why a datagram is dropped; the value is the text for people and the name in metrics."""
 
-    # It is no message.
+    # No message.
     TOO_LONG = "too long"
     NOT_MSGPACK = "not msgpack"
     NOT_A_MESSAGE = "not a message"
@@ -22,7 +22,7 @@ class Drop(StrEnum):
     NOT_FINITE = "not finite"
     INPUT_OUT_OF_RANGE = "input out of range"
 
-    # It is not for this end, or not in this session.
+    # For another end, or another session.
     ELSEWHERE = "not from the server's address"
     NOT_FOR_A_SERVER = "not for a server"
     NOT_FOR_A_CLIENT = "not for a client"
@@ -35,7 +35,7 @@ class Drop(StrEnum):
     FULL = "full"
     TAKEN = "taken"
 
-    # It is not sealed as it should be, see `wire.channel` and `wire.handshake`.
+    # Not sealed correctly, see `wire.channel` and `wire.handshake`.
     NOT_SEALED = "not sealed"
     LENGTH = "length"
     UNKNOWN_KEY = "unknown key"
@@ -47,12 +47,12 @@ class Drop(StrEnum):
     OUT_OF_PLACE = "out of place"
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
-    # It is an observation that is impossible, see `server.plausibility`.
+    # Impossible observations, see `server.plausibility`.
     IMPLAUSIBLE_CLOCK = "implausible: clock"
     IMPLAUSIBLE_HORIZON = "implausible: horizon"
     IMPLAUSIBLE_JUMP = "implausible: jump"
 
-    # It is a horizon that is not flown, see `client.compensator`.
+    # Horizons that are not flown, see `client.compensator`.
     FROM_THE_FUTURE = "from the future"
     OBSERVATION = "observation"
     """The observation from which the horizon was planned is impossible."""

@@ -60,9 +60,8 @@ STAMPS = 2**32
 REFERENCE_P = 0
 """Column of `Horizon.feedback`: position of x̄ at the horizon's step [m]."""
 REFERENCE_V = 1
-"""Column of `Horizon.feedback`: velocity of x̄ at that step [m/s]."""
+"""Column of `Horizon.feedback`: velocity of x̄ at the horizon's step [m/s]."""
 REFERENCE = [REFERENCE_P, REFERENCE_V]
-"""Columns of `Horizon.feedback`: x̄, position and velocity."""
 DISTURBANCE = 2
 """Column of `Horizon.feedback`: disturbance ŵ that the inputs compensate [m/s]."""
 GAIN_P = 3
@@ -70,7 +69,6 @@ GAIN_P = 3
 GAIN_V = 4
 """Column of `Horizon.feedback`: K on velocity."""
 FEEDBACK = 5
-"""Number of columns of `Horizon.feedback`."""
 
 NO_FEEDBACK = np.empty((0, 0), np.float32)
 FLOAT_MAX = float(np.finfo(np.float32).max)
@@ -130,7 +128,7 @@ class Mode(IntEnum):
     COAST = 4
     """Flies on along a horizon without a newer one."""
     BRAKE = 5
-    """Brakes to a stop, beginning at its last input."""
+    """Brakes to a stop from the last input."""
     HOVER = 6
     """At rest, holding the position."""
     LAND = 7
@@ -162,7 +160,7 @@ class Observation(NamedTuple):
     """First step that was flown with that horizon."""
     backward_us: int
     """Time stamp: arrival of the server's newest packet, in time since the vehicle's step 0, minus
-    the server's clock when it was sent."""
+    the server's clock when the packet was sent."""
     heard: int
     """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
@@ -187,7 +185,7 @@ class Horizon(NamedTuple):
     step: int
     """Step k of the first input, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     age: int
     """Steps from the server's newest observation to `step`."""
     inputs: NDArray[np.float32]
@@ -209,11 +207,10 @@ class Trajectory(NamedTuple):
     step: int
     """Step k of the first knot, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     age: int
     """Steps from the server's newest observation to `step`."""
     spacing: int
-    """Steps from one knot to the next."""
     knots: NDArray[np.float32]
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     number: int = 0
@@ -247,7 +244,7 @@ class Heartbeat(NamedTuple):
     vehicle: int
     session: int
     server_us: int
-    """Time stamp: the server's clock when it was sent."""
+    """Time stamp: the server's clock when the packet was sent."""
     idle: int
     degraded: int
     """1 if the server misses too many ticks, else 0."""
@@ -270,11 +267,11 @@ class Time(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k in which it is sent, on the vehicle's grid."""
+    """Step k in which the message is sent, on the vehicle's grid."""
     epoch_us: int
     """Time stamp: the time since 1970 at which step 0 began."""
     error_us: int
-    """Largest error of that time [µs]."""
+    """Largest error of `epoch_us` [µs]."""
 
 
 # With 10 % loss, all three are lost once in a thousand times.
@@ -352,11 +349,11 @@ def _is_plain(value: object) -> bool:
 def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
     """State and input of an observation; the input is NO_INPUT if the scheme does not use it."""
     axes = ours.axes
-    told = _FLOATS[axes * (2 if ours.splines else 3)]
-    if type(value) is not bytes or len(value) != told.size:
+    layout = _FLOATS[axes * (2 if ours.splines else 3)]
+    if type(value) is not bytes or len(value) != layout.size:
         raise ProtocolError(Drop.SHAPE)
     # Struct takes 0.2 µs for six numbers, np.frombuffer and tolist 0.7 µs.
-    numbers = told.unpack(value)
+    numbers = layout.unpack(value)
     # The sum of float32 numbers is finite unless one of them is not.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
@@ -474,9 +471,8 @@ _NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
-def _told(said: Observation) -> list[object]:
-    """Fields of an observation on the wire."""
-    vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = said
+def _observation_fields(sent: Observation) -> list[object]:
+    vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = sent
     numbers = state.ravel().tolist() + u.tolist()
     return [
         # Steps are sent as differences, mode and `takes` as one number: usually a byte each instead
@@ -496,8 +492,8 @@ def _told(said: Observation) -> list[object]:
     ]
 
 
-def _observation(told: Iterable[Any]) -> Observation:
-    vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = told
+def _observation(fields: Iterable[Any]) -> Observation:
+    vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = fields
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
     # Differences may lead below step 0 even if each of them is within its range.
@@ -512,7 +508,7 @@ def _observation(told: Iterable[Any]) -> Observation:
 def encode(message: Message) -> bytes:
     """Datagram of a message; arrays are sent as little-endian bytes."""
     if type(message) is Observation:
-        payload: bytes = _PACKER.pack(_told(message))
+        payload: bytes = _PACKER.pack(_observation_fields(message))
     else:
         payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
     assert len(payload) <= PAYLOAD_BYTES_MAX
@@ -531,8 +527,8 @@ def encode_horizon(
     silence: int,
 ) -> bytes:
     """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
-    told = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
-    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *told))
+    fields = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
+    payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
@@ -560,10 +556,10 @@ def decode(payload: bytes, terms: Terms) -> Message:
         raise ProtocolError(Drop.TOO_LONG)
     if payload.startswith(_QUICK_START):
         with suppress(msgspec.DecodeError):
-            told = list(_QUICK.decode(payload)[2:])
+            quick = list(_QUICK.decode(payload)[2:])
             for i, made_of in _MADE:
-                told[i] = made_of(told[i], terms)
-            return _observation(told)
+                quick[i] = made_of(quick[i], terms)
+            return _observation(quick)
     try:
         # No message has a map or an extension, so none is ever built from received bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)

@@ -285,7 +285,7 @@ def test_an_autopilot_that_ends_in_a_climb_is_told_to_be_silent(flavour: Flavour
     air.end(60.0)
     doing, because = why(air)
     assert doing == "not at the altitude of take-off in 12 s"
-    assert "nothing is heard" in because
+    assert "no message from its autopilot" in because
 
 
 def test_without_a_position_nothing_is_armed() -> None:

@@ -189,7 +189,7 @@ def test_a_line_that_is_cut_is_told_in_the_climb_and_on_the_ground(armed: bool) 
     assert air.flight.armed is armed
     air.tap.dumb = True
     air.run(8.0)
-    assert "nothing is heard" in air.of(AutopilotWaits)[-1].waits_for
+    assert "it is silent" in air.of(AutopilotWaits)[-1].waits_for
 
 
 def test_a_vehicle_found_armed_waits_for_a_person_once_it_is_disarmed() -> None:

@@ -82,7 +82,7 @@ def test_a_return_is_lowered_where_parameters_may_be_set(flavour: FlavourName) -
 
 
 def test_vehicles_of_a_mission_land_straight_down() -> None:
-    with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*lands straight down"):
+    with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*vertical landing"):
         packaged("swap", vehicle={"on_loss": "return"})
 
 

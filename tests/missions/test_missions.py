@@ -944,7 +944,7 @@ def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
     assert ends == [[0.0, 1.0], [9.0, 1.0]]
     assert found.start_m(2).tolist() == [9.0, 0.0]
     fewer = with_goals(tmp_path, "1,0,0,0\n1,5,9,1\n2,0,9,0\n", allocate=True)
-    with pytest.raises(ConfigError, match=r"mission\.allocate: .* a goal of each vehicle at each"):
+    with pytest.raises(ConfigError, match=r"mission\.allocate: .* goals of all vehicles at"):
         reading.check(fewer, "mission")
 
 

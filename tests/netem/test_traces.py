@@ -356,7 +356,7 @@ def test_bytes_that_are_no_text_are_refused(content: bytes, said: str) -> None:
         ),
         ("timestamp,rtt\n0,0.3\n1,0.4\n", "got 'rtt', which may be seconds or milliseconds"),
         ("t,rtt_ms\n0,9\n10,9\n20,9\n", "got 't', which may be seconds or milliseconds"),
-        ("time_s,delay_s,lost\n0,1,1\n1,1,1\n", "got lost packets alone"),
+        ("time_s,delay_s,lost\n0,1,1\n1,1,1\n", "got lost packets only"),
         ("time_s,delay_s\n0,0.1\n2e9,0.1\n", "got 2e+09 s, expected at most 1e9 s"),
         ('{"round_trips": [{}]}', "expected JSON as irtt writes it"),
         ("{" * 100_000, "expected JSON as irtt writes it"),

@@ -87,7 +87,9 @@ def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path)
     driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
     _, scenario, news = begun(tmp_path)
     assert scenario.network.uplink == LOSSY(0.25)
-    assert str(news[0]).endswith("as it was set in flight: " + f"network.uplink = '{LOSSY(0.25)}'")
+    said = str(news[0])
+    assert said.startswith("set in flight and in force again, from ")
+    assert said.endswith(f": network.uplink = '{LOSSY(0.25)}'")
     answers, _ = driven(
         tmp_path,
         lambda caller: (caller.ask({"network.downlink.loss": 0.5}), caller.ask({}).values)[1],

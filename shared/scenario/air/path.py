@@ -7,7 +7,7 @@ packet lost by one is lost.
 
 from functools import lru_cache
 
-from skytether.shared.scenario.air import delays, losses, queues, traces  # noqa: F401 - the table
+from skytether.shared.scenario.air import delays, losses, queues, traces  # noqa: F401 - fills the table
 from skytether.shared.scenario.air.impairment import Impairment
 from skytether.shared.scenario.air.queues import Ordered, Queued
 from skytether.shared.scenario.grammar import Call, GrammarError

@@ -24,7 +24,6 @@ from skytether.shared.law.model import Array
 ROWS_MAX = 1_000_000
 LINES_MAX = 2 * ROWS_MAX
 LINE_MAX = 400
-"""Number of characters read of a line."""
 EVERY_S = 1.0
 """Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
@@ -77,8 +76,8 @@ class Run:
         """Times of sending [s] and round trips [s], NaN of lost packets, from first to last."""
         low = self.low()
         numbers = np.arange(low, self.last + 1, dtype=np.float64)
-        known = sorted((n, *trip) for n, trip in self.trips.items() if isfinite(trip[1]))
-        at, at_s, trip_s = np.array(known, dtype=np.float64).reshape(-1, 3).T
+        answered = sorted((n, *trip) for n, trip in self.trips.items() if isfinite(trip[1]))
+        at, at_s, trip_s = np.array(answered, dtype=np.float64).reshape(-1, 3).T
         trips_s: Array = np.full(len(numbers), nan)
         trips_s[at.astype(int) - low] = trip_s
         stamped = np.isfinite(at_s)
@@ -120,16 +119,16 @@ class Log:
             both = f"got answers of {run.peer} and of {peer}"
             raise LogError(f"{both}, expected one host: keep the lines of one")
         placed = run.place(number)
-        came = isfinite(trip_s)
-        there = run.trips.get(-1 if placed is None else placed, (nan, nan))
-        twice = isfinite(there[1])
-        if placed is None or (twice and came and not copy):
+        is_answered = isfinite(trip_s)
+        present = run.trips.get(-1 if placed is None else placed, (nan, nan))
+        twice = isfinite(present[1])
+        if placed is None or (twice and is_answered and not copy):
             run, placed, twice = self.begin(None), number, False
         if at_s < run.at_s - BACK_MAX_S:
             back = f"{run.at_s - at_s:.6g} s before the line above"
             raise LogError(f"got a time {back}, expected rising times: split the file there")
         run.peer, run.last = peer, max(run.last, placed)
-        if came:
+        if is_answered:
             run.at_s = max(run.at_s, at_s)
             run.copies += twice
         if not twice:

@@ -216,11 +216,11 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
     Raises:
         ValueError: the median lies between.
     """
-    known = values[np.isfinite(values)]
-    median = float(np.median(known)) if len(known) else 0.0
+    finite = values[np.isfinite(values)]
+    median = float(np.median(finite)) if len(finite) else 0.0
     if low <= median <= high:
-        said = f"got {name!r}, which may be seconds or milliseconds (median {median:.3g})"
-        raise ValueError(f"{said}, expected {name}_s or {name}_ms in the first line")
+        problem = f"got {name!r}, which may be seconds or milliseconds (median {median:.3g})"
+        raise ValueError(f"{problem}, expected {name}_s or {name}_ms in the first line")
     return 1.0 if median < low else 1e-3
 
 
@@ -267,8 +267,8 @@ def _of_irtt(text: str, way: Way) -> RecordedPath:
         for trip in msgspec.json.decode(text, type=_Irtt).round_trips[: ROWS_MAX + 1]:
             sent = trip.timestamps.client.send
             sent_ns = sent.monotonic if sent.monotonic is not None else sent.wall
-            came = trip.lost in ("false", False)
-            rows.append((sent_ns, *((trip.delay[key], trip.delay["rtt"]) if came else _LOST)))
+            arrived = trip.lost in ("false", False)
+            rows.append((sent_ns, *((trip.delay[key], trip.delay["rtt"]) if arrived else _LOST)))
         times, delays, trips = np.array(rows, dtype=np.float64).reshape(-1, 3).T * 1e-9
     except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"expected JSON as irtt writes it: {error!r}") from None

@@ -65,8 +65,8 @@ def deliveries_in(file: File) -> Array:
         wrong = ~np.isfinite(times) | (times < 0.0) | (np.diff(times, prepend=0.0) < 0.0)
         if wrong.any():
             row = int(np.argmax(wrong))
-            said = f"row {row + 1}: got {times[row]:g}, expected milliseconds in rising order"
-            raise ValueError(said)
+            problem = f"row {row + 1}: got {times[row]:g}, expected milliseconds in rising order"
+            raise ValueError(problem)
         if times[-1] == 0.0:
             raise ValueError("got times of 0 alone, expected milliseconds in rising order")
     except ValueError as error:
