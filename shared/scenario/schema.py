@@ -536,7 +536,7 @@ class Scenario(Section, frozen=True):
             points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
             speed_mps=reference.speed_mps,
             loop=reference.loop,
-            table=_digest(self.table + repr(reference.origin).encode() * bool(reference.origin)),
+            table=self._table_digest(),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
@@ -606,6 +606,11 @@ class Scenario(Section, frozen=True):
         flies = self.vehicle.kind.partition("(")[0].strip()
         if flies in VEHICLES:  # built-in ones are registered by the client, which may be missing
             yield VEHICLES[flies]
+
+    def _table_digest(self) -> str:
+        """Digest of `reference.file`, and of the origin of its coordinates."""
+        origin = self.reference.origin
+        return _digest(self.table + repr(origin).encode() if self.table and origin else self.table)
 
     def _shape(self) -> str:
         """Shape as a term: its name; for a plug-in, its text and a digest of its states."""

@@ -35,6 +35,7 @@ OTHER: dict[str, Any] = {
     "model.axes": 3,
     "control.scheme": "predictive",
     "control.feedback": False,
+    "reference.origin": [47.0, 8.0],
     "reference.preview": 1.0,
     "sensor.filter": "none",
     "sensor.position_bias_m": [0.1, 0.1],
@@ -189,6 +190,9 @@ def test_a_trajectory_is_compared_by_what_stands_in_its_file(tmp_path: Path) -> 
         reference = {"shape": "csv", "file": str(file)}
         scenarios.append(reading.check({"reference": reference}, name))
     assert scenarios[0].terms() == scenarios[1].terms()
+    elsewhere = reading.to_table(scenarios[1])
+    elsewhere["reference"]["origin"] = [47.0, 8.0]
+    assert scenarios[0].terms() != reading.check(elsewhere, "elsewhere").terms()
 
 
 def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
