@@ -16,7 +16,7 @@ from skytether.autopilot.faults import Script, ScriptedFault
 from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
 from skytether.autopilot.flight import TICK_NS, PilotedVehicle, Result
 from skytether.autopilot.px4 import PX4
-from skytether.autopilot.telemetry import HEARTBEAT, STREAMS, Telemetry
+from skytether.autopilot.telemetry import ALL, GROUPS, HEARTBEAT, STREAMS, Telemetry
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -42,6 +42,7 @@ PATIENCE_NS = SECOND_NS
 BEHIND_MAX_NS = SECOND_NS
 """Longest time that is simulated at once after a late wake [ns]; the flight skips the rest."""
 LISTED_EACH_TICK = 2
+HOME = int(dialect.MAVLINK_MSG_ID_HOME_POSITION)
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -147,6 +148,11 @@ class Autopilot(Endpoint):
             "COMMAND_LONG": self._on_command,
             "COMMAND_INT": self._on_command,
             "SET_MODE": self._on_mode,
+            "REQUEST_DATA_STREAM": self._on_data_stream,
+            "AUTOPILOT_VERSION_REQUEST": self._on_version_request,
+            "MISSION_REQUEST_LIST": self._on_mission_list,
+            "MISSION_CLEAR_ALL": self._on_mission_clear,
+            "MISSION_COUNT": self._on_mission_count,
             "SET_POSITION_TARGET_LOCAL_NED": self._on_setpoint,
         }
 
@@ -303,6 +309,42 @@ class Autopilot(Endpoint):
         for receiver in self._peers.values():
             self._send(receiver, self._telemetry.parameter(name))
 
+    def _on_data_stream(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        """Set the rate of a group of messages, as ground stations still do."""
+        group, rate = message.req_stream_id, message.req_message_rate
+        for number in sum(GROUPS.values(), ()) if group == ALL else GROUPS.get(group, ()):
+            if message.start_stop and rate:
+                peer.every(number, round(SECOND_NS / rate), self.flight.now_ns)
+            else:
+                peer.streams.pop(number, None)
+
+    def _on_version_request(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        self._send(peer, self._telemetry.version())
+
+    def _on_mission_list(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        """Answer that the mission is empty."""
+        whom = message.get_srcSystem(), message.get_srcComponent()
+        self._send(
+            peer,
+            dialect.MAVLink_mission_count_message(*whom, 0, mission_type=message.mission_type),
+        )
+
+    def _on_mission_clear(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        self._answer_mission(message, peer, dialect.MAV_MISSION_ACCEPTED)
+
+    def _on_mission_count(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
+        """Refuse the upload of a mission; an empty one is accepted."""
+        is_empty = message.count == 0
+        result = dialect.MAV_MISSION_ACCEPTED if is_empty else dialect.MAV_MISSION_UNSUPPORTED
+        self._answer_mission(message, peer, result)
+
+    def _answer_mission(self, message: Message, peer: Peer, result: int) -> None:
+        whom = message.get_srcSystem(), message.get_srcComponent()
+        self._send(
+            peer,
+            dialect.MAVLink_mission_ack_message(*whom, result, mission_type=message.mission_type),
+        )
+
     def _on_mode(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         self._acknowledge(
             peer, message, dialect.MAVLINK_MSG_ID_SET_MODE, self.flight.switch(message.custom_mode)
@@ -362,6 +404,9 @@ class Autopilot(Endpoint):
                 result = self._set_interval(_whole(first), second, peer)
             case dialect.MAV_CMD_REQUEST_MESSAGE:
                 result = Result.ACCEPTED if self._tell(peer, _whole(first)) else Result.DENIED
+            case dialect.MAV_CMD_GET_HOME_POSITION:
+                self._tell(peer, HOME)
+                result = Result.ACCEPTED
             case _:
                 result = Result.UNSUPPORTED
         return result

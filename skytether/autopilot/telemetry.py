@@ -1,5 +1,6 @@
 """Telemetry: MAVLink messages made from a flight."""
 
+import math
 from collections.abc import Callable
 
 from skytether.autopilot.flight import Landed, PilotedVehicle
@@ -8,6 +9,7 @@ from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.scenario.geographic import EARTH_M
 
 HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
 SENSORS = int(
@@ -21,6 +23,8 @@ KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
 """Flags of an estimate with position, and of one without, as sent by ArduPilot and PX4."""
 UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
+UNKNOWN = 65535
+"""Value of a quantity that is not known."""
 
 
 class Telemetry:
@@ -55,6 +59,74 @@ class Telemetry:
             velocity[2],
         )
 
+    def _globe(self) -> tuple[int, int, int]:
+        """Latitude and longitude [1e-7 degrees], and altitude above the sea [mm]."""
+        north, east, up = self._flight.estimate()
+        latitude, longitude, altitude = self._flight.flavour.home
+        degree_m = math.radians(1.0) * EARTH_M
+        longitude += east / (degree_m * math.cos(math.radians(latitude)))
+        return (
+            round(1e7 * (latitude + north / degree_m)),
+            round(1e7 * longitude),
+            round(1e3 * (altitude + up)),
+        )
+
+    def global_position(self) -> Message | None:
+        if not self._flight.ready:
+            return None
+        latitude, longitude, altitude_mm = self._globe()
+        *_, up = self._flight.estimate()
+        north, east, down = (round(100.0 * each) for each in turned(self._flight.velocity()))
+        heading = round(100.0 * self._heading) % 36000
+        return dialect.MAVLink_global_position_int_message(
+            self._boot_ms,
+            latitude,
+            longitude,
+            altitude_mm,
+            round(1e3 * up),
+            north,
+            east,
+            down,
+            heading,
+        )
+
+    def gps(self) -> Message:
+        """Fix of the receiver: none before the estimate is ready."""
+        flight = self._flight
+        fix = dialect.GPS_FIX_TYPE_3D_FIX if flight.ready else dialect.GPS_FIX_TYPE_NO_FIX
+        latitude, longitude, altitude_mm = self._globe() if flight.ready else (0, 0, 0)
+        north, east, _ = flight.velocity()
+        speed = round(100.0 * math.hypot(north, east))
+        satellites = 10 if flight.ready else 0
+        return dialect.MAVLink_gps_raw_int_message(
+            1000 * self._boot_ms,
+            fix,
+            latitude,
+            longitude,
+            altitude_mm,
+            121,
+            200,
+            speed,
+            UNKNOWN,
+            satellites,
+        )
+
+    def hud(self) -> Message:
+        north, east, climb = self._flight.velocity()
+        speed = math.hypot(north, east)
+        altitude_m = self._flight.flavour.home[2] + self._flight.estimate()[2]
+        heading, throttle = int(self._heading), 50 if self._flight.armed else 0
+        return dialect.MAVLink_vfr_hud_message(speed, speed, heading, throttle, altitude_m, climb)
+
+    @property
+    def _heading(self) -> float:
+        """Heading clockwise from north [degrees]."""
+        _, _, yaw, _ = self._flight.quadrotor.attitude()
+        return math.degrees(yaw) % 360.0
+
+    def system_time(self) -> Message:
+        return dialect.MAVLink_system_time_message(0, self._boot_ms)
+
     def attitude(self) -> Message:
         roll, pitch, yaw, rates = self._flight.quadrotor.attitude()
         return dialect.MAVLink_attitude_message(
@@ -63,7 +135,7 @@ class Telemetry:
 
     def system_status(self) -> Message:
         battery = self._flight.quadrotor.battery()
-        healthy = SENSORS
+        healthy = SENSORS | int(dialect.MAV_SYS_STATUS_GEOFENCE)
         if not self._flight.ready:
             healthy &= ~int(dialect.MAV_SYS_STATUS_SENSOR_GPS | dialect.MAV_SYS_STATUS_AHRS)
         if self._flight.why_not_armed():
@@ -162,6 +234,10 @@ class Telemetry:
 STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
     HEARTBEAT: Telemetry.heartbeat,
     int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED): Telemetry.local_position,
+    int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT): Telemetry.global_position,
+    int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Telemetry.gps,
+    int(dialect.MAVLINK_MSG_ID_VFR_HUD): Telemetry.hud,
+    int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Telemetry.system_time,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telemetry.attitude,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Telemetry.system_status,
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): Telemetry.battery_status,
@@ -172,3 +248,23 @@ STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
     int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telemetry.estimate,
 }
 """Telemetry messages by id, which can be streamed or requested once."""
+GROUPS: dict[int, tuple[int, ...]] = {
+    int(dialect.MAV_DATA_STREAM_EXTENDED_STATUS): (
+        int(dialect.MAVLINK_MSG_ID_SYS_STATUS),
+        int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT),
+    ),
+    int(dialect.MAV_DATA_STREAM_POSITION): (
+        int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
+        int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
+    ),
+    int(dialect.MAV_DATA_STREAM_EXTRA1): (int(dialect.MAVLINK_MSG_ID_ATTITUDE),),
+    int(dialect.MAV_DATA_STREAM_EXTRA2): (int(dialect.MAVLINK_MSG_ID_VFR_HUD),),
+    int(dialect.MAV_DATA_STREAM_EXTRA3): (
+        int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS),
+        int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT),
+        int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME),
+    ),
+}
+"""Messages of each group of REQUEST_DATA_STREAM, as ArduCopter groups them."""
+ALL = int(dialect.MAV_DATA_STREAM_ALL)
+"""Group of all groups."""
