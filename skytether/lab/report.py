@@ -1,4 +1,6 @@
-"""Report: a page of tables and figures that opens offline; and the report of `reproduce`."""
+"""Report: a page of tables and figures that opens offline; and the contents of `reproduce`'s
+report.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -43,25 +45,19 @@ class Real:
     """Flight over UDP."""
 
     scenario: Scenario
-    """Scenario that was flown."""
     flight: Record
-    """Records of the flight."""
     netem: Mapping[str, Any]
-    """Figures of netem: its counters, and its lateness."""
+    """Counters of netem, and its lateness."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """Results of all flights of a reproduction."""
-
     table: tuple[Study, Cells]
-    """Study of Table 1, and its cells."""
     curves: Sequence[tuple[Study, Cells]]
-    """Study of each curve, and its cells."""
     maps: CellSummaries
     """Summaries of Fig. 5, by λ and ε."""
     periods: CellSummaries
-    """Summaries of periodic sending beside Fig. 5, by period."""
+    """Summaries of periodic sending, for Fig. 5 as curves, by period."""
     delay_ms: Array
     """Measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
@@ -72,22 +68,19 @@ class Reproduction:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Report with its figures drawn."""
+    """Contents of a report, with figures drawn."""
 
     title: str
-    """Heading of the page."""
     about: str
     """Introduction: one or two sentences on the scenario."""
     tables: Sequence[Table]
     """Tables, the most important first."""
     pictures: Sequence[Plate]
-    """Figures."""
     verdict: str
-    """Result: one or two sentences on the outcome."""
+    """One or two sentences on the outcome."""
 
 
 def draw(measured: Reproduction) -> Drawn:
-    """Report of a reproduction."""
     study, cells = measured.table
     columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
     entries = table_1(columns)
@@ -110,7 +103,7 @@ def draw(measured: Reproduction) -> Drawn:
 
 
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
-    """Table 1, the paper's figures beside the reproduced ones."""
+    """Table 1: the paper's figures with the reproduced ones."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
@@ -175,7 +168,7 @@ REAL = {
 
 
 def real_table(measured: Reproduction) -> Table:
-    """Table of the flights over real UDP beside those in virtual time, by method."""
+    """Table of the flights over UDP and of those in virtual time, by method."""
     study, cells = measured.table
     length_s = study.axis.values[1]
     rows: list[dict[str, Any]] = []
@@ -234,21 +227,18 @@ def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights])
 
 
 def _rmse(cell: MethodFlights) -> float:
-    """Mean RMSE xy [m]; NaN if nothing was flown."""
+    """Mean RMSE xy [m]; NaN if every flight failed."""
     mean = cell.estimate("rmse_xy")[0]
     return float("nan") if mean is None else mean
 
 
 def as_interval(estimate: Estimate, spec: str) -> str:
-    """Mean with its interval, as shown in a table."""
     return " ± ".join(as_text(part, spec) for part in estimate)
 
 
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
     """Page of a report.
 
-    Args:
-        scenario: scenario of the report.
-        calls: facts about each call of the command that made it, in order.
+    `calls` are facts about each call of the command that made the report, in order.
     """
     return rendered("figures/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)

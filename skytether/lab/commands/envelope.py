@@ -1,6 +1,4 @@
-"""`skytether envelope`: networks and settings under which a scenario flies, tested at many
-points.
-"""
+"""`skytether envelope`: networks and settings under which a scenario flies, by many flights."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
-"""Most bad points that are printed with their command lines."""
+"""Largest number of flyaways and crashes that are printed with their command lines."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,7 @@ def envelope(argv: Sequence[str]) -> None:
 
 
 def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Write and print the outcomes of all points.
-
-    Raises:
-        CommandError: some points are bad.
-    """
+    """Write and print all outcomes; raises CommandError if some points flew away or crashed."""
     title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
     files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 
 def processor() -> str:
-    """Name of this machine's processor."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -23,13 +23,10 @@ from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
 SEEDS = 2**32
-"""Number of seeds."""
 HOURS_MAX = 10_000
-"""Largest number of hours."""
 SCHEDULES_BYTES_MAX = 64_000_000
-"""Largest size of a file of schedules [B]."""
 TOLD_MAX = 10
-"""Most failures that are shrunk and printed."""
+"""Largest number of failures that are shrunk and printed."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,6 @@ def torture(argv: Sequence[str]) -> None:
 
 
 def _failures(done: Collection[TrialOutcome]) -> str:
-    """Number of failures, in words; nothing without any."""
     failed = sum(bool(each.failure) for each in done)
     return f"{failed} failed" if failed else ""
 
@@ -144,7 +140,6 @@ def _read(path: Path) -> list[Trial]:
 def _finish(
     options: TortureOptions, title: str, done: Collection[TrialOutcome], failed: list[TrialOutcome]
 ) -> None:
-    """Write and print the counters and the failures."""
     counts: Counter[str] = Counter()
     for outcome in done:
         counts.update(outcome.counts)

@@ -1,6 +1,6 @@
 """Results of an identification: each axis in words, and a scenario with the identified model.
 
-Keys changed on the command line are also in the written scenario.
+The scenario also contains the keys changed on the command line.
 """
 
 import math
@@ -17,22 +17,18 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 AXES = "xyz"
-"""Names of the axes."""
 BEYOND = 1.5
-"""Largest allowed input over the largest step; the response to larger inputs was not measured."""
+"""Largest allowed input over the largest step; larger inputs were not measured."""
 FASTER = 1.25
-"""Required speed over the desired trajectory's, to catch up, and over the fence's wind."""
+"""Required speed relative to the desired trajectory's, to catch up, and to the fence's wind."""
 DIGITS = 4
 """Significant digits of written numbers."""
 
 
 class AxisOutcome(NamedTuple):
-    """Results of one axis."""
-
     speed: float
-    """Size of step [m/s]."""
     cut: int
-    """Number of steps that the fence cut short or left no room for."""
+    """Number of steps that the fence cut short, or for which the fence left no room."""
     responses: Sequence[StepResponse]
     """Responses to the usable steps."""
     fit: Fit | None
@@ -45,13 +41,11 @@ class AxisOutcome(NamedTuple):
 
 
 def with_interval(name: str, numbers: Numbers, within: Numbers) -> str:
-    """Number and its interval, as text."""
     half = getattr(within, name)
     return f"{getattr(numbers, name):.3f} ± {f'{half:.3f}' if math.isfinite(half) else '?'}"
 
 
 def describe(axis: AxisOutcome) -> str:
-    """Results of an axis, in words."""
     fit = axis.fit
     if fit is None:
         return f"too few steps ({axis.steps}), {_remedy(axis)}"
@@ -61,7 +55,6 @@ def describe(axis: AxisOutcome) -> str:
 
 
 def _remedy(axis: AxisOutcome) -> str:
-    """Advice on how to get more steps."""
     if axis.cut < STEPS:
         return "fly it to its end, and measure velocities"
     return "the fence leaves no room: expected a wider one, a smaller --speed, or a shorter --hold"
@@ -117,7 +110,7 @@ def scenario_text(
 
 
 def differing(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Values of a table that differ from the base, as a table."""
+    """Values of a table that differ from the base, nested as in the table."""
     found: dict[str, Any] = {}
     for key, value in table.items():
         before = base.get(key)
@@ -134,8 +127,8 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: no more than was tested, and enough for the desired trajectory
-    and against the fence's wind.
+    """Bounds of the input [m/s]: sufficient for the desired trajectory and against the fence's
+    wind, and otherwise no more than was measured.
     """
     wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0
     wanted = [max(speed, wind_mps) for speed in reference_speeds(flown)]
@@ -148,7 +141,7 @@ def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbe
 
 
 class AxisTold(msgspec.Struct, frozen=True):
-    """Results of one axis in identified.json; None for unknown values."""
+    """Results of an axis in identified.json; None for unknown values."""
 
     axis: str
     step_mps: float
@@ -167,7 +160,6 @@ class AxisTold(msgspec.Struct, frozen=True):
 
 
 def told(name: str, axis: AxisOutcome) -> AxisTold:
-    """Results of an axis, for identified.json."""
     steps, fit = len(axis.responses), axis.fit
     if fit is None:
         return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))
