@@ -1,4 +1,6 @@
-"""The exact solver: right to rounding, the same whatever came before, and never a guess."""
+"""The exact solver: accurate to rounding, independent of earlier problems, and never a wrong
+answer.
+"""
 
 from collections.abc import Callable
 from functools import cache
@@ -47,7 +49,7 @@ def make(
 
 
 ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
-"""Long steps and hardly a cost of the input: here sets wander in circles."""
+"""Long steps and hardly any weight of the input: active sets cycle."""
 
 
 @cache
@@ -60,13 +62,13 @@ def active_sets_with(**constants: float) -> Callable[..., int]:
 
 @pytest.fixture
 def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sets that wander are given up at once."""
+    """Cycling active sets are given up at once."""
     changed = {**vars(exact), "active_sets": active_sets_with(PIVOTS_MAX=0)}
     monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
 
 
 def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
-    """Random gradients, of moving targets and states `scale` away, and random guesses."""
+    """Random gradients, of moving targets and states up to `scale` away, and random guesses."""
     rng = np.random.default_rng(seed)
     axes, H = problem.hessian.shape[:2]
     x = rng.normal(0.0, scale, (count, axes, 2))
@@ -137,7 +139,7 @@ def test_problems_that_cycle_are_solved_all_the_same(
 def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Such an answer is right to rounding and yet has a slope: no reason to refuse it."""
+    """Such an answer is accurate to rounding although it has a slope; it must not be refused."""
     dual = exact.daqp.solve
 
     def nearly(*args: object, **keys: object) -> object:
@@ -158,7 +160,7 @@ def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
 def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
+    """A wrong answer of DAQP is refused: these vehicles keep their guess."""
     problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     right, _ = ExactSolver(problem).solve(gradient, guess)
@@ -174,7 +176,7 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 
 
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
-    """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
+    """Warm start of every saturated flight: one round, although 1.8 became 1.7999999."""
     problem = make((0.855, 0.855), (1.8, 1.8))
     gradient, guess = problems(problem, 20, 10.0, seed=6)
     inputs, _ = ExactSolver(problem).solve(gradient, guess)

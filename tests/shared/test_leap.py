@@ -1,4 +1,4 @@
-"""Leaps: how far a vehicle's own state may change within a time, by value."""
+"""Jumps: the largest change of a vehicle's own state within a time, in numbers."""
 
 import pytest
 

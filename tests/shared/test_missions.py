@@ -1,4 +1,4 @@
-"""Checks of missions: which goals are too near to each other, whatever the number of vehicles."""
+"""Checks of missions: goals that are too near to each other, for any number of vehicles."""
 
 import resource
 from itertools import combinations
@@ -12,7 +12,9 @@ from skytether.shared.scenario.mission import Mission, mission
 Goals = dict[int, tuple[Array, Array]]
 MANY = 20_000
 CPU_S = 30.0
-"""Longest time for MANY vehicles [s], which take half a second; each with each takes minutes."""
+"""Longest time for MANY vehicles [s]. The check takes half a second; comparing all pairs takes
+minutes.
+"""
 
 
 def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, float] | None:
@@ -75,7 +77,7 @@ def test_many_vehicles_are_checked_in_proportion() -> None:
 
 
 def test_numbers_of_vehicles_are_those_that_fly() -> None:
-    """The link has two bytes for them."""
+    """Numbers have two bytes on the wire."""
     for number in (0, 65_536, 1.5):
         with pytest.raises(ValueError, match="column vehicle: expected numbers"):
             mission(f"vehicle,t,x,y\n{number},0,0,0\n".encode(), 2)

@@ -1,4 +1,6 @@
-"""Plug-ins: triggers and references of files and packages, in every process; their mistakes."""
+"""Plug-ins: triggers and references from files and packages, in every process, and their
+mistakes.
+"""
 
 import csv
 import importlib.util
@@ -60,7 +62,7 @@ class bad(Impairment):
 
 
 def plug(folder: Path, code: str, name: str = "mine.py") -> str:
-    """Path of a plug-in that is imported."""
+    """Path of an imported plug-in."""
     path = folder / name
     path.write_text(HEAD + dedent(code))
     plugins.load([str(path)])
@@ -68,12 +70,12 @@ def plug(folder: Path, code: str, name: str = "mine.py") -> str:
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The scenario demo-committed for ten seconds, with other keys in its sections."""
+    """The scenario demo-committed for ten seconds, with sections changed."""
     return packaged("demo-committed", {"duration": 10.0}, sections)
 
 
 def flown(trigger: str, **control: Any) -> Record:
-    """The scenario's flight with a trigger."""
+    """Flight of the scenario with a trigger."""
     return fly(scenario(control={"trigger": trigger} | control))
 
 
@@ -81,7 +83,7 @@ def flown(trigger: str, **control: Any) -> Record:
 
 
 def example(document: Path) -> str:
-    """The one plug-in in a document."""
+    """The only plug-in in a document."""
     blocks: list[str] = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
     (code,) = (block for block in blocks if "skytether.plugin import" in block)
     return code
@@ -109,7 +111,7 @@ def test_the_documented_plugin_flies_with_the_documented_command(
 
 
 def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) -> None:
-    """More often with a tighter bound, and never later than the silence beside it."""
+    """More often with a tighter bound, and never later than the `silence` combined with it."""
     plug(tmp_path, example(TRIGGERS_MD))
     loose, tight = (flown(f"slip({mps}) | silence(1)").server for mps in (0.3, 0.05))
     assert 0 < loose["event"].sum() < tight["event"].sum()
@@ -157,7 +159,7 @@ def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixtur
 
 
 def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
-    """Every field has its shape, and nothing can be written into the server's own arrays."""
+    """Every field has its shape, and the server's own arrays cannot be written."""
     code = """
         @trigger
         def look(now):
@@ -180,7 +182,7 @@ def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
 
 
 def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path) -> None:
-    """A plan is what is sent; with no loss, what is held aboard is the plan that was sent last."""
+    """The plan is the one that is sent; without loss, the horizon aboard is the last sent one."""
     code = """
         @trigger
         def look(now):
@@ -204,7 +206,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
         last = max((each for each in sent if each < step), default=None)
         if last is not None:
             inputs = sent[last]["inputs"][:, start - sent[last]["begins"] :]
-            # The vehicle's clamp cuts off what a float32 is above the bound.
+            # The vehicle's clamp removes the excess of a rounded float32 over the bound.
             np.testing.assert_allclose(held[:, : inputs.shape[1]], inputs, rtol=1e-7)
             compared += 1
         times = (start + np.arange(desired.shape[1])) * asked.control.dt
@@ -214,7 +216,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
 
 
 def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path) -> None:
-    """Elsewhere it is a mistake to ask, which is told."""
+    """With other schemes asking is a mistake, which is logged."""
     plug(tmp_path, "@trigger\ndef look(now):\n    return now.held[:, 0, 0] > 0.0\n")
     (said,) = faults(flown("look", scheme="predictive"))
     known = "held: expected control.scheme = 'committed'"
@@ -245,7 +247,7 @@ def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
 
 
 def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
-    """Written anew, `periodic` flies as ours does, to the last bit."""
+    """A rewritten `periodic` flies like the built-in one, to the last bit."""
     code = """
         @trigger(name="every")
         class Every(Trigger):
@@ -329,7 +331,7 @@ def test_arguments_of_a_plugin_are_checked_like_ours(
 def test_every_bound_of_msgspec_holds(
     bound: str, right: str, wrong: str, form: str, tmp_path: Path
 ) -> None:
-    """As it does for keys of a scenario: `jolt(-0.2)` does not fly where it is to be above 0."""
+    """As for keys of a scenario: `jolt(-0.2)` is refused if the argument must be above 0."""
     code = f"""
         from typing import Annotated
         from msgspec import Meta
@@ -397,7 +399,7 @@ def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) ->
 
 
 def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
-    """The refusal is worded as for a packaged trigger."""
+    """The refusal is worded as for a built-in trigger."""
     code = """
         @trigger(needs="held")
         def mine(now):
@@ -495,7 +497,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(
 
 
 def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
-    """A file that is imported again, with other content, takes the place of itself."""
+    """A file that is imported again, with other content, replaces itself."""
     one = plug(tmp_path, NEVER, "one.py")
     said = refusal(lambda: plug(tmp_path, NEVER, "two.py"))
     assert said.endswith(f"policy never: expected another name, {one} has one of this name")
@@ -532,7 +534,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("body", "said"), MISTAKES.values(), ids=MISTAKES)
 def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_path: Path) -> None:
-    """A packet too many costs bytes, one too few the flight."""
+    """An unnecessary packet costs bytes, a missing one the flight."""
     plug(tmp_path, f"@trigger\ndef bad(now):\n    {body}\n")
     flight, always = flown("bad"), flown("always")
     assert faults(flight) == [f"the trigger bad: {said}; when it fails, a horizon is sent"]
@@ -548,7 +550,7 @@ def test_a_budget_caps_a_trigger_that_fails(tmp_path: Path) -> None:
 
 
 def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
-    """It is told once in all, and the flight goes on."""
+    """The mistake is logged once, and the flight continues."""
     code = """
         @trigger(name="bad")
         class Bad(Trigger):
@@ -571,7 +573,7 @@ def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
 
 
 def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> None:
-    """It ends with what the trigger's mistake is."""
+    """The batch ends with the trigger's error."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
     said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
     assert said == "the trigger bad: RuntimeError: no; when it fails, a horizon is sent"
@@ -622,7 +624,7 @@ def test_a_reference_that_cannot_be_flown_is_refused(body: str, said: str, tmp_p
     "shape", [" circle", "circle()", "slope & circle", "slope(1, 2)", "circle(1)"]
 )
 def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
-    """Code that compares a shape with a name meets no other text for it."""
+    """Code that compares a shape with a name must meet only one form."""
     plug(tmp_path, SLOPE)
     assert f"reference.shape: got {shape!r}" in refusal(
         lambda: scenario(reference={"shape": shape})
@@ -630,7 +632,7 @@ def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
 
 
 def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
-    """In name, numbers or what the function gives, but not in how that is computed."""
+    """In name, numbers or the function's result, but not in its code."""
     terms = []
     for states in ("mps * t", "t * mps + 1e-9", "0.999 * mps * t"):
         plug(tmp_path, SLOPE.replace("mps * t", states))
@@ -665,7 +667,7 @@ def test_the_terms_of_our_shapes_are_their_names() -> None:
 
 
 def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
-    """Also where the file is gone, or is another one by now."""
+    """Also if the file is gone, or has changed."""
     path = plug(tmp_path, NEVER)
     job = partial(_equipped, lambda name: name in TRIGGERS, plugins.loaded())
     Path(path).unlink()
@@ -676,7 +678,7 @@ def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
 
 
 def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path) -> None:
-    """By the digest of their content; those that are not named do not count."""
+    """By the digest of their content; unused plug-ins do not count."""
     path = plug(tmp_path, NEVER)
     plug(tmp_path, SLOPE, "unused.py")
     named = scenario(control={"trigger": "never | silence(1)"})
@@ -701,7 +703,7 @@ def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path
 def test_commands_of_the_laboratory_take_the_flag_several_times(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each file is imported, in order, before the command refuses something else."""
+    """Each file is imported, in order, before the command refuses another option."""
     files = [tmp_path / "one.py", tmp_path / "two.py"]
     for path, code in zip(files, (NEVER, SLOPE), strict=True):
         path.write_text(HEAD + code)
@@ -714,7 +716,7 @@ def test_commands_of_the_laboratory_take_the_flag_several_times(
 
 @pytest.mark.usefixtures("here")
 def test_a_sweep_flies_with_the_triggers_of_several_files(tmp_path: Path) -> None:
-    """A cell for each: one never sends but for silence, one whenever it can."""
+    """A cell for each: one never sends except by `silence`, one whenever possible."""
     other = NEVER.replace("never", "ever").replace("zeros", "ones")
     given = []
     for name, code in (("one.py", NEVER), ("two.py", other)):
@@ -743,7 +745,7 @@ def run(line: str, *more: str, folder: Path, path: str = "") -> str:
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Folder that tests/plugin_package is installed into."""
+    """Folder into which tests/plugin_package is installed."""
     folder = tmp_path_factory.mktemp("installed")
     with chdir(ROOT / "tests" / "plugin_package"):
         wheel = build_wheel(str(folder))
@@ -768,7 +770,7 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
 
 
 def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
-    """It is listed, and flown by the trigger whose figure it computes."""
+    """It is listed, and flown with the trigger whose figure it computes."""
     listed = run("schemes", folder=tmp_path, path=installed)
     assert "beacon\n    Sends where the vehicle should be now and how fast" in listed
     control = "--control.scheme beacon --control.trigger deviation(0.1)"
@@ -813,7 +815,7 @@ def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path)
     ],
 )
 def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
-    """It changes nothing, and is told once a flow and direction."""
+    """The impairment has no effect, and the mistake is logged once per flow and direction."""
     plug(tmp_path, IMPAIRING.format(mistake=mistake))
     network = {"uplink": "constant(0.2) & bad", "downlink": "constant(0.2)"}
     flight = fly(scenario(network=network))
@@ -825,7 +827,7 @@ def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path)
 @pytest.mark.long
 @pytest.mark.timeout(400)
 def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
-    """Over UDP: a trigger's mistake is told, and a reference is flown by both ends."""
+    """Over UDP: a trigger's mistake is logged, and both ends know the reference."""
     bad = "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + bad)
     plugged = f"{SHORT} --plugin mine.py --record flight.mcap"
@@ -852,7 +854,7 @@ def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs `distributed`")
 def test_a_dask_worker_knows_the_plugin(tmp_path: Path) -> None:
-    """One that was there before, in a folder without the file."""
+    """A worker started before, in a folder without the file."""
     (tmp_path / "mine.py").write_text(HEAD + NEVER)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

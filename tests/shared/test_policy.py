@@ -1,4 +1,4 @@
-"""Triggers as texts: one is a trigger, or it is refused in one line; nothing in it is ever run."""
+"""Texts of triggers: parsed, or refused in one line; never executed."""
 
 import string
 from typing import Any
@@ -99,7 +99,7 @@ REFUSED = {
     "state_gap(1, epsilon=2)": ("state_gap(1, epsilon=2)", GAP),
     "state_gap(lambda=2)": ("state_gap(lambda=2)", GAP),
 }
-"""Texts that are no trigger, each with the part that is named as wrong and what was expected."""
+"""Invalid texts, each with the part that is named as wrong and the expected form."""
 
 
 def refusal(text: str) -> str:
@@ -180,7 +180,7 @@ words = st.sampled_from(
 @example("\ud800")
 @example("[" * 100 + "]" * 100)
 def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
-    """Nothing else: no other error, no warning of Python's, and nothing happens."""
+    """Without other errors, warnings of Python, or side effects."""
     said, found = "", []
     try:
         found = list(leaves(TRIGGERS.parse(text)))
@@ -194,7 +194,7 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
 
 
 def test_nothing_written_is_ever_run() -> None:
-    """A call that would end the process is a name that nobody knows."""
+    """A call that would end the process is an unknown name."""
     assert "there are always" in refusal("exit(1)")
     assert refusal("__import__('os')._exit(1)").endswith(FORM)
 
@@ -207,7 +207,7 @@ trees = st.recursive(
 
 
 def written(tree: Expression) -> str:
-    """With every parenthesis."""
+    """Text with every parenthesis."""
     if isinstance(tree, Call):
         values = ", ".join(map(repr, tree.values))
         return f"{tree.name}({values})"

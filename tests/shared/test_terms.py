@@ -1,4 +1,4 @@
-"""Terms of a flight: for every key of a scenario, two ends differ and are told, or may differ."""
+"""Terms of a flight: for every key, ends that differ are refused with a message, or may differ."""
 
 import math
 import re
@@ -75,11 +75,11 @@ OTHER: dict[str, Any] = {
     "title": "another",
     "armed": False,
 }
-"""Another value of the keys that are no numbers, or that not every number may be."""
+"""Another value of each key that is no number, or is restricted."""
 
 
 ON_MISSION = reading.load("swap")
-"""A scenario in which vehicles keep apart."""
+"""Scenario in which vehicles keep apart."""
 MISSION: dict[str, Any] = {
     "mission.separation_m": 0.6,
     "mission.height_m": 1.0,
@@ -90,7 +90,7 @@ MISSION: dict[str, Any] = {
     "mission.goals": "goal(2, 5.5, 1)",
     "mission.zones": "fence(-9, 9, -9, 9)",
 }
-"""Another value of each key of its own."""
+"""Another value of each key of `mission`."""
 
 
 ALL = dict(flat(reading.to_table(HERE)))
@@ -98,7 +98,6 @@ ALL = dict(flat(reading.to_table(HERE)))
 
 
 def with_(key: str, value: Any) -> Scenario:
-    """The scenario with one key changed."""
     table = reading.to_table(HERE)
     set_keys({key: value}, table)
     if key == "model.axes":
@@ -135,7 +134,7 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
 
 
 def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
-    """A server of one scenario and a client of another, after HELLO and WELCOME."""
+    """Server of one scenario and client of another, after HELLO and WELCOME."""
     server = Server(ours, boot_id=7, entropy=stream(1, "entropy").bytes)
     client = Client(theirs, simulated(theirs, 1), server=("server", 0), vehicle=1, boot_id=9)
     client.wake(now_ns=0)
@@ -147,7 +146,7 @@ def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
 
 
 def test_every_key_is_a_term_or_free_to_differ() -> None:
-    """There is no third kind: a key of both ends is a term, and each term has one key."""
+    """A key of both ends is a term, and each term has one key."""
     assert set(ALL) == set(KEYS)
     of_both = [name for name, key in KEYS.items() if key.owner is Owner.BOTH]
     assert sorted(TERMS.values()) == sorted(of_both)
@@ -156,7 +155,7 @@ def test_every_key_is_a_term_or_free_to_differ() -> None:
 
 @pytest.mark.parametrize("key", list(TERMS.values()))
 def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Path) -> None:
-    """Both operators read the key and both values; no session is opened."""
+    """Both operators see the key and both values; no session is opened."""
     ours, theirs = differing(key, tmp_path)
     server, client = shake_hands(ours, theirs)
     (difference,) = differences(ours.terms(), theirs.terms())[:1]
@@ -203,7 +202,7 @@ def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
 
 
 def test_the_longest_terms_fit_one_datagram() -> None:
-    """Three axes, and texts as long as they may be."""
+    """Three axes, and texts of the largest length."""
     terms = HERE.terms()._replace(tau_s=(math.pi,) * 3, u_max=(math.pi,) * 3, points="x" * 32)
     terms = terms._replace(scheme="x" * 32, exhausted="x" * 32, shape="x" * 32, table="x" * 32)
     assert len(encode(Hello(2**16 - 1, 2**64 - 1, terms))) <= PAYLOAD_BYTES_MAX
@@ -228,7 +227,7 @@ def test_the_documented_table_names_every_term() -> None:
 def test_what_follows_from_the_terms_of_a_scheme(
     scheme: str, indexed: bool, commits: bool, splines: bool, planned: int, reach: int
 ) -> None:
-    """Steps of 50 ms, H = 40, and an age bound of 3 s: 60 steps; it brakes at 2 m/s²."""
+    """Steps of 50 ms, H = 40, an age bound of 3 s, 60 steps, and braking at 2 m/s²."""
     agreed = (
         reading.load("demo")
         .terms()
